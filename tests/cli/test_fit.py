@@ -162,3 +162,28 @@ def test_the_truth_is_learned_from_where_the_table_has_it(folder, tmp_path, caps
     assert main([*command, str(tmp_path / "true.csv")]) == 0
     forms = {row["form"] for row in json.loads((tmp_path / "out" / "fitted.json").read_text())["table"]}
     assert forms == {"truth"}
+
+
+RATES = """
+import heliograph as hg
+
+plant = hg.LinearPlant([[0.98]], hg.free(0.1, "q"), [0.0], 1.0, states=["x"])
+sensors = {name: hg.LinearSensor([[1.0]], 0.1, outputs=[f"{name} y"]) for name in ("fast", "odom")}
+nodes = {name: hg.Node(s, hg.perfect(), {"k": hg.kalman_filter(plant, s)}) for name, s in sensors.items()}
+network = hg.Network(plant, nodes)
+"""
+
+
+@pytest.mark.slow
+def test_a_slower_sender_loses_what_was_due_and_did_not_come(tmp_path):
+    """A sender that is due in each fourth row loses 3 of the 148 between its ends, not three quarters of the rows."""
+    (tmp_path / "net.py").write_text(RATES)
+    rng = np.random.default_rng(1)
+    x = np.cumsum(0.1 * rng.standard_normal(600))
+    rows = [f"{k / 10},{x[k] + rng.normal()},{x[k] + rng.normal() if k % 4 == 0 and k not in (100, 200, 204) else ''}"
+            for k in range(600)]  # fmt: skip
+    (tmp_path / "data.csv").write_text("\n".join(["time,fast y,odom y", *rows]))
+    arguments = ["--measurements", str(tmp_path / "data.csv"), "--out", str(tmp_path / "out"), "--starts", "1"]
+    assert main(["fit", str(tmp_path / "net.py"), *arguments]) == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert f"loss {3 / 148:.3g} " in page and "fast</" not in page[page.index("How measurements are lost") :]

@@ -82,7 +82,10 @@ def test_a_heading_beside_clocks_stays_an_angle():
     plant = hg.Plant(drive, np.diag([1e-4, 1e-4, 1e-5]), [0.0, 0.0, 0.0], np.diag([0.1, 0.1, 0.01]),
                      states=["x", "y", "yaw"], circular=["yaw"])  # fmt: skip
     sensor = hg.LinearSensor(np.eye(3), np.diag([0.01, 0.01, 0.001]), ["x", "y", "compass"], ["compass"])
-    rate = lambda x: jnp.stack([0.5 * jnp.cos(x[2]), 0.5 * jnp.sin(x[2]), 0.1])  # noqa: E731
+
+    def rate(x):
+        return jnp.stack([0.5 * jnp.cos(x[2]), 0.5 * jnp.sin(x[2]), 0.1])
+
     larger, seen = hg.model.with_clocks(plant, {"a": sensor}, {"a": hg.model.Clock(0.05, 1e-4)}, rate, 1.0)
     cubature = hg.cubature_filter(larger, seen["a"])
     network = hg.Network(larger, {"a": hg.Node(seen["a"], hg.perfect(3), {"f": cubature})})

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
+    from heliograph.learning.losses.stretches import Fates
     from heliograph.report.fit_page import Learned
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
@@ -88,7 +89,6 @@ def learn(
     from heliograph.files.fitted import NetworkAgain
     from heliograph.learning.held_out import changes, uniformity
     from heliograph.learning.losses.losses import learn_losses
-    from heliograph.learning.losses.stretches import fates_of_measurements
     from heliograph.learning.senders import decides
     from heliograph.numerics.check import fail
     from heliograph.report.fit_page import Learned
@@ -111,10 +111,29 @@ def learn(
     judged = stop.unless_stopped(lambda: changes(start, fitted.network, z, u, cut) if cut < rows else []) or []
     uniform = stop.unless_stopped(lambda: uniformity(fitted.network, judged, z, u, cut) if judged else []) or []
     advance("looking at losses")
-    fates = fates_of_measurements(z)
-    lossy = {name: fate for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])}
+    lossy = {name: fate for name, fate in _fates(start, recording).items() if any(0 < f.mean() < 1 for f in fate)}
     losses = stop.unless_stopped(lambda: {name: learn_losses(fate) for name, fate in lossy.items()}) or {}
     return Learned(network, str(measurements), fitted, cut, rows - cut, judged, uniform, losses)
+
+
+def _fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
+    """Return the fates of each node's messages; of one that is slower than the rows, of those that were due.
+
+    None of a node that nobody knows to be due: where rows are messages, of one without a rate of its own.
+    """
+    from heliograph.learning.losses.stretches import fates_of_measurements, fates_of_sequence
+    from heliograph.report.health import arrivals_of
+
+    fates = fates_of_measurements(recording.measurements)
+    for arrivals in arrivals_of(network, recording.time, recording.measurements):
+        component = network.nodes[arrivals.node].received_names.index(arrivals.component)
+        # The node's components are one packet, or each is one of its own.
+        name = arrivals.node if arrivals.node in fates else f"{arrivals.node}.{component}"
+        if arrivals.due is None:
+            fates.pop(name, None)
+        elif arrivals.period is not None and name in fates and arrivals.arrived.any():
+            fates[name] = fates_of_sequence(arrivals.numbers)
+    return fates
 
 
 def _data(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from heliograph.filters.innovation import independent_count
-from heliograph.numerics.types import Bool, Float
+from heliograph.numerics.types import Bool, Float, Int
 
 FEW = 8  # arrivals from which a rate of its own can be told
 NEAR = 0.25  # of a period: how far an interval may be from whole periods
@@ -75,9 +75,17 @@ class Arrivals:
         came = clock[self.arrived]
         if not len(came):
             return max(int((clock[-1] - clock[0]) / self.period), 1)
-        # Whole periods between arrivals, and those that passed after the last.
-        between = np.maximum(np.round(np.diff(came) / self.period), 1).sum()
-        return 1 + int(between) + self._due_since(clock, came)
+        # Those up to the last arrival, and those that were due after it.
+        return 1 + int(self.numbers[-1]) + self._due_since(clock, came)
+
+    @property
+    def numbers(self) -> Int[np.ndarray, " arrivals"]:
+        """Running number of each message that arrived, from 0: the rows or the whole periods since the first."""
+        if self.period is None:
+            rows = np.flatnonzero(self.arrived)
+            return rows - rows[:1]
+        periods = np.maximum(np.round(np.diff(_clock(self.time)[self.arrived]) / self.period), 1)
+        return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
 
     @property
     def share(self) -> float:

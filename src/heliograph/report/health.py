@@ -1,6 +1,6 @@
 """Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -176,19 +176,26 @@ def examine(
         lost = np.any(record.estimates[node][name].claims == "none")
         filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
     others = tuple(belief.words for belief in beliefs(network))
-    return Health(record, _links(network, record), filters, outputs, network.shared, others)
+    return Health(
+        record, arrivals_of(network, record.time, record.measurements), filters, outputs, network.shared, others
+    )
 
 
-def _links(network: Network, record: Record) -> list[Arrivals]:
-    """Return when each component arrived, by distinct times: of messages at one time each may be a row."""
-    time, row = np.unique(record.time, return_inverse=True)
+def arrivals_of(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
+    """Return when each component arrived, by distinct times: of messages at one time each may be a row.
+
+    Args:
+        network: the network.
+        times: of the rows (time,).
+        received: by node, (time, received), NaN where nothing arrived.
+    """
+    time, row = np.unique(times, return_inverse=True)
 
     def by_time(there: Any) -> np.ndarray:
         came = np.zeros(len(time), dtype=bool)
         came[row[there]] = True
         return came
 
-    received = record.measurements
     messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
     links = []
     for node, z in received.items():
