@@ -28,6 +28,20 @@ filters = {"aware": hg.linear_filter(plant, sensor, channel)}
 network = hg.Network(plant, {"a": hg.Node(sensor, hg.erasure(channel, 0.9), filters)})
 def build(noise=0.5):
     return network
+def at(x, y):
+    far = hg.hop(hg.Discrete([0.5 / (1 + x**2 + y**2), 1 / (1 + x**2 + y**2)], [0.5, 0.5]), 0.2)
+    return hg.Network(network.plant, {"near": hg.Node(sensor, hg.hop(0.8, 0.2), {}), "far": hg.Node(sensor, far, {})})
+place = at(1.0, 0.0)
+"""
+DESIGN = """
+network = "net.py:place"
+budget = 2.0
+path_loss_exponent = 2.0
+[map]
+network = "net.py:at"
+x = [0.0, 1.0]
+y = [0.0, 1.0]
+points = 5
 """
 CAMPAIGN = """
 network = "net.py:build"
@@ -79,9 +93,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("demo", "--out", "out"),
     "reproduce": ("reproduce", "quadratic-bias", "--out", "out", "--runs", "200"),
     "sweep": ("sweep", "campaign.toml", "--out", "out", "--workers", "1"),
+    "design": ("design", "design.toml", "--out", "out"),
 }
-STAGES = {"fit": 14, "run": 6, "check": 3, "serve": 3, "demo": 7, "reproduce": 7, "sweep": 3}  # that are announced
-SHARES = {"fit": 8, "run": 3, "check": 1, "serve": 3, "demo": 2, "reproduce": 2, "sweep": 1}
+STAGES = {"fit": 14, "run": 6, "check": 3, "serve": 3, "demo": 7, "reproduce": 7, "sweep": 3, "design": 25}  # announced
+SHARES = {"fit": 8, "run": 3, "check": 1, "serve": 3, "demo": 2, "reproduce": 2, "sweep": 1, "design": 3}
 AFTER = 1.5  # seconds, at most, from a stage to the signal
 PATIENCE = 120.0  # seconds in which a command has to end
 KEPT = {"out", "out.csv", "report", "store.db", "store.db-wal", "store.db-shm", "store.db.lock"}
@@ -106,6 +121,7 @@ def prepared(folder: Path) -> None:
     """Write a network and its data."""
     (folder / "net.py").write_text(NETWORK)
     (folder / "campaign.toml").write_text(CAMPAIGN)
+    (folder / "design.toml").write_text(DESIGN)
     chance, state, lines = random.Random(1), 0.0, ["time,far"]
     for row in range(4000):
         state = 0.95 * state + chance.gauss(0, 0.4)
@@ -140,7 +156,7 @@ def interrupt(name: str, number: signal.Signals, stages: int, after: float, fold
 def _stage(process: "subprocess.Popen[str]", pipe: int, stages: int) -> tuple[str, list[str]]:
     """Wait for so many announcements, or until there are no more for a while."""
     seen: list[str] = []
-    while len(seen) < stages and process.poll() is None and select([pipe], [], [], 3.0 if seen else 60.0)[0]:
+    while len(seen) < stages and process.poll() is None and select([pipe], [], [], 10.0 if seen else 60.0)[0]:
         text = os.read(pipe, 65536).decode()
         if not text:
             break

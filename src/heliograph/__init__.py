@@ -4,8 +4,18 @@ Public names are listed in `__init__.pyi`, in the order data flows, and loaded w
 import path.
 """
 
-from heliograph.numerics.names import lazy_names
-
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
-
 __version__ = "0.2.0"
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name; nothing is imported before, so that the command hears Ctrl-C from its first line on."""
+    from heliograph.numerics.names import lazy_names
+
+    here = globals()
+    here["__getattr__"], here["__dir__"], here["__all__"] = lazy_names(__name__, __file__)
+    return here[name] if name in here else here["__getattr__"](name)
+
+
+def __dir__() -> list[str]:
+    __getattr__("__all__")
+    return list(globals()["__all__"])

@@ -1,17 +1,22 @@
 """The command `heliograph`, and `python -m heliograph`, as a process: Ctrl-C ends it without a word from the start."""
 
-import atexit
-import gc
 import os
-import signal
-import sys
-from contextlib import suppress
-from typing import NoReturn
+
+INTERRUPTED = 130
+
+try:  # nothing is to undo while this is imported
+    import atexit
+    import gc
+    import signal
+    import sys
+    from contextlib import suppress
+except KeyboardInterrupt:
+    os._exit(INTERRUPTED)
 
 RARELY = 50_000, 20, 100  # what is imported and traced stays: the collector would look at it again and again
 
 
-def command() -> NoReturn:
+def command() -> None:
     """Run the command and end the process with its exit code.
 
     The process ends without the interpreter's own end, which would wait for threads, and free what threads of the

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -110,6 +111,29 @@ sys.meta_path.insert(0, Interrupted())
 command()"""
     )
     done = subprocess.run([sys.executable, "-c", program, "--help"], capture_output=True, text=True, cwd=folder)
+    assert (done.returncode, done.stderr, done.stdout) == (130, "", "")
+
+
+@pytest.mark.parametrize("module", ["signal", "contextlib"])
+def test_ctrl_c_is_heard_before_the_first_import(module):
+    """Python's own start is over: from the first line of `heliograph.__main__` on."""
+    program = f"""
+import _signal, os, sys
+_signal.signal(2, _signal.default_int_handler)  # what runs in the background ignores it
+class Interrupted:
+    def find_spec(self, name, path=None, target=None):
+        if name == "{module}":
+            os.kill(os.getpid(), 2)
+
+before = set(sys.modules)
+import heliograph
+assert set(sys.modules) - before == {{"heliograph"}}, set(sys.modules) - before  # or Ctrl-C meets these imports
+sys.meta_path.insert(0, Interrupted())
+from heliograph.__main__ import command"""
+
+    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[2])}
+    # `-S`: what `site` loads may import both.
+    done = subprocess.run([sys.executable, "-S", "-c", program], env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr, done.stdout) == (130, "", "")
 
 
