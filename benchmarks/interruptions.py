@@ -28,17 +28,21 @@ filters = {"aware": hg.linear_filter(plant, sensor, channel)}
 network = hg.Network(plant, {"a": hg.Node(sensor, hg.erasure(channel, 0.9), filters)})
 def build(noise=0.5):
     return network
+"""
+YARD = """
+import heliograph as hg
+plant, sensor = hg.LinearPlant([[0.95]], 0.5, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.05)
 def at(x, y):
     far = hg.hop(hg.Discrete([0.5 / (1 + x**2 + y**2), 1 / (1 + x**2 + y**2)], [0.5, 0.5]), 0.2)
-    return hg.Network(network.plant, {"near": hg.Node(sensor, hg.hop(0.8, 0.2), {}), "far": hg.Node(sensor, far, {})})
-place = at(1.0, 0.0)
+    return hg.Network(plant, {"near": hg.Node(sensor, hg.hop(0.8, 0.2), {}), "far": hg.Node(sensor, far, {})})
+network = at(1.0, 0.0)
 """
 DESIGN = """
-network = "net.py:place"
+network = "yard.py"
 budget = 2.0
 path_loss_exponent = 2.0
 [map]
-network = "net.py:at"
+network = "yard.py:at"
 x = [0.0, 1.0]
 y = [0.0, 1.0]
 points = 5
@@ -120,6 +124,7 @@ class Interruption:
 def prepared(folder: Path) -> None:
     """Write a network and its data."""
     (folder / "net.py").write_text(NETWORK)
+    (folder / "yard.py").write_text(YARD)
     (folder / "campaign.toml").write_text(CAMPAIGN)
     (folder / "design.toml").write_text(DESIGN)
     chance, state, lines = random.Random(1), 0.0, ["time,far"]
