@@ -22,6 +22,10 @@ from heliograph.simulation.stepping import AllFilters
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each
 TOGETHER, WIDTH = 16, 512  # rows of one turn of XLA's loop, which fill the vectors of a processor; rows of one call
+NUMBERS_TOGETHER, NUMBERS = (
+    2**14,
+    2**18,
+)  # of long rows no more: one costs about itself
 
 
 class Flat(NamedTuple):
@@ -130,6 +134,14 @@ class RowStep:
         """Return which engine steps the filters, and why."""
         return self._choice.explained
 
+    @property
+    def _block(self) -> tuple[int, int]:
+        """Return the number of rows of a call of XLA's program, and of those of a turn; the layout alone decides."""
+        longest = max(self._layout.size, self.state.size + self.outputs.size)
+        together = min(max(NUMBERS_TOGETHER // longest, 1), TOGETHER)
+        turns = min(max(NUMBERS // (together * longest), 1), WIDTH // together)
+        return turns * together, together
+
     @cached_property
     def program(self) -> str:
         """Return the step as text, which two processes compare to see that they compute the same."""
@@ -140,7 +152,7 @@ class RowStep:
         if self._code is not None:
             stepped: np.ndarray = self._code(rows)
             return stepped
-        width, together = (1, 1) if alone else (WIDTH, TOGETHER)
+        width, together = (1, 1) if alone else self._block
         run = _by_xla(self._layout, self.outputs, width, together)
         done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
         for begin in range(0, len(rows), width):
