@@ -13,6 +13,7 @@ from heliograph.live.lanes import FilterColumns
 from heliograph.live.plant import Plant
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
+from heliograph.simulation.centres.blame import blamed
 from heliograph.simulation.network import FUSED
 
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
@@ -92,10 +93,9 @@ class Judges:
                 rows.setdefault(taken[i][-1].slot, []).append(i)
         for those in rows.values():
             if len({taken[i][2].node_index for i in those}) > 1:
-                those.sort(key=lambda i: _size(taken[i][2]), reverse=True)
-                blamed = next((i for i in those if self._plausible_without(taken[i])), those[0])
+                one = blamed(those, lambda i: _size(taken[i][2]), lambda i: self._plausible_without(taken[i]))
                 for i in those:
-                    if i != blamed:
+                    if i != one:
                         del reasons[i]
 
     def _plausible_without(self, candidate: Candidate) -> bool:

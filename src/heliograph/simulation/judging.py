@@ -103,17 +103,24 @@ class Judges:
             return np.zeros((0, len(Judgement._fields)))
         return np.moveaxis(np.array(items), (0, 1), (-2, -1))
 
+    @property
+    def without_own(self) -> list[str]:
+        """Nodes that no filter of their own judges, but the central ones."""
+        return [name for name, places in self._places.items() if not places]
 
-def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> dict[str, dict[int, str]]:
-    """Rows of a recording that are implausible, by node, each with its reason."""
+
+def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
+    """Rows of a recording that are implausible, each with its reason: by node, and to all central filters."""
     judges, refused = Judges(network), dict[str, dict[int, str]]()
+    shared = judges.without_own
     for name in network.names:
-        votes = judges.of_node(outcome, name)
-        bad = _flagged(votes, "reason")
-        why = {k: said for k in bad if (said := why_values(votes[k]))}
-        if why:
+        if name not in shared and (why := _reasons(judges.of_node(outcome, name))):
             refused[name] = why
-    return refused
+    return refused, _reasons(judges.of_node(outcome, shared[0])) if shared else {}
+
+
+def _reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
+    return {k: said for k in _flagged(votes, "reason") if (said := why_values(votes[k]))}
 
 
 def doubts(

@@ -16,9 +16,17 @@ from heliograph.numerics.dates import unequal_steps
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
+from heliograph.simulation.centres.blame import refused_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.description.wide_angles import beyond_a_turn, wide_in_rows
-from heliograph.simulation.judging import any_implausible, doubts, forbidden_rows, plausible_step, refused_rows
+from heliograph.simulation.judging import (
+    Judges,
+    any_implausible,
+    doubts,
+    forbidden_rows,
+    plausible_step,
+    refused_rows,
+)
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
@@ -144,7 +152,8 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
     """Results of the filters without implausible data, which are warned of.
 
     If there are any, the recording is first filtered step by step without them to find all rows; then, without those
-    that all filters of a node refuse, once again as a recording that never had them.
+    that all filters of a node refuse, once again as a recording that never had them. Of what central filters refuse
+    one node is to blame in each row, and the others' values are judged again without it.
     """
 
     def grouped() -> tuple[np.ndarray, ...]:
@@ -156,17 +165,47 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
         said = doubts(network, outputs, {}, rest[2])
     else:
         # Find all rows that are, then filter again without them.
-        outputs = _filtered(*rest, grouped(), True)
-        refused = refused_rows(network, outputs)
-        said = doubts(network, outputs, refused, rest[2])
-        for name, rows in refused.items():
-            z[name] = z[name].copy()
-            z[name][list(rows)] = np.nan
-        again = _filtered(*rest, grouped(), False)
-        outputs = _filtered(*rest, grouped(), True) if any_implausible(again) else again
+        outputs = first_time = _filtered(*rest, grouped(), True)
+        refused = dict[str, dict[int, str]]()
+        while new := _refused(network, outputs, z, grouped(), rest, refused):
+            for name, rows in new.items():
+                refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
+                z[name] = z[name].copy()
+                z[name][list(rows)] = np.nan
+            again = _filtered(*rest, grouped(), False)
+            outputs = _filtered(*rest, grouped(), True) if any_implausible(again) else again
+        said = doubts(network, first_time, refused, rest[2])
     for line in said:
         warnings.warn(line, stacklevel=3)
     return {name: values for name, values in outputs.items() if not name.startswith("judged")}
+
+
+def _refused(
+    network: Network, outputs: PyTree, z: dict[str, np.ndarray], grouped: tuple[np.ndarray, ...], rest: Rest,
+    before: dict[str, dict[int, str]],
+) -> dict[str, dict[int, str]]:  # fmt: skip
+    """Rows that all filters of a node refuse, and those that central ones do by the node to blame; new ones alone."""
+    (filters, _, u, arrivals), (refused, shared) = rest, refused_rows(network, outputs)
+    if shared:
+        states = computed(_central_states, _central_states_by_xla, (filters, u, arrivals, grouped))
+        in_order = {name: z[name] for name in network.names}
+        nodes = Judges(network).without_own
+        refused |= refused_centrally(filters.central, states, in_order, u, shared, nodes)
+    new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
+    return {name: rows for name, rows in new.items() if rows}
+
+
+def _central_states(
+    filters: AllFilters, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...]
+) -> PyTree:
+    """States of the central filters before each row."""
+
+    def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+        k, u_k, z_k, drawn = row
+        return plausible_step(filters, states, z_k, u_k, k, drawn)[0], states[1]
+
+    before: PyTree = jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
+    return before
 
 
 def _filtered(*arguments: PyTree) -> PyTree:
@@ -224,3 +263,4 @@ def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[st
 
 
 _by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scanned)
+_central_states_by_xla = quickly_compiled(_central_states)

@@ -1,0 +1,90 @@
+"""Which node a row's implausible values are of, where a central filter judges those of all nodes together."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
+
+import jax
+import numpy as np
+
+from heliograph.codegen.engine import chosen
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import Judgement, why_values
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.side_by_side import filter_step, over_all
+
+Candidate = TypeVar("Candidate")
+
+
+def blamed(
+    candidates: Sequence[Candidate], size: Callable[[Candidate], float], plausible_without: Callable[[Candidate], bool]
+) -> Candidate:
+    """Return the first, from the largest on, without which a row is plausible; the largest if there is none."""
+    ordered = sorted(candidates, key=size, reverse=True)
+    if len(ordered) == 1:
+        return ordered[0]
+    return next((one for one in ordered if plausible_without(one)), ordered[0])
+
+
+def refused_centrally(
+    filters: Mapping[str, AbstractFilter],
+    before: Mapping[str, PyTree],
+    z: Mapping[str, Float[np.ndarray, "steps m"]],
+    u: Float[np.ndarray, "steps inputs"],
+    why: Mapping[int, str],
+    nodes: Sequence[str],
+) -> dict[str, dict[int, str]]:
+    """Give each row that all central filters find implausible to one of the nodes that have a value there.
+
+    Args:
+        filters: the central filters, which receive from all nodes.
+        before: their states before each row.
+        z: measurements by node, in the order in which the filters receive them.
+        u: inputs by row.
+        why: rows that are implausible, with the reason.
+        nodes: those that no filter of their own judges.
+
+    Returns:
+        the rows of each node that is to blame, with the reason.
+    """
+    tried = [(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
+    rows = np.array([k for k, _ in tried], dtype=int)
+    without = [z[name][rows] for name in z]
+    for i, (_, name) in enumerate(tried):
+        without[list(z).index(name)][i] = np.nan
+    votes = _judgements(filters, before, np.concatenate(without, axis=1), u, rows)
+    plausible = {those: why_values(vote) is None for those, vote in zip(tried, votes, strict=True)}
+    refused = dict[str, dict[int, str]]()
+    for k, reason in why.items():
+        if candidates := [those for those in tried if those[0] == k]:
+            _, name = blamed(
+                candidates, lambda those: float(np.nanmax(np.abs(z[those[1]][those[0]]))), plausible.__getitem__
+            )
+            refused.setdefault(name, {})[k] = reason
+    return refused
+
+
+def _judgements(
+    filters: Mapping[str, AbstractFilter], before: Mapping[str, PyTree], z: np.ndarray, u: np.ndarray, rows: np.ndarray
+) -> Float[np.ndarray, "row filter 4"]:
+    """Let each filter judge measurements of these rows, from its states before them."""
+    votes = []
+    for name, filter in filters.items():
+        states = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], before[name])
+        arguments = filter, states, z, u[rows], rows
+        with jax.enable_x64(True):
+            code = chosen(_judgement, arguments, (False, True, True, True, True))
+            judgement = to_numpy(_all_by_xla(*arguments, len(rows)) if code.code is None else code.results())
+        votes.append(np.stack([np.broadcast_to(field, len(rows)) for field in judgement], axis=-1))
+    return np.stack(votes, axis=1)
+
+
+def _judgement(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:
+    judgement = filter_step(filter, state, z, u, k, False, True)[1].judgement
+    assert judgement is not None  # as it judges
+    return judgement
+
+
+@quickly_compiled
+def _all_by_xla(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree, count: int) -> PyTree:
+    return over_all(lambda *row: _judgement(filter, *row), count)(state, z, u, k)
