@@ -4,8 +4,13 @@ import inspect
 import re
 import signal
 from contextlib import contextmanager
+from decimal import Decimal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import pandas as pd
+import xarray as xr
 from hypothesis import strategies as st
 from jaxtyping import config
 
@@ -37,9 +42,41 @@ LISTS = st.recursive(
 )
 THINGS = st.sampled_from(
     [None, b"x", object(), set(), {}, {"a": 1}, {1: 2}, lambda x: x, lambda: 0, np.array([None]), range(2), iter([1]),
-     int,      PLANT, SENSOR, HOP, KALMAN, NODE, hg.Rayleigh(1.0), COIN, ESCAPE, "exact", np.array("x")]
+     int,      PLANT, SENSOR, HOP, KALMAN, NODE, hg.Rayleigh(1.0), COIN, ESCAPE, "exact", np.array("x"), "a\0b",
+     slice(None), ..., memoryview(b"1"), pd.NA, pd.Timestamp(0), pd.Timedelta(1), pd.Series(["a"], dtype="category")]
 )  # fmt: skip
-JUNK = st.one_of(NUMBERS, st.text(SOUND, max_size=4), ARRAYS, LISTS, THINGS)
+KINDS = {  # of one and the same numbers: each means what the plain array means, or is refused in one line
+    "single": lambda a: np.where(np.abs(a) < 1e30, a, 1.0).astype(np.float32),
+    "big-endian": lambda a: a.astype(">f8"),
+    "extended": lambda a: a.astype(np.longdouble),
+    "objects": lambda a: a.astype(object),
+    "decimals": lambda a: np.vectorize(lambda x: Decimal(repr(float(x))), otypes=[object])(a) if a.size else a,
+    "read-only": lambda a: np.frombuffer(a.tobytes()).reshape(a.shape),
+    "strided": lambda a: np.repeat(a, 2, axis=-1)[..., ::2] if a.ndim else a,
+    "reversed": lambda a: a[::-1].copy()[::-1] if a.ndim else a,
+    "in columns": lambda a: np.array(a, order="F"),
+    "masked nowhere": np.ma.array,
+    "of JAX": jnp.asarray,
+    "of pandas": lambda a: pd.Series(a, range(5, 5 + len(a))) if a.ndim == 1 else pd.DataFrame(a) if a.ndim == 2 else a,
+    "nullable": lambda a: pd.array(a, dtype="Float64") if a.ndim == 1 else a,
+    "of xarray": xr.DataArray,
+}
+MORE = {  # and what is no such array
+    "masked": lambda a: np.ma.masked_all(a.shape),
+    "complex": lambda a: a + 0j,
+    "bytes": lambda a: np.full(a.shape, b"1"),
+    "records": lambda a: np.zeros(a.shape, [("x", "f8")]),
+    "too large": lambda a: np.full(a.shape, 10**400, dtype=object),
+    "NA": lambda a: np.full(a.shape, pd.NA),
+    "spans": lambda a: np.full(a.shape, np.timedelta64(1, "ns")),
+    **{f"dates by {unit}": lambda a, u=unit: np.full(a.shape, np.datetime64(0, u)) for unit in ("Y", "D", "s", "ns")},
+    "key": lambda a: jax.random.key(0),
+    "set of arrays": lambda a: xr.Dataset({"a": ("t", np.ones(2))}),
+}
+KINDS_OF_ARRAYS = st.builds(
+    lambda kind, a: ((KINDS | MORE)[kind])(a.astype(float)), st.sampled_from(sorted(KINDS | MORE)), ARRAYS
+)
+JUNK = st.one_of(NUMBERS, st.text(SOUND, max_size=4), ARRAYS, KINDS_OF_ARRAYS, LISTS, THINGS)
 RAW = re.compile(r"e-308|\bany, any\b|\bto inf\b|pydantic|validation error|Tracer")  # words of the works inside
 LENGTH = 500  # of a line that somebody reads
 SECONDS = 60.0  # that one call may take on a busy machine

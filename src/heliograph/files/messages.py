@@ -17,7 +17,7 @@ from heliograph.files.message_files import (
 from heliograph.files.own_messages import OwnMessages, holds_events, is_own
 from heliograph.files.sources import Sources
 from heliograph.files.table import kind_of
-from heliograph.numerics.check import InputError, check_progress, fail, file_path, instance
+from heliograph.numerics.check import InputError, check_progress, fail, file_path, flag, instance
 from heliograph.simulation.network import Network
 
 
@@ -58,6 +58,7 @@ def read_messages(
     path = file_path("recording", path)
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
+    strict, ignore_unknown = flag("strict", strict), flag("ignore_unknown", ignore_unknown)
     known = None if sources is None else Sources(sources, network)
     if is_bag(path):
         if known is None:

@@ -382,12 +382,12 @@ def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " 
         numbers: Array = np.asarray(unmasked(value))
     except jax.errors.TracerArrayConversionError:
         numbers = jnp.asarray(value, dtype=float)
-    except ValueError:  # rows of different lengths
-        raise fail(name, expected, repr(value)[:60]) from None
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths, a set of arrays, a key
+        raise fail(name, expected, shown(value)) from None
     # Concrete values: real numbers only, in double precision.
     if isinstance(numbers, np.ndarray):
         if numbers.dtype.kind not in "fiub":
-            raise fail(name, expected, repr(value)[:60])
+            raise fail(name, expected, shown(value))
         numbers = numbers.astype(np.float64)
     # A scalar stands for a vector of length one.
     numbers = numbers[None] if numbers.ndim == 0 and length in (1, None) else numbers

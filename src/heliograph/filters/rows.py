@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.codegen.engine import computed
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.masked import unmasked
 from heliograph.numerics.module import readable
@@ -146,8 +146,8 @@ def rows(
         raise fail(name, f"shape ({steps}, {length})", "none")
     try:
         values = np.asarray(unmasked(value), dtype=np.float64)
-    except (TypeError, ValueError):
-        raise fail(name, "an array of numbers", repr(value)[:60]) from None
+    except (TypeError, ValueError, OverflowError):
+        raise fail(name, "an array of numbers", shown(value)) from None
     values = values[:, None] if values.ndim == 1 and length in (1, None) else values
     table: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
     return table

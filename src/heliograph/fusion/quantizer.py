@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import array, check_count, fail, rank
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, library
@@ -120,7 +120,7 @@ def levels_of(value: int) -> Float[np.ndarray, ""]:
 
 def parameter(name: str, value: ArrayLike) -> Parameter:
     """Return a parameter as a number, or as one number per component."""
-    several = isinstance(value, Sequence) or np.ndim(value) > 0
+    several = isinstance(value, Sequence) or rank(name, value) > 0
     numbers: Parameter = array(name, value, (None,) if several else ())
     return numbers
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
-from heliograph.h_infinity.system import Growth, GrowthSystem, smallest_eigenvalue, symmetric_weight
+from heliograph.h_infinity.system import LARGEST, Growth, GrowthSystem, smallest_eigenvalue, symmetric_weight
 from heliograph.numerics.check import TINY, array, fail, instance, items, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -82,10 +82,12 @@ def certify_level(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 (inequalities (18) and (19)).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level, TINY))
+    level = float(scalar("level", level, TINY, LARGEST))
     findings = {"f": _findings("growth", growth), "h": _findings("output growth", output_growth)}
     n, m, T = system.states, system.received, system.steps
     K = array("gains", gains, (T, n, m))
+    if np.max(np.abs(K), initial=0.0) > LARGEST:
+        raise fail("gains", f"entries of at most {LARGEST:g}", f"{np.max(np.abs(K)):g}")
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
     lam = _multipliers(array("multipliers", multipliers, (T, None)))
     # Phi_k of every step, and its largest eigenvalue

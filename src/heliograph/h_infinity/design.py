@@ -28,8 +28,8 @@ from heliograph.h_infinity.step import (
     scale,
     step_matrices,
 )
-from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
-from heliograph.numerics.check import TINY, array, fail, instance, scalar
+from heliograph.h_infinity.system import LARGEST, GrowthSystem, symmetric_weight
+from heliograph.numerics.check import TINY, array, fail, flag, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -100,17 +100,17 @@ def recursive_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 2 (inequality (32), after a congruence).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    if level is not None:
-        scalar("level", level, TINY)
+    target = None if level is None else float(scalar("level", level, TINY, LARGEST))
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _weight(initial, system.states)
-    recursion = _Recursion(system, objective, solver, separate)
+    recursion = _Recursion(system, objective, solver, flag("separate", separate))
+    search = flag("search", search)
     # at the given level, or by bisection
-    design = None if level is None else recursion.run(level, start)
+    design = None if target is None else recursion.run(target, start)
     if design is not None and (design.feasible or not search):
         return design
-    guess = recursion.coordinates.unit if level is None else level
+    guess = recursion.coordinates.unit if target is None else target
     tried: dict[float, HInfinityDesign] = {}
 
     def works(trial: float) -> bool:
@@ -153,7 +153,7 @@ def horizon_design(
     n, m = system.states, system.received
     given_gains = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
     # coordinates of order one, and the unknowns of every step
-    steps, coordinates = scale(system, step_matrices(system, separate), given_gains)
+    steps, coordinates = scale(system, step_matrices(system, flag("separate", separate)), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
     layouts = [Layout(n, m, len(s.growth), given_correction) for s in steps]
     start = None if initial is None else coordinates.initial_weight(_weight(initial, n))

@@ -10,7 +10,7 @@ import scipy
 from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
-from heliograph.numerics.check import array, check_seed, fail, scalar, shown_error
+from heliograph.numerics.check import array, check_seed, fail, flag, scalar, shown_error
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import readable
@@ -142,7 +142,9 @@ def check_growth(
         ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.
     Source: H-infinity fusion over amplify-and-forward relays, condition (2).
     """
-    bottom, top = _check_box(constant, low, high)
+    constant = float(scalar("growth constant", constant, 0.0))
+    bottom, top = _check_box(low, high)
+    differences = flag("differences", differences)
     seed = check_seed("seed", seed)
     _check_function(check_callable("function", function, "the state"), bottom)
     if not differences and (np.any(bottom > 0) or np.any(top < 0)):
@@ -179,10 +181,7 @@ def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
         raise fail("function", expected, f"{axes} axes")
 
 
-def _check_box(
-    constant: float, low: ArrayLike, high: ArrayLike
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    scalar("growth constant", constant, 0.0)
+def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     bottom = np.asarray(array("low corner of the region", low, (None,)))
     top = np.asarray(array("high corner of the region", high, bottom.shape))
     if np.any(top < bottom) or not np.any(top > bottom):

@@ -14,6 +14,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, fold
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 
+LARGEST = 1e100  # of levels, gains and weights: products of three of them are numbers
 ROUNDING = 1e-13  # relative to the largest eigenvalue, in units of each component: smaller ones are rounding
 
 
@@ -309,7 +310,10 @@ def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
-    """Make a matrix exactly symmetric."""
+    """Make a matrix exactly symmetric; its entries times a level squared, and their products, must be numbers."""
+    largest = float(np.max(np.abs(matrix), initial=0.0))
+    if largest > LARGEST:
+        raise fail(name, f"entries of at most {LARGEST:g}", f"{largest:g}")
     unit = standard_deviations(matrix)
     skew = np.abs(matrix - np.swapaxes(matrix, -1, -2))
     if np.any(skew > SYMMETRY_TOLERANCE * unit[..., :, None] * unit[..., None, :]):

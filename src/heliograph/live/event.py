@@ -67,18 +67,18 @@ def moment(name: str, value: object) -> float:
     return float(value)
 
 
-def numbers(name: str, value: ArrayLike, size: int) -> Float[np.ndarray, " size"]:
-    """Copy `size` real numbers, NaN where one did not arrive; a single one need not be a list."""
+def numbers(name: str, value: ArrayLike, size: int, alone: int | None = None) -> Float[np.ndarray, " numbers"]:
+    """Copy `size` real numbers, or so many as come `alone`, NaN where one did not arrive; one need not be a list."""
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:
         values = np.array(unmasked(value))
         if values.dtype.kind not in "fiu":
             raise ValueError
-    except ValueError:
+    except (TypeError, ValueError, OverflowError):
         raise fail(name, expected, shown(value)) from None
     values = values.astype(np.float64)
-    values = values[None] if values.ndim == 0 and size == 1 else values
-    if values.ndim != 1 or len(values) != size:
+    values = values[None] if values.ndim == 0 and 1 in (size, alone) else values
+    if values.ndim != 1 or len(values) not in (size, alone):
         raise fail(name, expected, f"shape {values.shape}")
     if np.isinf(values).any():
         raise fail(name, "finite numbers, or NaN for what is missing", values.tolist())

@@ -197,7 +197,7 @@ def _row(value: object, length: int) -> np.ndarray | None:
         return None
     try:
         row = np.asarray(value)
-    except (ValueError, TypeError):  # rows of different lengths; traced numbers
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths; traced numbers
         return None
     return row if row.shape == (length,) and row.dtype.char == "d" else None
 

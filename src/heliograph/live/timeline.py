@@ -278,9 +278,8 @@ class Timeline:
         at = moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
         came = max(self._plant.confirmed, at) if arrival is None else moment(f"{name}, arrival", arrival)
-        alone = self._fleet.values_of(node)
-        size = size if alone is None or np.size(values) != alone else alone
-        known = self._fleet.with_losses(node, numbers(name, values, size).tolist())
+        given = numbers(name, values, size, self._fleet.values_of(node))
+        known = self._fleet.with_losses(node, given.tolist())
         return Known(index, whole(f"{name}, sequence", sequence), at, known, came)
 
     def _finalise(self) -> None:

@@ -170,11 +170,14 @@ def _drifts(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     """Offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start."""
     spread, wander, start_at, states = [], [], [], []
     for name, clock in clocks.items():
+        instance(f"clock of {name!r}", clock, Clock, "a Clock")
         start_at += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
-        for field in ("offset", "drift", "wander"):
+        clock_offset, drift, gain = (
             scalar(f"{field} of the clock of {name!r}", getattr(clock, field), 0.0)
-        spread += [clock.offset**2, clock.drift**2]
-        wander.append(clock.wander)
+            for field in ("offset", "drift", "wander")
+        )
+        spread += [clock_offset**2, drift**2]
+        wander.append(gain)
         offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
         states += [renamed(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
     center, start, strength = (library(x).asarray(library(x).stack(x)) for x in (start_at, spread, wander))

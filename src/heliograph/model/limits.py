@@ -18,12 +18,13 @@ LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | 
 
 def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":
     """Limits of so many received numbers; those of another node as they are; None where there are none."""
+    codes = _numbers("invalid values", invalid)
     if isinstance(limits, Limits):
-        if len(limits.low) != received or np.size(invalid):
-            got = f"those of {len(limits.low)}" + " and further codes" * bool(np.size(invalid))
+        if len(limits.low) != received or codes.size:
+            got = f"those of {len(limits.low)}" + " and further codes" * bool(codes.size)
             raise fail("limits of another node", f"those of {received} received numbers, codes included", got)
         return limits
-    return None if limits is None and np.size(invalid) == 0 else Limits(received, limits, invalid)
+    return None if limits is None and codes.size == 0 else Limits(received, limits, invalid)
 
 
 class Limits(Module):
@@ -84,7 +85,10 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
     if limits is None:
         return np.tile(everything, (received, 1))
     expected = f"(low, high), or such a pair for each of {received} received numbers, None where there is no limit"
-    values = np.asarray(limits, dtype=object)
+    try:
+        values = np.asarray(limits, dtype=object)
+    except (TypeError, ValueError):
+        raise fail("limits", expected, shown(limits)) from None
     if values.shape not in ((2,), (received, 2)):
         raise fail("limits", expected, shown(limits))
     rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
@@ -100,6 +104,6 @@ def _numbers(name: str, value: object, expected: str = "numbers") -> Float[np.nd
         values = np.asarray(value)
         if values.size and values.dtype.kind not in "fiu":
             raise ValueError
-    except ValueError:
+    except (TypeError, ValueError, OverflowError):
         raise fail(name, expected, shown(value)) from None
     return values.astype(np.float64)

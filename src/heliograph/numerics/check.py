@@ -219,7 +219,7 @@ def rank(name: str, value: object) -> int:
     """Return the number of axes of what may become an array."""
     try:
         return np.ndim(cast(ArrayLike, value))
-    except ValueError:  # rows of different lengths
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths, a set of arrays, a key
         raise fail(name, "an array of numbers", shown(value)) from None
 
 
@@ -237,11 +237,7 @@ def text(name: str, value: object) -> str:
 
 def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
     """Return a number for each of `count` steps, from one for all or one each."""
-    try:
-        single = np.ndim(value) == 0
-    except ValueError:  # rows of different lengths
-        single = False
-    numbers: np.ndarray = np.broadcast_to(array(name, value, () if single else (count,)), (count,))
+    numbers: np.ndarray = np.broadcast_to(array(name, value, (count,) if rank(name, value) else ()), (count,))
     return numbers
 
 

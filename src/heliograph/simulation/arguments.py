@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, check_seed, fail
+from heliograph.numerics.check import array, check_seed, fail, rank
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import Network
@@ -35,7 +35,7 @@ def measurement_of(name: str, value: ArrayLike, steps: int, received: int) -> np
 
     (steps,) is accepted for one component.
     """
-    flat = received == 1 and np.asarray(value, dtype=None if isinstance(value, np.ndarray) else object).ndim == 1
-    shape = (steps,) if flat else (steps, received)
-    values: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)
+    what = f"measurements of node {name!r}"
+    flat = received == 1 and rank(what, value) == 1
+    values: np.ndarray = array(what, value, (steps,) if flat else (steps, received), missing=True)
     return values[:, None] if flat else values

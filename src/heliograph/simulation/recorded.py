@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.codegen.engine import computed
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import array, check_times, fail, instance, table
+from heliograph.numerics.check import array, check_times, fail, instance, rank, table
 from heliograph.numerics.dates import unequal_steps
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
@@ -84,7 +84,8 @@ def run(
     name = next(iter(network.nodes))
     measured = table("measurements", measurements, f"arrays of nodes, such as {{{name!r}: z}},")
     network = network.restricted_to(measured)
-    steps = len(np.atleast_1d(np.asarray(next(iter(measurements.values())), dtype=object)))
+    some = next(iter(measured.values()))
+    steps = len(some) if rank("measurements", some) else 1
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
     # Measurements, inputs and times of one length.

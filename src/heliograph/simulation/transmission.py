@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.codegen.engine import computed
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, steps_covered
-from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
+from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance, rank
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, apply
@@ -41,7 +41,7 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     """
     instance("channel", first(channel), AbstractRandomAffine, "a channel, such as hop(...)")
     inputs = first(channel).inputs
-    flat = inputs == 1 and np.ndim(np.asarray(signal, dtype=None if isinstance(signal, np.ndarray) else object)) == 1
+    flat = inputs == 1 and rank("signal", signal) == 1
     y = array("signal", signal, (None,) if flat else (None, inputs), missing=True).reshape(-1, inputs)
     if not len(y):
         raise fail("signal", "at least one step", "none")

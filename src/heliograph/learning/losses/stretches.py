@@ -195,7 +195,7 @@ def as_fates(value: object) -> Fates:
     """
     if isinstance(value, CheckedFates):
         return value
-    listed = isinstance(value, Sequence) or np.ndim(cast(ArrayLike, value)) > 0
+    listed = isinstance(value, Sequence) or rank("fates", value) > 0
     items: list[Any] = list(cast(Sequence[Any], value)) if listed else [value]
     several = len(items) > 0 and all(rank("fates", x) == 1 for x in items)
     parts = [array("fates", x, (None,), missing=True) for x in (items if several else [cast(ArrayLike, value)])]

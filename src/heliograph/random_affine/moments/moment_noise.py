@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import array, check_count, fail, rank
 from heliograph.numerics.traced import is_traced, plain
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.monomials import Exponents, exponents
@@ -114,10 +114,7 @@ def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: in
     Raises:
         ValueError: fewer than two samples, an order below 1, numbers that are not finite.
     """
-    try:
-        single = np.ndim(samples) == 1
-    except ValueError:  # rows of different lengths
-        single = False
+    single = rank("noise samples", samples) == 1
     values = array("noise samples", samples, (None,) if single else (None, None))
     values = values[:, None] if single else values
     if len(values) < 2:

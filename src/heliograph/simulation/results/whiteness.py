@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import HALF
 from heliograph.filters.rows import data_of, over_rows
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.check import array, check_count, fail, instance
+from heliograph.numerics.check import array, check_count, fail, instance, rank
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import whiten
 from heliograph.numerics.module import readable
@@ -80,13 +80,17 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
     """Test whitened innovations; their power only where they are in units of a filter's claim (`claimed`).
 
     Raises:
-        ValueError: too few steps for the lags, nothing but zeros.
+        ValueError: too few steps for the lags, nothing but zeros, innovations beyond all numbers.
     """
     if len(white) < 10 * lags:
         raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
     if not np.any(np.nan_to_num(white)):
         raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
-    # Correlations and their standard errors by lag.
+    if np.isinf(white).any():
+        raise fail("data", "innovations that are finite numbers of their deviations", "infinite ones")
+    # Correlations and their standard errors by lag: the same in any unit, so in one whose squares are numbers.
+    unit = 2.0 ** (int(np.frexp(np.nanmax(np.abs(white)))[1]) - 1)
+    white = white / unit
     size, size_error = correlated_mean(_by_step(white**2))
     parts = [correlated_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
@@ -95,13 +99,13 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
         float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
     )
     share = float(correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0])
-    power = (size, size_error) if claimed else (np.nan, np.nan)
+    power = (size * unit * unit, size_error * unit * unit) if claimed else (np.nan, np.nan)
     return MemoryTest(correlation, error, p_value, share, *power)
 
 
 def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     """Innovations of unknown covariance, each component in units of its deviation."""
-    values = array("innovations", data, (None,) * max(np.ndim(np.asarray(data)), 1), missing=True)
+    values = array("innovations", data, (None,) * max(rank("innovations", data), 1), missing=True)
     value = values[:, None] if values.ndim == 1 else values
     largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
     value = value / np.where(largest > 0, largest, 1.0)
