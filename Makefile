@@ -45,6 +45,7 @@ bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/result
 soak: .venv/.test  ## Kill a service fifty times, interrupt commands 200 times; try ten thousand random networks (an hour or more; goes on where stopped)
 	@$(BIN)/python benchmarks/kills.py
 	@$(BIN)/python benchmarks/upper_claims.py
+	@$(BIN)/python benchmarks/upper_fusion.py
 	@$(BIN)/python benchmarks/interruptions.py
 	@$(BIN)/python benchmarks/soak.py
 

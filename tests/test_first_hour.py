@@ -33,7 +33,7 @@ def test_three_rooms_with_quantized_links(tmp_path):
     whole = table.loc["fused", "house"]
     alone = [table.loc[room, "local"] for room in house.states]
     assert whole["rmse"] < min(room["rmse"] for room in alone)
-    assert whole["claim"] == "upper" and whole["nees high"] < 1.0  # it promises no more than it keeps
+    assert whole["claim"] == "nominal" and whole["nees high"] < 1.0  # it promises no more than it keeps
     assert all(room["nees low"] < 1.0 < room["nees high"] for room in alone)  # exact
     for room, item in zip(house.states, alone, strict=True):  # each knows its own room best, and the fused all of them
         assert item[f"rmse of {room}"] < min(o[f"rmse of {room}"] for o in alone if o is not item)

@@ -1,4 +1,4 @@
-"""A short search for a broken claim of "upper"; benchmarks/upper_claims.py makes a long one."""
+"""A short search for a broken claim of "upper"; benchmarks/upper_claims.py and upper_fusion.py make long ones."""
 
 import importlib
 from pathlib import Path
@@ -33,3 +33,21 @@ def test_the_search_finds_a_rule_that_is_no_bound(search, monkeypatch):
         return search.ratio_of(search.behind_a_link("a hop", "zero mean")(numbers))
 
     assert search.ascended(ratio, 2, 20).largest > 1.1
+
+
+def test_no_claim_of_what_is_fused_or_smoothed_is_broken(search):
+    fusion = importlib.import_module("upper_fusion")
+    for name, ratio in fusion.families().items():
+        assert search.ascended(ratio, 0, STEPS).largest <= 1 + search.ROUNDING, name
+
+
+def test_the_search_finds_a_fusion_that_is_no_bound(search, monkeypatch):
+    """`MatrixWeights`-like: the information of independent errors, as if it claimed "upper"."""
+    fusion = importlib.import_module("upper_fusion")
+
+    class Naive(hg.fusion.EqualIntersection):
+        def combine(self, means, covariances):
+            mean, covariance = super().combine(means, covariances)
+            return mean, covariance / len(means)
+
+    assert search.ascended(fusion.intersected(lambda read: Naive()), 0, 5).largest > 1.5

@@ -224,9 +224,28 @@ def test_an_amplitude_that_follows_the_data_can_understate():
     with jax.enable_x64(True):
         bounds = [float(widen(np.array([[q * k**2]]), np.array([d]))[0, 0]) for d in (k, 0.0)]
     assert q * bounds[0] + (1 - q) * bounds[1] < 0.6 * 4 * q * k**2
-    assert hg.fusion.UniformQuantizer(8, 1.0).claim("exact") == "upper"
+    assert hg.fusion.UniformQuantizer(8, 1.0).claim("exact") == "nominal"
     assert ESCAPE.claim("upper") == "nominal"
     assert {item.claim("none") for item in QUANTIZERS.values()} == {"none"}
+
+
+def test_a_bound_does_not_hold_of_what_a_saturated_quantizer_leaves():
+    """Small estimates are those after a loss, x = 0 + e with the variance before data, of which the claim is a mean.
+
+    Behind a gain of 0 or 10, each with 1/2, the best linear filter claims about 1 - 5^2 / 50 = 1/2. Within an amplitude
+    that only estimates without a signal fit into, errors are the state itself, of variance 1, to 10 %.
+    """
+    plant, sensor = hg.LinearPlant([[0.5]], 0.75, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
+    link = hg.hop(hg.Discrete([0.0, 10.0], [0.5, 0.5]), 0.01)
+    node = hg.Node(sensor, link, {"f": hg.linear_filter(plant, sensor, link)})
+    fusion = hg.Fusion("f", hg.CovarianceIntersection(), hg.fusion.UniformQuantizer(64, 0.05))
+    with pytest.warns(UserWarning, match="no valid covariance"):
+        record = hg.monte_carlo(hg.Network(plant, {"a": node, "b": node}, {"c": fusion}), 1, 4000, 0)
+    fused = record.estimates["fused"]["c"]
+    there = np.isfinite(fused.covariance[:, 0, 0, 0])
+    error = (record.truth - fused.mean)[there, 0, 0]
+    assert fused.claim == "nominal" and 0.2 < there.mean() < 0.4
+    assert np.mean(error**2) > 1.5 * fused.covariance[there, 0, 0, 0].max()
 
 
 @pytest.mark.parametrize(

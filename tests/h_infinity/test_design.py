@@ -210,7 +210,7 @@ def test_what_varies_over_time_and_what_does_not():
     [
         (
             lambda: hg.h_infinity.recursive_design(node(0), -1.0),
-            "level: expected a positive number up to 1e+100, got -1",
+            r"level: expected a positive number up to 1e\+100, got -1",
         ),
         (lambda: hg.h_infinity.recursive_design(node(0), 1.0, objective="norm"), "objective: expected one of trace, "),
         (

@@ -232,10 +232,10 @@ def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
         np.testing.assert_allclose(counted.symbols, stored.symbols, rtol=1e-14)
 
 
-def test_quantizers_over_time_and_the_claim_of_a_static_one(statistics):
-    """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
+def test_quantizers_over_time_and_the_bound_of_a_static_one(statistics):
+    """A bound through a static quantizer holds where nothing saturates; levels that double halve the errors."""
     result = statistics["fused"]["over time"]
-    assert result.claim == "upper" and result.uplink.saturated.max() == 0 and result.worst_direction().z < 4
+    assert result.claim == "nominal" and result.uplink.saturated.max() == 0 and result.worst_direction().z < 4
     trace = np.trace(result.claimed(), axis1=1, axis2=2)
     assert trace[3] < 0.6 * trace[2]  # the quantizers' share, (r + s)^2 with s halved, outweighs what filters do
     with pytest.raises(ValueError, match="at most 7 steps"):

@@ -53,7 +53,7 @@ class AllReports(AbstractInformedFusion):
     Reports that fade, get lost or are late (`ReportLink`), or are quantized, are modelled as such; a late report is one
     of the past estimate, which is a state for as long as it may arrive.
 
-    Claim: as `MatrixWeights`; "upper" behind quantizers whose error is bounded before any data. Refused where the
+    Claim: as `MatrixWeights`; behind quantizers what these leave of it. Refused where the
     centre cannot know the nodes' gains: nodes that lose measurements behind links that may lack their report.
 
     Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.

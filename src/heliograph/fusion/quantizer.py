@@ -60,7 +60,8 @@ class AbstractQuantizer(Module):
     def claim(self, claim: Claim) -> Claim:
         """Claim of the widened covariance of a quantized estimate, from the claim of the estimate: "nominal" at most.
 
-        A quantizer whose error bounds hold whatever the data, before which they are known, may claim "upper".
+        A quantizer that has an error bound for every value, known before any data, may claim "upper": that bound does
+        not hold for values which are left out where it saturates.
         """
         return weakest([claim, "nominal"])
 
@@ -148,8 +149,9 @@ def check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float
 class UniformQuantizer(AbstractQuantizer):
     """Midpoints of `levels` equal segments of [-amplitude, amplitude], its ends outside: u q(x / u), u = scale.
 
-    |error| <= scale amplitude / levels where x / u lies within the amplitude; outside nothing is guaranteed. Errors and
-    their bounds do not depend on the data, so what was "upper" stays so.
+    |error| <= scale amplitude / levels where x / u lies within the amplitude; outside nothing is guaranteed or used. So
+    data select what is used: of errors e with E[e e'] <= P, those with x inside have E[e e'] <= P / p, where p is the
+    probability of that, and no less where errors are large just then. What was "upper" is "nominal".
 
     Args:
         levels: number of segments, at least 2.
@@ -186,10 +188,6 @@ class UniformQuantizer(AbstractQuantizer):
         half = self.scale * self.amplitude / self.levels
         bound: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
         return bound
-
-    def claim(self, claim: Claim) -> Claim:
-        """Lower a claim to "upper" at most."""
-        return weakest([claim, "upper"])
 
 
 def _published(
