@@ -1,6 +1,7 @@
 """Simplification of scalar operations: constants, neutral elements, two operations as one.
 
-A product with zero is zero only if the other factor is known to be finite: data may be NaN.
+A product with zero is zero only if the other factor is known to be finite: data may be NaN. In a product of matrices a
+known zero leaves its term out (`rules/matrices.py`).
 """
 
 import math

@@ -35,6 +35,7 @@ class Lowering:
         self.graph = Graph(most)
         self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
         self.sizes: dict[Jaxpr, int] = {}  # of programs within loops and branches
+        self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}  # entries of A B' -> A and B, of each product
 
     def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:
         """Return the results of a traced program for these arguments."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.nodes import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
@@ -26,23 +27,62 @@ def repeated(
     turn(row, carry) returns the next carry, and what is stacked in that row; rows run from 0 up, or down to 0.
     """
     graph, outer = lowering.graph, lowering.graph.current
-    body = Block(outer)
-    loop = Loop(body, length, [n for x in carry for n in scalars(x)])
-    loop.counter = counter = graph.fresh("counter", "i64", (), body, loop)
-    # In the body the carry is a parameter; the turn is traced once.
-    loop.parameters = [
-        graph.fresh("parameter", n.type, (), body, (loop, index)) for index, n in enumerate(loop.initial)
-    ]
-    graph.current = body
-    row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
-    following, stacked = turn(row, _like(carry, loop.parameters))
-    loop.following = [n for x in following for n in scalars(x)]
-    memory = [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
-    graph.current = outer
+
+    def body(loop: Loop, now: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[InMemory]]:
+        loop.counter = counter = graph.fresh("counter", "i64", (), loop.body, loop)
+        row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
+        following, stacked = turn(row, now)
+        return following, [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
+
+    return _looped(lowering, length, carry, body)
+
+
+def _looped(
+    lowering: Lowering, length: int | None, carry: Sequence[np.ndarray], body: Callable[[Loop, list[np.ndarray]], Any]
+) -> tuple[list[np.ndarray], Any]:
+    """Lower a loop; return the carry after it, and what body(loop, carry) returns beside the following carry.
+
+    A matrix that is symmetric before the loop is taken for one within it, of which the loop carries a triangle; where
+    the body does not keep it so, the body is lowered once more for all entries.
+    """
+    graph, outer = lowering.graph, lowering.graph.current
+    halves = [is_symmetric(x) for x in carry]
+    while True:
+        begun = graph.serial
+        loop = Loop(Block(outer), length, _entries(carry, halves))
+        # In the body the carry is a parameter; the turn is traced once.
+        loop.parameters = _stand_ins(graph, "parameter", loop, loop.body)
+        graph.current = loop.body
+        following, rest = body(loop, _like(carry, loop.parameters, halves))
+        graph.current = outer
+        kept = [half and is_symmetric(x) for half, x in zip(halves, following, strict=True)]
+        if kept == halves:
+            break
+        halves = kept
+        graph.most += graph.serial - begun
+    loop.following = _entries(following, halves)
     outer.items.append(loop)
     # After the loop the carry is a result.
-    loop.results = [graph.fresh("result", n.type, (), outer, (loop, index)) for index, n in enumerate(loop.initial)]
-    return _like(carry, loop.results), memory
+    loop.results = _stand_ins(graph, "result", loop, outer)
+    return _like(carry, loop.results, halves), rest
+
+
+def _stand_ins(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
+    """Make nodes that stand for the carry in the body or after the loop."""
+    return [graph.fresh(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
+
+
+def is_symmetric(x: np.ndarray) -> bool:
+    """Return whether the entries of matrices (..., n, n), n > 1, are the same nodes across the diagonal."""
+    if x.ndim < 2 or x.shape[-1] != x.shape[-2] or not x.size or x.shape[-1] == 1:
+        return False
+    return all(a is b for a, b in zip(x.ravel().tolist(), np.swapaxes(x, -1, -2).ravel().tolist(), strict=True))
+
+
+def _entries(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list[Node]:
+    """Return the nodes of arrays, of those marked the upper triangles alone."""
+    parts = [x[..., *np.triu_indices(x.shape[-1])] if h else x for x, h in zip(arrays, halves, strict=True)]
+    return [n for x in parts for n in scalars(x)]
 
 
 def _stack(
@@ -66,15 +106,26 @@ def _numbers(value: np.ndarray) -> list[Node]:
     return flat
 
 
-def _like(arrays: Sequence[np.ndarray], nodes: Sequence[Node]) -> list[np.ndarray]:
-    """Restore arrays of the same shapes from nodes, and keys."""
+def _like(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves: Sequence[bool]) -> list[np.ndarray]:
+    """Restore arrays of the same shapes, and keys, from nodes as `_entries` returns them."""
     rest = iter(nodes)
-    return [
-        array_of(
-            [Key(next(rest), next(rest)) if isinstance(x, Key) else next(rest) for x in a.ravel().tolist()], a.shape
+    results = []
+    for a, half in zip(arrays, halves, strict=True):
+        n = a.shape[-1] if half else 0
+        shape = (*a.shape[:-2], n * (n + 1) // 2) if half else a.shape
+        kinds = a[..., *np.triu_indices(n)] if half else a
+        x = array_of(
+            [Key(next(rest), next(rest)) if isinstance(k, Key) else next(rest) for k in kinds.ravel().tolist()], shape
         )
-        for a in arrays
-    ]
+        results.append(_mirrored(x, n) if half else x)
+    return results
+
+
+def _mirrored(upper: np.ndarray, n: int) -> np.ndarray:
+    """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
+    places = np.zeros((n, n), dtype=int)
+    places[np.triu_indices(n)] = np.arange(upper.shape[-1])
+    return upper[..., np.maximum(places, places.T)]
 
 
 def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -163,27 +214,27 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
 
     Under `vmap` the condition has axes, the leading ones of the carry, and each entry keeps its carry likewise.
     """
-    params, graph, outer = equation.params, lowering.graph, lowering.graph.current
+    params, graph = equation.params, lowering.graph
     conditional, fixed = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
-    carry = [lowering.nodes(x) for x in inputs[conditional + fixed :]]
-    body = Block(outer)
-    loop = Loop(body, None, [n for x in carry for n in scalars(x)])
-    loop.parameters = [graph.fresh("parameter", n.type, (), body, (loop, k)) for k, n in enumerate(loop.initial)]
-    graph.current = body
-    now = _like(carry, loop.parameters)
-    # The check comes before the body; there the carry is selected by each run's condition.
-    active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
-    loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
-    body.items.append(Check(loop))
-    results = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
-    moved = [n for x in results for n in scalars(x)]
-    going = [a for x in results for a in np.repeat(active.ravel(), len(scalars(x)) // active.size)]
-    loop.following = [select(graph, a, new, old) for a, new, old in zip(going, moved, loop.parameters, strict=True)]
-    graph.current = outer
-    outer.items.append(loop)
-    loop.results = [graph.fresh("result", n.type, (), outer, (loop, k)) for k, n in enumerate(loop.initial)]
-    return _like(carry, loop.results)
+
+    def body(loop: Loop, now: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
+        # The check comes before the body; there the carry is selected by each run's condition.
+        active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
+        loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
+        loop.body.items.append(Check(loop))
+        moved = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
+        return [_where_active(graph, active, new, old) for new, old in zip(moved, now, strict=True)], None
+
+    return _looped(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]
+
+
+def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    going = np.repeat(active.ravel(), new.size // active.size).tolist()
+    return array_of(
+        [select(graph, a, x, y) for a, x, y in zip(going, new.ravel().tolist(), old.ravel().tolist(), strict=True)],
+        old.shape,
+    )
 
 
 def size_of(lowering: Lowering, jaxpr: Any) -> int:

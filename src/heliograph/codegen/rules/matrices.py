@@ -90,18 +90,80 @@ def _arg(op: str) -> Rule:
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Sum products over the contracted axes, with batch axes first."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    graph, type = lowering.graph, result_type(equation)
-    x, y = (_of_type(graph, type, x) for x in inputs)
+    type = result_type(equation)
+    x, y = (_of_type(lowering.graph, type, x) for x in inputs)
     a, b = _batched(x, left, left_batch), _batched(y, right, right_batch)
-    inner = a.shape[2]
+    products = [_product(lowering, type, rows, columns) for rows, columns in zip(a, b, strict=True)]
+    return [array_of([n for product in products for n in product.ravel().tolist()], result_shape(equation))]
+
+
+def _product(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Compute A B' of A (n, k) and B (m, k). Of a congruence C P C' both triangles are the upper one.
+
+    A = C P and B = C with a symmetric P, or A = C and B = C P. That A A' is symmetric needs no rule, since equal
+    expressions are one node.
+    """
+    mirrored = any(_is_weighted(x, y) or _is_congruence(lowering, x, y) for x, y in ((a, b), (b, a)))
+    places = [(i, j) for i in range(len(a)) for j in range(i if mirrored else 0, len(b))]
+    product = np.empty((len(a), len(b)), dtype=object)
+    sums = _sums_of_products(lowering.graph, type, [(a[i], b[j]) for i, j in places])
+    for (i, j), entry in zip(places, sums, strict=True):
+        product[i, j] = entry
+        if mirrored:
+            product[j, i] = entry
+    for entries, factors in ((product, (a, b)), (product.T, (b, a))):
+        lowering.products[_key(entries)] = factors
+    return product
+
+
+def _sums_of_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Node]:
+    """Sum the products of pairs of vectors, all sums term by term at once, so that none waits for the last of another.
+
+    A term of data that is multiplied by a known zero is none, whatever the data: a zero in a matrix of a model says
+    what does not depend on what, and NaN passes only to what does.
+    """
     product, sum_ = ("and", "or") if type == "bool" else ("mul", "add")
-    nodes = []
-    for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
-        for row in rows:
-            for column in columns:
-                products = [graph.node(product, type, row[k], column[k]) for k in range(inner)]
-                nodes.append(total(graph, sum_, type, products, 0.0 if type == "f64" else 0))
-    return [array_of(nodes, result_shape(equation))]
+    sums: list[Node | None] = [None] * len(pairs)
+    for k in range(len(pairs[0][0]) if pairs else 0):
+        for place, (a, b) in enumerate(pairs):
+            if _leaves_out(a[k], b[k]) or _leaves_out(b[k], a[k]):
+                continue
+            term, before = graph.node(product, type, a[k], b[k]), sums[place]
+            sums[place] = term if before is None else graph.node(sum_, type, before, term)
+    return [graph.constant(0.0 if type == "f64" else 0, type) if s is None else s for s in sums]
+
+
+def _leaves_out(x: Node, y: Node) -> bool:
+    return x.op == "constant" and not x.value and y.op != "constant"
+
+
+def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether A = B diag(w)."""
+    if a.shape != b.shape:
+        return False
+    weights = [[_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
+    return all(w is not None and w is column[0] for column in weights for w in column)
+
+
+def _weight(x: Node, y: Node) -> Node | None:
+    """Return w of a number x = w y."""
+    if y.op == "constant" and y.value == 1:
+        return x
+    return x.args[x.args[0] is y] if x.op == "mul" and any(a is y for a in x.args) else None
+
+
+def _is_congruence(lowering: Lowering, a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether A = B P of a symmetric P."""
+    factor, p = lowering.products.get(_key(a), (a[:0], a[:0]))
+    return _is_same(factor, b) and _is_same(p, p.T)
+
+
+def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.shape == b.shape and all(x is y for x, y in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True))
+
+
+def _key(matrix: np.ndarray) -> Any:
+    return matrix.shape, *matrix.ravel().tolist()
 
 
 def _of_type(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
