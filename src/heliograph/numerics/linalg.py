@@ -55,7 +55,9 @@ def summed(a: jax.Array, axis: int) -> jax.Array:
 
 
 def times(a: Array, b: jax.Array) -> jax.Array:
-    """A B, as a sum of columns of A times rows of B."""
+    """A B; of many runs as a sum of columns of A times rows of B."""
+    if np.ndim(a) == b.ndim == 2:
+        return jnp.asarray(a) @ b
     inner = b.shape[0]
     if not 0 < inner <= 2 * UNROLL_LIMIT:  # twice: cubature has two points for each state
         return jnp.einsum("ij...,jk...->ik...", a, b)
@@ -111,7 +113,7 @@ def identity(n: int, like: jax.Array) -> np.ndarray:
 
 def diagonal(d: jax.Array) -> jax.Array:
     """diag(d)."""
-    return d[None] * identity(d.shape[0], d[None])
+    return jnp.where(identity(d.shape[0], d[None]) == 1, d[None], 0.0)
 
 
 def rounding(tolerance: float, like: jax.Array, units: int = 10) -> float:
@@ -360,7 +362,7 @@ def _over_matrices(function: Callable[..., jax.Array], a: jax.Array, b: jax.Arra
 def contract(tensor: Array, matrix: jax.Array) -> jax.Array:
     """sum_ab T_ijab W_ab."""
     n = matrix.shape[0]
-    if n > UNROLL_LIMIT // 2:
+    if matrix.ndim == 2 or n > UNROLL_LIMIT // 2:
         return jnp.einsum("ijab...,ab...->ij...", tensor, matrix)
     flat = jnp.asarray(tensor).reshape(*tensor.shape[:2], n * n, *tensor.shape[4:])
     return summed(flat * matrix.reshape(n * n, *matrix.shape[2:]), 2)
