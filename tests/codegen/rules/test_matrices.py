@@ -90,6 +90,16 @@ def test_the_terms_of_known_zeros_are_not_computed():
     assert count == 2 * (8 + 8) - 4  # rows, then columns, of positions; four products are in both
 
 
+def test_the_zeros_of_a_matrix_in_memory_are_known_too():
+    """Of 400 numbers 39 are not zero; NaN moves one state on."""
+    f = 0.9 * np.eye(20) + np.diag(np.full(19, 0.1), 1)
+    x = np.ones((1, 20))
+    x[0, 7] = np.nan
+    moved = compile(lambda x: f @ x, x[0])(x)[0]
+    assert np.flatnonzero(np.isnan(moved)).tolist() == [6, 7]
+    assert operations(lambda x: f @ x, (20,)) == (39 + 19, 0)
+
+
 def mirrored(a):
     """The upper triangle for both: what is symmetric but for rounding, written by hand."""
     return jnp.where(np.triu(np.ones(a.shape[-2:], bool)), a, jnp.swapaxes(a, -1, -2))

@@ -3,6 +3,7 @@
 What `vmap` made of a step, for all rows of a record at once, becomes that step in a loop again.
 """
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,6 +20,9 @@ OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
     "bitcast_convert_type", "round",
 )  # fmt: skip
+
+
+FEW_TERMS = 256  # of a product with a known matrix, which are written out rather than looped over
 
 
 def is_long(inputs: list[Value]) -> bool:
@@ -84,7 +88,7 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     """Loop over the first batch axis, else the first free axis of the left argument, else that of the right one."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     to_number = not result_shape(equation) and all(x.size <= LARGE for x in inputs)
-    if to_number or not is_long(inputs):
+    if to_number or not is_long(inputs) or _has_few_terms(lowering, equation, inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     a, b = (in_memory(lowering, x) for x in inputs)
     free_left, free_right = (
@@ -112,6 +116,17 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
     count = (b if in_left is None else a).shape[0]
     return list(repeated(lowering, count, [], turn)[1])
+
+
+def _has_few_terms(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> bool:
+    """Return whether the known zeros of a factor, which leave terms out, leave few of them."""
+    terms = math.prod(result_shape(equation))
+    terms *= math.prod(inputs[0].shape[d] for d in equation.params["dimension_numbers"][0][0])
+    if any(x.size > LARGE for x in inputs):
+        return False
+    tables = [x for x in inputs if isinstance(x, InMemory) and x.buffer.kind == "table" and not x.moves]
+    shares = [sum(n.value != 0 for n in x.nodes(lowering.graph).ravel().tolist()) / x.size for x in tables if x.size]
+    return any(terms * share <= FEW_TERMS for share in shares)
 
 
 def _first(x: InMemory, axis: int) -> InMemory:
