@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import computed
+from heliograph.codegen.engine import chosen, of_arrays, setting
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
@@ -17,7 +17,7 @@ from heliograph.live.row_step import NetworkStep
 from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim, Estimate, with_sound_claim
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.float64 import understood
+from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.gathering import Fused
@@ -115,8 +115,10 @@ Into: TypeAlias = "Callable[[Sweep, History, StepOfRow], SmootherStep]"
 
 
 @lru_cache
-def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
-    """Compile (numbers, history, (begin, stop)) -> estimates after row `begin`, given the rows after it, up to `stop`.
+def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], Callable[..., PyTree]]:
+    """Return (numbers, history, (begin, stop)) -> estimates after row `begin`, given the rows after it, up to `stop`.
+
+    The function, and XLA's program of it.
 
     The smoother's terms of a step are computed again from the state before it, and so are the steps between rows where
     time counts steps; begin > 0.
@@ -148,8 +150,7 @@ def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
         _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
         return sweep.outputs(steps, later)
 
-    by_xla = jax.jit(run, compiler_options=understood())
-    return lambda *arguments: computed(run, by_xla, arguments)
+    return run, jax.jit(run, compiler_options=understood())
 
 
 def _into_row(dt: int) -> Into:
@@ -198,15 +199,29 @@ class Sweeper:
         with jax.enable_x64(True):
             self.sweep = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
             self._numbers, static = cast(self.sweep)
-        self._run = sweep_back(static, dt)
+        self._run, self._by_xla = sweep_back(static, dt)
+        self._programs = dict[tuple[int, str], Callable[[History, np.ndarray], PyTree]]()
 
     def _fuses(self, fusion: Fused, kinds: tuple[int, ...]) -> bool:
         return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
+    def _program(self, history: History) -> Callable[[History, np.ndarray], PyTree]:
+        """Return the program for histories of this length, which an engine is chosen for once."""
+        key = len(history.rows), setting()
+        if key not in self._programs:
+            span = np.zeros(2, dtype=np.int32)
+            choice = chosen(self._run, (self._numbers, history, span), [False] * 3)
+            if choice.code is None:
+                self._programs[key] = lambda *arguments: to_numpy(self._by_xla(self._numbers, *arguments))
+            else:
+                code = choice.code.with_first(*self._numbers)
+                self._programs[key] = lambda *arguments: _only(code(*jax.tree.leaves(arguments)))
+        return self._programs[key]
+
     def estimates(self, history: History, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
         """Return estimates after a row given the rows after it, by node and filter."""
         with jax.enable_x64(True):
-            by_kind, fused = self._run(self._numbers, history, np.array([begin, stop], dtype=np.int32))
+            by_kind, fused = self._program(history)(history, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
         for k, outputs in by_kind.items():
             for f, name in enumerate(self.network.kinds[k].filters):
@@ -219,6 +234,11 @@ class Sweeper:
                 claim = fusion.claim([claims[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)])
             results.setdefault(FUSED, {})[name] = _estimate_of(outputs, claim, ())
         return {node: filters for node, filters in results.items() if filters}
+
+
+def _only(results: PyTree) -> PyTree:
+    """Return the results of the one run of several."""
+    return of_arrays(lambda leaf: leaf[0, ...], results)
 
 
 def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:

@@ -200,6 +200,8 @@ class Plant:
 
     def withdraw(self) -> tuple[list[Withdrawn], list[int]]:
         """Remove the rows of contradicted leaps; return their events, and their slots."""
+        if not self.contradicted:
+            return [], []
         rows = [row for row in self.rows.held[1:] if row.key[0] in self.contradicted]
         self.contradicted = []
         for row in rows:

@@ -220,13 +220,14 @@ class Timeline:
         time = np.ceil(min(self.now, self._fleet.end_step) - lag) if by_steps else self.now - lag
         if time <= rows.keys[0][0] if by_steps else time < rows.keys[0][0]:
             raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
-        index, slots = rows.after(time), [row.slot for row in rows.held]
-        if not by_steps or rows.keys[index - 1][0] < time:
-            self._fleet.look(rows.held[index - 1], time, self._spare)
-            slots.insert(index, self._spare)
-        else:
-            index -= 1
-        return self._lanes.sweeper.estimates(self._fleet.pool.history(slots), index, len(slots))
+        # The row of that moment, or a prediction to it, behind the row before it, and all later ones.
+        after = rows.after(time)
+        there = by_steps and rows.keys[after - 1][0] >= time
+        slots = [row.slot for row in rows.held[after - 1 - there :]]
+        if not there:
+            self._fleet.look(rows.held[after - 1], time, self._spare)
+            slots.insert(1, self._spare)
+        return self._lanes.sweeper.estimates(self._fleet.pool.history(slots), 1, len(slots))
 
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.
