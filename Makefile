@@ -42,11 +42,12 @@ docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery
 bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/results.json
 	@$(BIN)/python benchmarks/run.py
 
-soak: .venv/.test  ## Kill a service fifty times, interrupt commands 200 times; try ten thousand random networks (an hour or more; goes on where stopped)
+soak: .venv/.test  ## Kill, interrupt, try thousands of random programs and networks (hours; goes on where stopped)
 	@$(BIN)/python benchmarks/kills.py
 	@$(BIN)/python benchmarks/upper_claims.py
 	@$(BIN)/python benchmarks/upper_fusion.py
 	@$(BIN)/python benchmarks/interruptions.py
+	@$(BIN)/python benchmarks/random_programs.py
 	@$(BIN)/python benchmarks/soak.py
 
 clean:  ## Remove the environment and everything made by the other targets

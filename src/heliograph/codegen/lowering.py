@@ -49,6 +49,15 @@ class Lowering:
             values |= zip(equation.outvars, self.equation(equation, arguments), strict=True)
         return [self._read(values, v) for v in jaxpr.outvars]
 
+    def results(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
+        """Return the results of a whole program; an array without entries, which has no node, is a typed view."""
+        avals: list[Any] = [v.aval for v in program.jaxpr.outvars]
+        values = self.inline(program, inputs)
+        return [x if x.size else self._empty(a) for x, a in zip(values, avals, strict=True)]
+
+    def _empty(self, aval: Any) -> InMemory:
+        return InMemory.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
+
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Return the results of one operation.
 

@@ -65,7 +65,7 @@ def lower_traced(traced: ClosedJaxpr, tree: Any, most: int = MOST) -> Program:
         inputs.append(buffer)
         values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
     with jax.enable_x64(True):
-        outputs = lowering.inline(traced, values)
+        outputs = lowering.results(traced, values)
     return Program(lowering.graph, inputs, outputs, tree)
 
 

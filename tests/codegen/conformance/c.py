@@ -41,7 +41,7 @@ def by_c(cases: Sequence[Case], folder: Path, compiler: str, quiet: bool = False
 def _function(case: Case, name: str) -> tuple[str, str, list[tuple[str, tuple[int, ...]]]]:
     program = program_of([case])
     places = {b: f"x{n}[{{}}]".format for n, b in enumerate(program.inputs)}
-    nodes = [scalars(x) for x in program.outputs]
+    nodes = [scalars(x) if x.size else [] for x in program.outputs]
     source = CSource([n for x in nodes for n in x], places, "double", name)
     body, arrays, ends, types = source.statements(program.graph.top), [], [], []
     for number, buffer in enumerate(program.inputs):
@@ -49,10 +49,11 @@ def _function(case: Case, name: str) -> tuple[str, str, list[tuple[str, tuple[in
         arrays.append(f"    static {c_type(buffer.type, 'double')} {array};")
         arrays.append(f"    if (fread(x{number}, sizeof x{number}[0], {buffer.size}, stdin) != {buffer.size}) return;")
     for flat, x in zip(nodes, program.outputs, strict=True):
-        if flat:
-            kind = c_type(flat[0].type, "double")
-            ends += [f"    {{ {kind} y = {source.name(n)}; fwrite(&y, sizeof y, 1, stdout); }}" for n in flat]
-        types.append((flat[0].type if flat else "f64", x.shape))
+        kind = flat[0].type if flat else x.type
+        ends += [
+            f"    {{ {c_type(kind, 'double')} y = {source.name(n)}; fwrite(&y, sizeof y, 1, stdout); }}" for n in flat
+        ]
+        types.append((kind, x.shape))
     lines = [f"static void {name}(void)", "{", *arrays, *source.declarations(), *body, *ends, "}"]
     return "\n".join([*source.table_definitions(), *lines]), f"{name}();", types
 

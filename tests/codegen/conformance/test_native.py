@@ -3,7 +3,7 @@
 The cases are made of the table of rules, so that a new rule is covered by being there. What may differ, and why:
 
 * Subnormal numbers, which XLA's code takes for zeros, and native code computes with (`difference`).
-* Bits of NaN, and the type of an array without entries, which holds no number of any.
+* Bits of NaN.
 * Units of rounding of functions, which both compute in their own way, and of sums and products, in their own order
   and with a product and a sum rounded once (`Case.units`). XLA's cosh, sinh and exp2 of large numbers have 14 digits,
   its cbrt of powers of two 14, and its lgamma is off beside its zeros.

@@ -14,7 +14,7 @@ from heliograph.codegen.llvm.lanes import WIDTH, gather, lane_numbers, types
 from heliograph.codegen.llvm.operations import BITS
 from heliograph.codegen.llvm.text import Slots, Writer, loops_of, turns_of
 from heliograph.codegen.llvm.transposed import mover
-from heliograph.codegen.lowering import Lowering, refusing
+from heliograph.codegen.lowering import Lowering, Value, refusing
 from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.nodes import Buffer, Node, Type, Unsupported
 from heliograph.codegen.program import (
@@ -93,7 +93,7 @@ def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]
     results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
         nodes_only = number in last or not isinstance(value, InMemory)
-        stored = _filled(lowering, lowering.nodes(value)) if nodes_only else _stored(lowering, value, results)
+        stored = _filled(lowering, value) if nodes_only else _stored(lowering, value, results)
         results.append(stored.buffer)
     return results
 
@@ -106,13 +106,14 @@ def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemor
     if whole and alone and value.size == buffer.size:
         buffer.shape = value.shape
         return value
-    return _filled(lowering, lowering.nodes(value)) if value.size <= LONG else copied(lowering, value)
+    return _filled(lowering, value) if value.size <= LONG else copied(lowering, value)
 
 
-def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
-    """Store nodes in new memory, constants too."""
-    flat: list[Node] = nodes.ravel().tolist()
-    buffer = Buffer("scratch", flat[0].type if flat else "f64", nodes.shape, lowering.graph.current)
+def _filled(lowering: Lowering, value: Value) -> InMemory:
+    """Store an array in new memory, constants too."""
+    flat: list[Node] = lowering.nodes(value).ravel().tolist()
+    type: Type = value.type if isinstance(value, InMemory) else flat[0].type
+    buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
     for index, node in enumerate(flat):
         lowering.graph.store(buffer, node, index, (), ())
     return InMemory.whole(buffer)

@@ -110,6 +110,8 @@ def _of_integers(node: Node, names: list[str], text: str, emit: Emit) -> str:
     if op == "neg":
         return emit(f"sub {text} zeroinitializer, {names[0]}")
     signed = type[0] == "i"
+    if type == "bool" and op in ("max", "min"):  # LLVM's own, in haste for masks of AVX-512, end the process
+        return emit(f"{'or' if op == 'max' else 'and'} {first}, {names[1]}")
     if op in ("max", "min"):
         return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}({first}, {text} {names[1]})")
     if op == "abs" and signed:

@@ -225,7 +225,7 @@ def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
             )
     # The program of one run.
     values.append(InMemory.whole(number))
-    outputs = lowering.inline(made, values)
+    outputs = lowering.results(made, values)
     return Program(graph, [*inputs, number], outputs, None)
 
 

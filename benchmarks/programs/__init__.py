@@ -1,0 +1,1 @@
+"""Random programs: their text, and what two engines make of it."""
