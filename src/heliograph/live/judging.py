@@ -6,16 +6,20 @@ from typing import TypeAlias
 
 import numpy as np
 
-from heliograph.filters.plausibility import Judgement, why_inputs, why_values
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import Judgement, Reason, why_inputs, why_values
 from heliograph.live.event import Known
 from heliograph.live.fleet import Fleet
 from heliograph.live.lanes import FilterColumns
 from heliograph.live.plant import Plant
-from heliograph.live.rows import HeldRow
+from heliograph.live.rows import BEFORE, HeldRow
+from heliograph.model.estimate import Estimate
+from heliograph.model.faults import function_fault
 from heliograph.numerics.types import Float
 from heliograph.simulation.centres.blame import blamed
 from heliograph.simulation.network import FUSED
 
+TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
@@ -35,6 +39,7 @@ class Judges:
             if not len(of_node):
                 self._central.add(index)
         self._every = _columns(places)
+        self._faults: dict[tuple[str, str], tuple[int, str]] = {}  # by node and filter: how often tried, what was found
 
     def implausible_inputs(
         self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
@@ -80,7 +85,39 @@ class Judges:
             node_of_row = row.slot, event.node_index
             largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _size(taken[j][2]))
         first_of_plant = {i: why for i, why in reasons.items() if spoilt.get(taken[i][1].name, i) == i}
-        return {i: why for i, why in first_of_plant.items() if i in largest.values()}
+        return {i: why + self._fault(taken[i]) for i, why in first_of_plant.items() if i in largest.values()}
+
+    def _fault(self, candidate: Candidate) -> str:
+        """Name the function of a filter that returned no number in a row, after a semicolon; "" where none did.
+
+        What was found of a filter is said again, and none is tried more than TRIES times: a plant may send for ever.
+        """
+        _, plant, event, row = candidate
+        pool, index = self.fleet.pool, plant.rows.index(row.key)
+        before, after = plant.rows.held[index - 1], pool.table[row.slot, pool.outputs]
+        known = pool.table[before.slot, pool.outputs]
+        for place in self.fleet.lanes.places:
+            filter = filter_of(self.fleet, place)
+            judged = place.judgement is not None and after[place.judgement.reason] in (
+                Reason.UNSOUND,
+                Reason.PREDICTION,
+            )
+            concerned = event.node_index < 0 or place.node in (FUSED, self.fleet.network.names[event.node_index])
+            if filter is None or not judged or not concerned:
+                continue
+            tried, said = self._faults.get((place.node, place.filter), (0, ""))
+            if not said and tried < TRIES:
+                n = len(filter.states)
+                mean = known[place.mean : place.mean + n]
+                covariance = known[place.covariance : place.covariance + n * n].reshape(n, n)
+                estimate = Estimate(mean, covariance, place.claim)
+                begun = before.key[1] != BEFORE
+                said = function_fault(filter, estimate if begun else filter.estimate(filter.init()),
+                                      *pool.led(before.slot, row.slot))  # fmt: skip
+                self._faults[place.node, place.filter] = tried + 1, said
+            if said:
+                return f"; {said}"
+        return ""
 
     def _blame(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
         """Leave of the events of several nodes in one row, which a central filter judged together, the one to blame.
@@ -121,6 +158,14 @@ def _columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
     """Return the columns of the judgements of these filters, of shape (filter, part)."""
     results = [list(output.judgement) for output in outputs if output.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
+
+
+def filter_of(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:
+    """Return the filter of these columns; None of a fusion rule."""
+    if output.node == FUSED:
+        central = fleet.network.fused[output.filter]
+        return central if isinstance(central, AbstractFilter) else None
+    return fleet.network.nodes[output.node].filters.get(output.filter)
 
 
 def _listens(fleet: Fleet, output: FilterColumns) -> bool:

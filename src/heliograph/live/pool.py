@@ -92,6 +92,14 @@ class Pool:
         table[after, : self.outputs.stop] = done
         table[after, self.held], table[after, self.at.start] = now_held, k
 
+    def led(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
+        """Return the inputs that led from the row in one slot to that in another, and the number of the step there."""
+        dt, table = self.lanes.dt, self.table
+        u = table[after if dt is None else before, self.held]
+        if dt is not None:
+            u = _with_time_step(u[None], dt, table[[after], self.numbers.stop - 1] - table[[before], -1])[0]
+        return u, int(table[after, self.at.start])
+
     def jump(self, slot: int, to: int) -> None:
         """Take the row in a slot, in place, to step number `to` without measurements, in bounded work."""
         row = self.table[slot]

@@ -25,6 +25,7 @@ from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, PyTree
+from heliograph.simulation.description.wide_angles import WideAngles
 
 BEYOND, RARE = 10, 1e-4  # measurements in a row, each beyond what an honest filter sees so seldom
 
@@ -44,7 +45,8 @@ class Stream:
         invalid: codes for a missing value, as of a `Node`.
 
     A filter that was sure of a wrong start, behind a gate, leaves out all that comes: where BEYOND measurements in a
-    row are further off than one in 10,000 should be, a warning says so, and `doubt` until one is not.
+    row are further off than one in 10,000 should be, a warning says so, and `doubt` until one is not. An angle that is
+    known less well than the filter can use is warned of once.
 
     Raises:
         ValueError: no filter, or invalid limits.
@@ -57,7 +59,7 @@ class Stream:
         self.limits = limits_of(filter.received, limits, invalid)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
         self.steps, self._last, self._beyond = 0, -1, 0
-        self._placed = _place(filter)
+        self._placed, self._angles = _place(filter), WideAngles(filter)
         self._stepper = self._placed.stepper()
 
     @property
@@ -109,6 +111,9 @@ class Stream:
         nis, arrived = stepper.judgement[:2].tolist()
         if arrived and nis == nis:
             self._judge(nis > placed.rare[int(arrived)])
+        if self._angles.states:
+            for line in self._angles.said_of(stepper.estimate[1]):
+                warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
         estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
         return with_sound_claim(estimate) if nis != nis else estimate
 

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.filters.plausibility import in_words
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.judging import Judges
+from heliograph.live.judging import Judges, filter_of
 from heliograph.live.lanes import shared_lanes
 from heliograph.live.plant import Link
 from heliograph.live.plant_codec import plant_bytes, plant_from
@@ -21,6 +21,7 @@ from heliograph.model.estimate import Estimate, JudgedEstimate, with_sound_claim
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.results.record import Record
@@ -71,7 +72,8 @@ class Timeline:
     row.
 
     `counts` has the number of each verdict; `dropped` the number of single values beyond a node's limits, which counted
-    as not arrived; `forced` the number of rows that became final early.
+    as not arrived; `reasons` says in words, by node, why the last implausible event was one; `forced` is the number of
+    rows that became final early.
 
     Args:
         network: the network whose filters run.
@@ -103,6 +105,10 @@ class Timeline:
         self._fleet = Fleet(self._lanes, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
         self._plant, self._spare = self._fleet.begin("", start, None), self._fleet.pool.take()
         self._judges = Judges(self._fleet)
+        self.reasons: dict[str, str] = {}
+        filters = [(place, filter_of(self._fleet, place)) for place in self._lanes.places]
+        watched = [(place, WideAngles(filter)) for place, filter in filters if filter is not None]
+        self._angles = [(place, angles) for place, angles in watched if angles.states]
         self._finals = Finals(2 * self.capacity, self._lanes.step_rows.outputs.size)
 
     def __getstate__(self) -> dict[str, object]:
@@ -151,17 +157,19 @@ class Timeline:
             ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
                 is counted, and everything stays as it was.
         """
-        event, dropped, _ = self._fleet.within(node, self._known(node, sequence, time, values, arrival))
+        event, dropped, beyond = self._fleet.within(node, self._known(node, sequence, time, values, arrival))
         plant, before = self._plant, self._plant.clock
         verdict = self._fleet.take(plant, event, None if arrival is None else event.arrival)
         if verdict == "used":
             nothing = dropped and np.isnan(event.values).all()
-            if nothing or self._refuses(event, plant.changes[-1][0]):
+            why = beyond if nothing else self._refuses(event, plant.changes[-1][0])
+            if why is not None:
                 # As if it had never arrived.
-                verdict = "implausible"
+                verdict, self.reasons[node] = "implausible", why
                 self._fleet.undo(plant, before)
                 self._fleet.step([plant])
             else:
+                self._warn_of_angles(plant.rows.held[-1].slot)
                 self._finalise()
         link = plant.link(node)
         link.count(verdict, event.sequence, event.time)
@@ -169,15 +177,27 @@ class Timeline:
             link.dropped += dropped
         return verdict
 
-    def _refuses(self, event: Known, row: HeldRow) -> bool:
-        """Step what an event changed; is it implausible? Inputs are also judged over one unit of time after them."""
+    def _warn_of_angles(self, slot: int) -> None:
+        """Warn of each angle that a filter knows less well than it can use, once."""
+        outputs = self._fleet.pool.table[slot, self._fleet.pool.outputs]
+        for place, angles in self._angles:
+            n = len(self.network.states)
+            covariance = outputs[place.covariance : place.covariance + n * n].reshape(n, n)
+            for line in angles.said_of(covariance):
+                warnings.warn(f"timeline, {place.node}/{place.filter}: {line}", stacklevel=3)
+
+    def _refuses(self, event: Known, row: HeldRow) -> str | None:
+        """Step what an event changed; return why it is implausible, None if it is not.
+
+        Inputs are also judged over one unit of time after them.
+        """
         fleet, plant = self._fleet, self._plant
         fleet.step([plant])
-        refused = bool(self._judges.implausible([(0, plant, event, row)]))
-        if not refused and event.node_index < 0 and self._lanes.dt is not None:
+        why = self._judges.implausible([(0, plant, event, row)]).get(0)
+        if why is None and event.node_index < 0 and self._lanes.dt is not None:
             after = fleet.pool.trial(np.array([row.slot]), np.full((1, self._lanes.given), np.nan), np.inf)
-            refused = self._judges.why_inputs(after[0]) is not None
-        return refused
+            why = self._judges.why_inputs(after[0])
+        return why
 
     def advance(self, now: float) -> None:
         """Advance the time: what is older than the window becomes final."""

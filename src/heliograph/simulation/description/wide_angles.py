@@ -63,6 +63,20 @@ def wide_in_rows(network: Network, record: Record) -> Iterator[str]:
                 yield f"{node}/{label}: {known} {rows}; {REMEDY}"
 
 
+class WideAngles:
+    """Watch for estimates of one filter that know an angle less well than it can use; each angle is said once."""
+
+    def __init__(self, filter: AbstractFilter):
+        used = None if filter.claim == "none" else filter.angles_used()
+        self.states = {} if used is None else {i: filter.states[i] for i in used.states}
+        self._most = largest_deviation(filter) if self.states else np.inf
+
+    def said_of(self, covariance: Float[np.ndarray, "n n"]) -> list[str]:
+        """Return a line for each angle that is known worse for the first time."""
+        wide = [i for i in self.states if covariance[i, i] > self._most**2]
+        return [f"{self.states.pop(i)!r} is known to +- {covariance[i, i] ** 0.5:.2g} rad; {REMEDY}" for i in wide]
+
+
 def _filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
     """Yield the filters that have angles, with their places."""
     if not first(network.plant).circular:
