@@ -47,3 +47,14 @@ def test_what_is_left_by_rounding_is_known(rule):
     variance = 1 / np.sum(weights / sizes)
     assert np.allclose(fused.covariance, variance * np.outer(direction, direction), rtol=0, atol=1e-6)
     assert np.allclose(fused.mean, variance * np.sum(weights * means / sizes) * direction, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES_THAT_INTERSECT, ids=lambda rule: type(rule).__name__)
+def test_what_an_estimate_knows_exactly_is_kept_to_the_bit(rule):
+    """A claim of 0 is that of the number itself, not of it and 1e-8 of what the other says."""
+    known = hg.model.Estimate(np.array([3.1, 1.0]), np.diag([0.0, 2.0]), "exact")
+    other = hg.model.Estimate(np.array([10.0, 0.0]), np.array([[1.0, 0.5], [0.5, 1.0]]), "exact")
+    for estimates in ([known, other], [other, known]):
+        fused = hg.fusion.fuse(rule, estimates)
+        assert fused.mean[0] == 3.1
+        assert np.array_equal(fused.covariance[0], [0.0, 0.0]) and fused.covariance[1, 1] > 0.5

@@ -182,7 +182,7 @@ def intersect_inversely(
     covariance, common = fused(w)
     # The two factors sum to the fused information: of differences, as above.
     mean = a + covariance @ ((q_information - (1 - w) * common) @ (b - a))
-    return mean, without_known(symmetric(covariance), both)
+    return with_known(mean, symmetric(covariance), jnp.stack([a, b]), both)
 
 
 @runs_last_of(jnp.shape)
@@ -212,12 +212,21 @@ def _widened_inverse(a: jax.Array, least: jax.Array) -> jax.Array:
     return inverse(a + diagonal(none * least))
 
 
-def without_known(
-    covariance: Float[jax.Array, "n n"], inputs: Float[jax.Array, "count n n"]
-) -> Float[jax.Array, "n n"]:
-    """Fused covariance, exactly zero for a component that an input knows exactly."""
-    known = jnp.any(jnp.diagonal(inputs, axis1=1, axis2=2) == 0, axis=0)
-    return jnp.where(known[:, None] | known, 0.0, covariance)
+def with_known(
+    mean: Float[jax.Array, "n"],
+    covariance: Float[jax.Array, "n n"],
+    means: Float[jax.Array, "count n"],
+    inputs: Float[jax.Array, "count n n"],
+) -> tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]:
+    """Fused mean and covariance, where a component that an input knows exactly is that input's, of variance zero.
+
+    In `inverses` a small number stands for no variance, of which the mean would keep 1e-8 of what the others say.
+    """
+    exact = jnp.diagonal(inputs, axis1=1, axis2=2) == 0
+    for own, known in zip(reversed(list(means)), reversed(list(exact)), strict=True):
+        mean = jnp.where(known, own, mean)
+    known = jnp.any(exact, axis=0)
+    return mean, jnp.where(known[:, None] | known, 0.0, covariance)
 
 
 Shared = tuple[Float[jax.Array, " degree"], Float[jax.Array, "n n"]]  # shares pi, and (sum_j pi_j P_j^-1)^-1

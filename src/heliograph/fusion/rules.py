@@ -16,7 +16,7 @@ from heliograph.fusion.intersection import (
     inverses,
     trace_optimal_weights,
     trace_shares,
-    without_known,
+    with_known,
 )
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
 from heliograph.fusion.mesh.graph import Graph, Neighbours, neighbours_of
@@ -143,7 +143,7 @@ class AbstractIntersection(AbstractFusion):
         """Find the weights and intersect."""
         information = inverses(covariances)
         mean, covariance = intersect(means, information, self.weights_of(covariances, information))
-        return mean, without_known(covariance, covariances)
+        return with_known(mean, covariance, means, covariances)
 
 
 class CovarianceIntersection(AbstractIntersection):
