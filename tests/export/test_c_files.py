@@ -203,8 +203,9 @@ def test_no_heap_no_variables_no_library_but_libm(readme, tmp_path, precision):
     hg.export_c(readme.nodes["cart"].filters["relay_aware"], tmp_path / "cart.c", precision)
     subprocess.run([COMPILER, *FLAGS, "-c", "cart.c", "-o", "cart.o"], cwd=tmp_path, check=True)
     listed = subprocess.run(["nm", "cart.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    suffix = "" if precision == "double" else "f"
     symbols = [line.split()[-2:] for line in listed.splitlines()]
-    assert {name for kind, name in symbols if kind == "U"} == {"sqrt" if precision == "double" else "sqrtf"}
+    assert {name for kind, name in symbols if kind == "U"} == {f"{f}{suffix}" for f in ("nearbyint", "sqrt")}
     assert sorted(name for kind, name in symbols if kind == "T") == [
         "cart_covariance", "cart_mean", "cart_start", "cart_step",
     ]  # fmt: skip
@@ -283,3 +284,31 @@ def test_both_files_or_none(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         hg.export_c(item, tmp_path / "a.c")
     assert not list(tmp_path.iterdir())
+
+
+def of_inputs(noise, name="dt"):
+    plant = hg.LinearPlant(lambda u: jnp.array([[1.0, u[0]], [0.0, 1.0]]), noise, [0.0, 0.0], np.eye(2), inputs=[name])
+    return hg.kalman_filter(plant, hg.LinearSensor([[1.0, 0.0]], 0.04))
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_a_time_step_that_is_none_is_refused_as_elsewhere(precision, tmp_path):
+    """Also a Q of rank 1, whose second pivot is rounding; the steps around it are as if it had never come."""
+    walk = of_inputs(lambda u: 0.1 * jnp.array([[u[0] ** 4 / 4, u[0] ** 3 / 2], [u[0] ** 3 / 2, u[0] ** 2]]))
+    device, clean = Device(walk, tmp_path, precision=precision), Device(walk, tmp_path, "clean", precision)
+    for dt in (1.0, 0.3, 7.7, 0.0, 1e-3):
+        assert device.step([1.0], [dt]) == clean.step([1.0], [dt]) == 0
+        before = device.state.copy()
+        for none in (-1.0, -1e-9, 2.0**32 - 2.0**20, 1e30, 2.0**60):
+            assert device.step([1.0], [none]) == 6
+        np.testing.assert_array_equal(device.state, before)
+    np.testing.assert_array_equal(device.mean(), clean.mean())
+    np.testing.assert_array_equal(device.covariance(), clean.covariance())
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_inputs_for_which_a_function_returns_no_covariance_are_refused(precision, tmp_path):
+    device = Device(of_inputs(lambda u: jnp.array([[1.0, u[0]], [u[0], 1.0]]), "s"), tmp_path, precision=precision)
+    assert [device.step([1.0], [s]) for s in (0.5, 2.0, 0.5, 1.0, -1.5)] == [0, 6, 0, 0, 6]

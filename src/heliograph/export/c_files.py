@@ -18,7 +18,6 @@ from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance, shown
 
-ROUNDING: dict[Real, float] = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
 PRECISIONS: dict[str, Real] = {"double": "double", "float": "float"}
 COMPILER = "cc"
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Werror", "-O2")
@@ -40,10 +39,10 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
 
     `step_start(state)` initialises; `step_step(state, z, u)` predicts over one step with the inputs u and corrects by
     the components of z that arrived (NaN: did not arrive), and returns 0, or refuses by another number and leaves the
-    state unchanged, as where a component is more than 1e6 deviations from what was expected; `step_mean(state)` and
-    `step_covariance(state)` (row by row) are the estimate. There is no heap, no global variable, and no library but
-    libm. All names begin with the name of the file. A filter of a plant that varies over time contains its tables, and
-    refuses a step past their end.
+    state unchanged, as where a component is more than 1e6 deviations from what was expected, or a time step "dt" is
+    negative; `step_mean(state)` and `step_covariance(state)` (row by row) are the estimate. There is no heap, no global
+    variable, and no library but libm. All names begin with the name of the file. A filter of a plant that varies over
+    time contains its tables, and refuses a step past their end.
 
     Args:
         filter: the filter.
@@ -98,7 +97,7 @@ def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
     if real == "float" and not isinstance(filter, ScheduledFilter):  # whose covariances are a table
         filter, kind = factored(filter), f"{kind}, its covariance as L D L'"
-    return c_text(step_program(filter, ROUNDING[real]), Form(prefix, real, names, kind))
+    return c_text(step_program(filter, real), Form(prefix, real, names, kind))
 
 
 def received_names(filter: AbstractFilter) -> Sequence[str]:

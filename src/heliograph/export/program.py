@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from heliograph.codegen.c_source import Real
 from heliograph.codegen.folding import is_finite
 from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, code_line, scalars, traced, type_of
@@ -18,6 +19,7 @@ from heliograph.codegen.memory import LARGE, InMemory
 from heliograph.codegen.nodes import Buffer, Node, Type, Unsupported
 from heliograph.filters.base import AbstractFilter, step_with_judgement
 from heliograph.filters.plausibility import LIMIT
+from heliograph.model.inputs import inputs_spoil
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
 
@@ -92,6 +94,7 @@ class DeviceLowering(Lowering):
         return InMemory.whole(Buffer("table", type_of(array), array.shape, self.graph.top, array))
 
 
+ROUNDING: dict[Real, float] = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
 RANDOM = ("random_", "threefry")
 RESERVED = frozenset((
     "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
@@ -113,7 +116,8 @@ class Leaf(NamedTuple):
 class StepProgram(NamedTuple):
     """A step: its inputs and outputs; `start_mean` and `start_covariance` are those before the first step.
 
-    `implausible`: whether the estimate would lose its digits, so that the step must not be used.
+    `implausible`: whether the estimate would lose its digits, so that the step must not be used; `spoilt`: whether
+    the inputs are none.
     """
 
     filter: AbstractFilter
@@ -125,15 +129,16 @@ class StepProgram(NamedTuple):
     mean: list[Node]
     covariance: list[Node]
     implausible: Node
+    spoilt: Node
     start_mean: np.ndarray
     start_covariance: np.ndarray
     equations: list[Any]
 
 
-def step_program(filter: AbstractFilter, rounding: float) -> StepProgram:
-    """Lower `step` of a filter to a graph of scalar operations.
+def step_program(filter: AbstractFilter, real: Real) -> StepProgram:
+    """Lower `step` of a filter to a graph of scalar operations, for numbers of this type.
 
-    A measurement that differs from what was expected by less than `rounding` of itself is used, however small its
+    A measurement that differs from what was expected by less than `ROUNDING` of itself is used, however small its
     deviations are: after many steps its expectation is rounded by as much (and below 1e-33 has few digits).
 
     An array of the state that is symmetric at the start, and after every step from a symmetric one, is always
@@ -145,6 +150,7 @@ def step_program(filter: AbstractFilter, rounding: float) -> StepProgram:
     state = filter.init()
     leaves, tree = jax.tree.flatten(state)
     z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
+    rounding, precision = ROUNDING[real], np.float64 if real == "double" else np.float32
 
     def step(leaves: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> PyTree:
         after, estimate, judgement, innovation = step_with_judgement(filter, jax.tree.unflatten(tree, leaves), z, u, k)
@@ -153,7 +159,8 @@ def step_program(filter: AbstractFilter, rounding: float) -> StepProgram:
         far = differs > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
         far &= (jnp.abs(z) > jnp.abs(z - innovation.value)) & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
         implausible = jnp.any(far) | (judgement.input > 0)
-        return jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible
+        spoilt = inputs_spoil(filter, filter.inputs, u, k, precision)
+        return jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt
 
     # Trace the step, and refuse random numbers: a device has none.
     program, _ = traced(step, leaves, z, u, k)
@@ -163,9 +170,9 @@ def step_program(filter: AbstractFilter, rounding: float) -> StepProgram:
             raise no_c(equation.primitive.name, code_line(equation))
     estimate, names = filter.estimate(state), names_of(state)
     graph, inputs, outputs = _with_symmetry(program, leaves)
-    # Inputs are (state, z, u, k), outputs (state, mean, covariance, whether it is implausible).
+    # Inputs are (state, z, u, k), outputs (state, mean, covariance, whether it is implausible, and the inputs spoilt).
     *buffers, of_z, of_u, of_k = inputs
-    *after, mean, covariance, (implausible,) = map(scalars, outputs)
+    *after, mean, covariance, (implausible,), (spoilt,) = map(scalars, outputs)
     parts = zip(names, buffers, map(np.asarray, leaves), after, strict=True)
     return StepProgram(
         filter=filter,
@@ -177,6 +184,7 @@ def step_program(filter: AbstractFilter, rounding: float) -> StepProgram:
         mean=mean,
         covariance=covariance,
         implausible=implausible,
+        spoilt=spoilt,
         start_mean=np.asarray(estimate.mean),
         start_covariance=np.asarray(estimate.covariance),
         equations=equations,

@@ -61,7 +61,7 @@ def c_text(program: StepProgram, form: Form) -> CText:
     places = {leaf.buffer: _entry(f"state->{leaf.name}") for leaf in program.leaves}
     places |= {program.z: _entry("z"), program.u: _entry("u"), program.k: lambda index: "state->step"}
     roots = [node for member in members for node in member.after]
-    source = CSource([*roots, *program.mean, program.implausible], places, real, prefix)
+    source = CSource([*roots, *program.mean, program.implausible, program.spoilt], places, real, prefix)
     try:
         body = source.statements(program.graph.top)
     except Unsupported as error:
@@ -155,7 +155,10 @@ def _checks(program: StepProgram, real: Real) -> list[str]:
 def _finish(members: Sequence[Member], program: StepProgram, source: CSource, counts: bool) -> list[str]:
     """Return the statements that refuse an implausible step, and then write all that changed."""
     known = [node for node in program.mean if node.op != "constant"]
-    lines = [f"    if (!isfinite({source.name(node)})) return 4;" for node in dict.fromkeys(known)]
+    lines = []
+    if program.spoilt.op != "constant":
+        lines.append(f"    if ({source.name(program.spoilt)}) return 6;")
+    lines += [f"    if (!isfinite({source.name(node)})) return 4;" for node in dict.fromkeys(known)]
     if program.implausible.op != "constant":
         lines.append(f"    if ({source.name(program.implausible)}) return 5;")
     for member in members:
@@ -183,7 +186,9 @@ def _comment(program: StepProgram, form: Form) -> str:
         "corrects it by the measurement z. A component of z that did not arrive is NaN; nothing may be infinite.",
         f"{prefix}_step returns 0, or refuses and leaves the state as it was: 1 a measurement is infinite, 2 an input",
         "is not finite, 3 the step is past the end of what varies over time, 4 the estimate would not be finite,",
-        "5 the measurement or an input is so far from what was expected that the estimate would lose its digits.",
+        "5 the measurement or an input is so far from what was expected that the estimate would lose its digits,",
+        "6 the inputs are none: dt is negative, beyond 2^53 units or the wrapped difference of unsigned counters of 32",
+        "bits, or a function of the inputs returned no finite numbers, or no covariance.",
         "",
         *_numbered("z", form.received, [""] * len(form.received)),
         *_numbered("u", filter.inputs, [""] * len(filter.inputs)),

@@ -64,7 +64,7 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
 
 
 def _is_time_step(dt: Array) -> Array:
-    wrapped = (dt >= WRAPPED - NEAR) & (dt < WRAPPED) & (dt % 1 == 0)
+    wrapped = (dt >= WRAPPED - NEAR) & (dt < WRAPPED) & (dt.round() == dt)
     return (dt >= 0) & (dt <= LONGEST) & ~wrapped
 
 
@@ -164,7 +164,9 @@ def covariances_wrong(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
     return wrong
 
 
-def inputs_spoil(model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array | int) -> jax.Array:
+def inputs_spoil(
+    model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array | int, precision: type | None = None
+) -> jax.Array:
     """Test in a compiled step whether the time step is none or a plant's function of the inputs returns what is none.
 
     Args:
@@ -172,6 +174,7 @@ def inputs_spoil(model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array
         names: names of the inputs.
         u: inputs of the step (inputs,).
         k: number of the step.
+        precision: type of numbers in which the step is computed, whose rounding is allowed (default: the matrix's).
     """
     spoilt = jnp.asarray(False)
     if TIME_STEP in names:
@@ -182,11 +185,11 @@ def inputs_spoil(model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array
             continue
         for name, function in _functions(plant).items():
             value = function(plant, u)
-            spoilt |= ~(_is_covariance(value) if name == NOISE else jnp.all(jnp.isfinite(value)))
+            spoilt |= ~(_is_covariance(value, precision) if name == NOISE else jnp.all(jnp.isfinite(value)))
     return spoilt
 
 
-def _is_covariance(matrix: jax.Array) -> jax.Array:
+def _is_covariance(matrix: jax.Array, precision: type | None) -> jax.Array:
     """Test a matrix (n, n) by elimination of its correlations: finite, symmetric, no pivot below zero.
 
     Where a pivot is zero, nothing may be left of its column: |c_ij|^2 <= c_ii c_jj.
@@ -194,9 +197,10 @@ def _is_covariance(matrix: jax.Array) -> jax.Array:
     variances = jnp.diagonal(matrix)
     scale = 1 / jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
     left = matrix * scale[:, None] * scale
+    like: Array = left if precision is None else np.zeros(0, precision)
     sound = jnp.all(jnp.isfinite(matrix)) & jnp.all(variances >= 0)
-    sound &= jnp.all(jnp.abs(left - left.T) <= rounding(LOOSE * SYMMETRY_TOLERANCE, left))
-    tolerance = rounding(LOOSE * DEFINITENESS_TOLERANCE, left, 10 * len(matrix))
+    sound &= jnp.all(jnp.abs(left - left.T) <= rounding(LOOSE * SYMMETRY_TOLERANCE, like))
+    tolerance = rounding(LOOSE * DEFINITENESS_TOLERANCE, like, 10 * len(matrix))
     for _ in range(len(matrix)):
         pivot, column = left[0, 0], left[1:, 0]
         determined = pivot <= tolerance

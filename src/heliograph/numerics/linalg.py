@@ -116,7 +116,7 @@ def diagonal(d: jax.Array) -> jax.Array:
     return jnp.where(identity(d.shape[0], d[None]) == 1, d[None], 0.0)
 
 
-def rounding(tolerance: float, like: jax.Array, units: int = 10) -> float:
+def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) -> float:
     """A relative tolerance, or so many units of an array's rounding where its precision does not allow that."""
     return max(tolerance, units * float(np.finfo(like.dtype).eps))
 
