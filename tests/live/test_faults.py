@@ -1,6 +1,7 @@
 """A timeline and a service name the function of the model that returned no number, as a stream and a recording do."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,21 +57,33 @@ def test_a_service_names_it_in_the_refusal():
     assert "; transition(x, u) returned [nan] for x = [2." in refused["detail"]
 
 
-def test_an_angle_that_becomes_too_wide_is_said_once():
-    """Without measurements its variance grows by 0.5 a step, and 1 rad is as much as a Gaussian may have."""
+@pytest.fixture
+def turning():
+    """Without measurements the variance of a heading grows by 0.5 a step; a Gaussian may have 1 rad at most."""
     plant = hg.LinearPlant([[1.0]], [[0.5]], [0.0], [[0.1]], states=["heading"], circular=["heading"])
     sensor = hg.LinearSensor([[1.0]], 0.01, circular=["y0"])
-    filter = hg.kalman_filter(plant, sensor)
-    stream, line = (
-        hg.Stream(filter),
-        hg.Timeline(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": filter})}), 9),
-    )
-    said = r"'heading' is known to \+- 1 rad; on the circle"
+    return hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})})
+
+
+SAID = r"'heading' is known to \+- 1 rad; on the circle"
+
+
+def test_an_angle_that_becomes_too_wide_is_said_once(turning):
+    stream, line = hg.Stream(turning.nodes["a"].filters["f"]), hg.Timeline(turning, 9)
     stream.push([np.nan])
-    with pytest.warns(UserWarning, match=r"^stream, step 1: 'heading' is known to \+- 1 rad; on the circle"):
+    with pytest.warns(UserWarning, match=f"^stream, step 1: {SAID}"):
         stream.push([np.nan])
     stream.push([np.nan])
     line.push("a", 0, 0, [np.nan])
-    with pytest.warns(UserWarning, match=f"^timeline, a/f: {said}"):
+    with pytest.warns(UserWarning, match=f"^timeline, a/f: {SAID}"):
         line.push("a", 1, 1, [np.nan])
     line.push("a", 2, 2, [np.nan])
+
+
+def test_a_service_says_it_once(turning):
+    said = []
+    service = Service(Fleet(Lanes(turning), Options(0.0, 0.1)), InMemoryStore(), said.append)
+    for k in range(4):
+        batch = [{"plant": p, "node": "a", "sequence": k, "time": k, "values": [None]} for p in ("first", "second")]
+        service.take([json.dumps(message).encode() for message in batch])
+    assert len(said) == 1 and re.search(f"^warning: plant 'first', a/f: {SAID}", said[0])

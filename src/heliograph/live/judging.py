@@ -17,6 +17,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.model.faults import function_fault
 from heliograph.numerics.types import Float
 from heliograph.simulation.centres.blame import blamed
+from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import FUSED
 
 TRIES = 10  # to find the function of a filter that returned no number
@@ -158,6 +159,31 @@ def _columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
     """Return the columns of the judgements of these filters, of shape (filter, part)."""
     results = [list(output.judgement) for output in outputs if output.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
+
+
+class FleetAngles:
+    """Watch for estimates of a fleet that know an angle less well than their filter can use; each is said once."""
+
+    def __init__(self, fleet: Fleet):
+        self._pool, self._watched = fleet.pool, list[tuple[str, np.ndarray, WideAngles]]()
+        for place in fleet.lanes.places:
+            filter = filter_of(fleet, place)
+            if filter is not None and (angles := WideAngles(filter)).states:
+                n = len(filter.states)
+                variances = fleet.pool.outputs.start + place.covariance + np.arange(n) * (n + 1)
+                self._watched.append((f"{place.node}/{place.filter}", variances, angles))
+
+    def said_of(self, plants: Sequence[Plant]) -> list[tuple[str, str]]:
+        """Return the name of a plant and a line for each angle that is wide in a newest row for the first time."""
+        self._watched = [watched for watched in self._watched if watched[-1].states]
+        if not self._watched:
+            return []
+        slots = np.array([plant.rows.held[-1].slot for plant in plants], dtype=int)
+        return [
+            (plants[row].name, f"{of}: {line}")
+            for of, columns, angles in self._watched
+            for row, line in angles.said_of(self._pool.table[slots[:, None], columns])
+        ]
 
 
 def filter_of(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:

@@ -112,7 +112,7 @@ class Stream:
         if arrived and nis == nis:
             self._judge(nis > placed.rare[int(arrived)])
         if self._angles.states:
-            for line in self._angles.said_of(stepper.estimate[1]):
+            for _, line in self._angles.said_of(np.diagonal(stepper.estimate[1])[None]):
                 warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
         estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
         return with_sound_claim(estimate) if nis != nis else estimate

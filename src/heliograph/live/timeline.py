@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.filters.plausibility import in_words
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.judging import Judges, filter_of
+from heliograph.live.judging import FleetAngles, Judges
 from heliograph.live.lanes import shared_lanes
 from heliograph.live.plant import Link
 from heliograph.live.plant_codec import plant_bytes, plant_from
@@ -21,7 +21,6 @@ from heliograph.model.estimate import Estimate, JudgedEstimate, with_sound_claim
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.results.record import Record
@@ -106,9 +105,7 @@ class Timeline:
         self._plant, self._spare = self._fleet.begin("", start, None), self._fleet.pool.take()
         self._judges = Judges(self._fleet)
         self.reasons: dict[str, str] = {}
-        filters = [(place, filter_of(self._fleet, place)) for place in self._lanes.places]
-        watched = [(place, WideAngles(filter)) for place, filter in filters if filter is not None]
-        self._angles = [(place, angles) for place, angles in watched if angles.states]
+        self._angles = FleetAngles(self._fleet)
         self._finals = Finals(2 * self.capacity, self._lanes.step_rows.outputs.size)
 
     def __getstate__(self) -> dict[str, object]:
@@ -169,22 +166,14 @@ class Timeline:
                 self._fleet.undo(plant, before)
                 self._fleet.step([plant])
             else:
-                self._warn_of_angles(plant.rows.held[-1].slot)
+                for _, line in self._angles.said_of([plant]):
+                    warnings.warn(f"timeline, {line}", stacklevel=2)
                 self._finalise()
         link = plant.link(node)
         link.count(verdict, event.sequence, event.time)
         if verdict in ("used", "implausible"):
             link.dropped += dropped
         return verdict
-
-    def _warn_of_angles(self, slot: int) -> None:
-        """Warn of each angle that a filter knows less well than it can use, once."""
-        outputs = self._fleet.pool.table[slot, self._fleet.pool.outputs]
-        for place, angles in self._angles:
-            n = len(self.network.states)
-            covariance = outputs[place.covariance : place.covariance + n * n].reshape(n, n)
-            for line in angles.said_of(covariance):
-                warnings.warn(f"timeline, {place.node}/{place.filter}: {line}", stacklevel=3)
 
     def _refuses(self, event: Known, row: HeldRow) -> str | None:
         """Step what an event changed; return why it is implausible, None if it is not.

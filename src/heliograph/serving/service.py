@@ -12,6 +12,7 @@ from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
+from heliograph.live.judging import FleetAngles
 from heliograph.live.lanes import Lanes as Lanes
 from heliograph.live.plant import Plant, Withdrawn
 from heliograph.live.plant_codec import plant_bytes, plant_from
@@ -62,7 +63,8 @@ class Service:
     Args:
         fleet: the plants of the network.
         store: where the state is committed.
-        say: called once with a line of text, when the first message is refused as implausible.
+        say: called with a line of text when the first message is refused as implausible, and when an angle is first
+            known less well than its filter can use.
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
             hardly changed; None for never.
     """
@@ -80,6 +82,7 @@ class Service:
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._writer, self._using = EstimateWriter(fleet.lanes), Using(fleet, self.plants)
         self._exchange, self._silence = Exchange(fleet, self._moment), Silence(fleet, every)
+        self._angles, self._doubt = FleetAngles(fleet), say
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
@@ -201,6 +204,9 @@ class Service:
         outcomes = self._using.use(messages, self._damage, datetime.now(UTC))
         touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
         used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
+        if self._doubt is not None:
+            for name, line in self._angles.said_of(list(touched.values())):
+                self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
         # All but those that were used as they are, as most were.
         for i in [i for i, (_, verdict, _, notes) in enumerate(outcomes) if notes or verdict != "used"]:
             message, payload, (_, verdict, why, notes) = messages[i], payloads[i], outcomes[i]

@@ -64,17 +64,25 @@ def wide_in_rows(network: Network, record: Record) -> Iterator[str]:
 
 
 class WideAngles:
-    """Watch for estimates of one filter that know an angle less well than it can use; each angle is said once."""
+    """Watch the variances of a filter's states, in rows of an array, for an angle known less well than it can use.
+
+    Each angle is said once. `states` are the names of those that are watched, by their places.
+    """
 
     def __init__(self, filter: AbstractFilter):
         used = None if filter.claim == "none" else filter.angles_used()
         self.states = {} if used is None else {i: filter.states[i] for i in used.states}
         self._most = largest_deviation(filter) if self.states else np.inf
 
-    def said_of(self, covariance: Float[np.ndarray, "n n"]) -> list[str]:
-        """Return a line for each angle that is known worse for the first time."""
-        wide = [i for i in self.states if covariance[i, i] > self._most**2]
-        return [f"{self.states.pop(i)!r} is known to +- {covariance[i, i] ** 0.5:.2g} rad; {REMEDY}" for i in wide]
+    def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
+        """Return a row and a line for each angle that is known so badly for the first time."""
+        said = []
+        for i in list(self.states):
+            wide = np.flatnonzero(variances[:, i] > self._most**2)
+            if wide.size:
+                known = f"{self.states.pop(i)!r} is known to +- {variances[wide[0], i] ** 0.5:.2g} rad"
+                said.append((int(wide[0]), f"{known}; {REMEDY}"))
+        return said
 
 
 def _filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
