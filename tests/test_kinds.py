@@ -88,3 +88,14 @@ def test_settings_are_true_or_false():
     ):
         with pytest.raises(ValueError, match="expected True or False, got"):
             call()
+
+
+def test_a_level_too_low_for_a_number_is_no_level():
+    plant, sensor = PLANT.matrix, [[1.0, 0.5]]
+    system = hg.h_infinity.growth_system(
+        3, [[0.2], [0.1]], [[0.3]], EYE, hg.hop(1.0, 0.1), 0.0, transition=plant, output=sensor, initial_weight=5.0
+    )
+    start = 5.0 * np.eye(4)
+    for level in (1e-300, 1e-160):
+        found = hg.h_infinity.recursive_design(system, level, start, search=False)
+        assert not found.feasible and found.status == "the initial condition 0 < P_0 < level^2 W fails"

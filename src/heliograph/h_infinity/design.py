@@ -209,11 +209,14 @@ class _Recursion:
         system, n, c = self.system, self.system.states, self.coordinates
         # P_0 in scaled coordinates, and the initial condition
         relative = (level / c.unit) ** 2
+        design = _empty(system, self.separate, level, "")
+        too_low = design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
+        if relative < LARGEST**-2:  # P_0 in units of it would be no number
+            return too_low
         top = c.unit**2 * c.initial_weight(system.initial_weight)
         present = (1 - MARGIN) * top if initial is None else c.initial_weight(initial) / relative
-        design = _empty(system, self.separate, level, "")
         if np.linalg.eigvalsh(top - present)[0] <= 0 or np.linalg.eigvalsh(present)[0] <= 0:
-            return design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
+            return too_low
         design.weights[0] = relative * c.weight(present, 0)
         # step by step: the inequality, then gain, weight and multipliers in the user's units
         for k, step in enumerate(self.steps):
