@@ -15,10 +15,14 @@ from heliograph.live.rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
 TYPES = ("<i8", "<i8", "<f8", "<f8", "<f8")  # of the parts after the head
+KEPT = "kept"  # in the head: how many numbers of the table are there, behind a bit for each; all, where it is absent
 
 
 class PlantParts(NamedTuple):
     """Parts of a plant's bytes, in their order: a head of JSON, integers, then doubles.
+
+    A table that is mostly zeros, as the states of filters that carry probabilities are, has a bit for each number in
+    its place, and those whose bits are not all 0.
 
     Shapes: keys (rows, 2), the node and step number of each row; events (events, 3), their row, node and count; table
     (rows, width); times (events,) and values (numbers,) of the events.
@@ -39,12 +43,16 @@ class PlantParts(NamedTuple):
     def of(data: bytes, width: int) -> "PlantParts":
         """Read bytes, of rows with so many numbers."""
         length, rows, events, numbers = HEAD.unpack_from(data)
-        at, arrays = HEAD.size + length, []
+        head, at, arrays = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length, list[np.ndarray]()
         shapes = ((rows, 2), (events, 3), (rows, width), (events,), (numbers,))
         for kind, shape in zip(TYPES, shapes, strict=True):
-            arrays.append(np.frombuffer(data, kind, math.prod(shape), at).reshape(shape))
-            at += arrays[-1].nbytes
-        return PlantParts(json.loads(data[HEAD.size : HEAD.size + length]), *arrays)
+            if len(arrays) == 2 and KEPT in head:
+                array, at = _unpacked(data, at, math.prod(shape), head.pop(KEPT))
+            else:
+                array = np.frombuffer(data, kind, math.prod(shape), at)
+                at += array.nbytes
+            arrays.append(array.reshape(shape))
+        return PlantParts(head, *arrays)
 
 
 def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
@@ -65,10 +73,25 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
 
 def _joined(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
     """Serialise the head and the flat parts of a plant behind their lengths."""
-    text = json.dumps(head).encode()
     counts = len(flat[0]) // 2, len(flat[1]) // 3, len(flat[4])
-    numbers = [np.array(a, dtype=kind).tobytes() for a, kind in zip(flat, TYPES, strict=True)]
-    return b"".join([HEAD.pack(len(text), *counts), text, *numbers])
+    numbers = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]
+    table = numbers[2]
+    there = table.view("<i8") != 0  # the sign of a zero counts
+    kept = int(np.count_nonzero(there))
+    bodies = [array.tobytes() for array in numbers]
+    if 2 * kept < len(table):
+        head, bodies[2] = head | {KEPT: kept}, np.packbits(there).tobytes() + table[there].tobytes()
+    text = json.dumps(head).encode()
+    return b"".join([HEAD.pack(len(text), *counts), text, *bodies])
+
+
+def _unpacked(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
+    """Read so many numbers, of which some are kept; return them and the place behind them."""
+    bits = np.frombuffer(data, np.uint8, -(-size // 8), at)
+    values = np.frombuffer(data, "<f8", kept, at + len(bits))
+    array = np.zeros(size)
+    array[np.unpackbits(bits, count=size).astype(bool)] = values
+    return array, at + len(bits) + values.nbytes
 
 
 def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:

@@ -9,7 +9,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, Operationa
 
 from heliograph.numerics.check import fail, text
 
-PAGES = "page_size=16384", "cache_size=-16384"  # bytes, of a new database; kB of pages in memory, as large commits have
+PAGES = "page_size=4096", "cache_size=-16384"  # bytes, of a new database: a small commit writes four; kB in memory
 PASSING = "starting up", "shutting down", "terminating connection", "recovery mode", "too many clients"
 PLACE = "a file, or a URL as postgresql://host/database"
 
