@@ -53,6 +53,9 @@ class Graph:
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
         if buffer.table is not None and not pairs:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
+        row = len(buffer.first)
+        if row and all(s % row == 0 for s, _ in pairs):  # another row alone
+            offset += buffer.first[offset % row] - offset % row
         indices = tuple(i for _, i in pairs)
         value = (buffer, offset, tuple(s for s, _ in pairs))
         return self._once("load", buffer.type, indices, value, buffer.block.depth)

@@ -96,16 +96,18 @@ class Buffer:
     """Numbers in memory, `size` of each run; a table has the same numbers in all runs.
 
     `kind`: "input", "scratch" or "table". A buffer that the program fills is read after the statement of `block` that
-    fills it. A buffer `inside` another starts at a place of it.
+    fills it. A buffer `inside` another starts at a place of it. `first`: of rows in which some entries are the same
+    number, as across the diagonal of a symmetric matrix, the first place in the row that has each entry's number.
     """
 
-    __slots__ = ("block", "inside", "kind", "parts", "shape", "stores", "table", "type")
+    __slots__ = ("block", "first", "inside", "kind", "parts", "shape", "stores", "table", "type")
 
     def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
         self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
         self.stores: list[Store] = []
         self.inside: tuple[Buffer, int] | None = None
         self.parts: list[Buffer] = []
+        self.first: list[int] = []
 
     def take_in(self, inner: "Buffer", start: int) -> None:
         """Place another buffer inside this one, from an offset on."""

@@ -154,6 +154,24 @@ def test_a_loop_carries_one_triangle_of_what_stays_symmetric():
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
 
 
+def test_what_a_loop_stored_is_as_symmetric_when_it_is_read_again():
+    """Backwards through the covariances of a loop, and one of them at a place that data say."""
+
+    def backwards(f, steps, k):
+        _, all_ = jax.lax.scan(lambda p, _: (f @ p @ f.T + 0.1 * np.eye(4), p), jnp.eye(4), steps)
+        total, _ = jax.lax.scan(lambda s, p: (s + f @ p @ f.T, None), jnp.zeros((4, 4)), all_, reverse=True)
+        return total, all_[k], all_[k, :, 1], all_[:, 2, 0], all_[k, k % 4]
+
+    f, steps, k = 0.4 * RANDOM.normal(size=(3, 4, 4)), np.zeros((3, 300)), np.array([0, 7, 299])
+    count, carried = operations(lambda f, steps: backwards(f, steps, 0)[0], FOUR, (300,))
+    assert count == (182 + 4) + (182 + 10) + 1 and carried == 20  # one: the row counted backwards
+    results = compile(backwards, f[0], steps[0], k[0])(f, steps, k)
+    with jax.enable_x64(True):
+        expected = jax.vmap(backwards)(f, steps, k)
+    for a, b in zip(results, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
+
+
 def test_a_loop_carries_all_of_what_does_not_stay_symmetric():
     """A product of matrices from the identity on, beside a covariance; in a loop of some turns and a `while`."""
 

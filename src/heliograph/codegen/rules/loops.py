@@ -92,7 +92,8 @@ def _stack(
     flat = _numbers(value)
     type: Type = flat[0].type if flat else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
-    size = len(flat)
+    size, places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
+    buffer.first = [places[node] for node in flat] if len(places) < size else []
     start, stride = ((length - 1) * size, -size) if backwards else (0, size)
     for entry, node in enumerate(flat):
         lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
