@@ -99,3 +99,12 @@ def test_a_level_too_low_for_a_number_is_no_level():
     for level in (1e-300, 1e-160):
         found = hg.h_infinity.recursive_design(system, level, start, search=False)
         assert not found.feasible and found.status == "the initial condition 0 < P_0 < level^2 W fails"
+
+
+def test_a_source_is_told_its_plant_and_numbers_in_their_kinds():
+    for wrong in (np.zeros(0), 0, {}):
+        with pytest.raises(ValueError, match="json_field, plant: expected a text"):
+            hg.files.json_field("value", "a", plant=wrong)
+    for wrong in NO_NUMBERS[:2]:
+        with pytest.raises(ValueError, match="json_field, scale: expected 1 number, or 1, got"):
+            hg.files.json_field("value", "a", scale=wrong)

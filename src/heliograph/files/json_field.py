@@ -234,7 +234,7 @@ def json_field(
         raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
     factors, shifts = (_per_path(name, value, len(paths)) for name, value in (("scale", scale), ("offset", offset)))
     return Source(
-        paths, whose, outputs, factors, shifts, stamp, time_unit, count, of and _named("plant", of),
+        paths, whose, outputs, factors, shifts, stamp, time_unit, count, None if of is None else _named("plant", of),
         seconds, _conditions(where), flag("json_field, quoted", quoted),
     )  # fmt: skip
 
@@ -351,7 +351,10 @@ def _texts(name: str, value: object) -> tuple[str, ...]:
 
 def _per_path(name: str, value: ArrayLike, count: int) -> tuple[float, ...]:
     """Return one number for each path."""
-    values = np.atleast_1d(np.asarray(value, dtype=object))
+    try:
+        values = np.atleast_1d(np.asarray(value, dtype=object))
+    except (TypeError, ValueError):  # a set of arrays, a key
+        raise fail(f"json_field, {name}", f"1 number, or {count}", shown(value)) from None
     if values.ndim != 1 or len(values) not in (1, count):
         raise fail(f"json_field, {name}", f"1 number, or {count}", shown(value))
     numbers = [float(scalar(f"json_field, {name}", single)) for single in values]
