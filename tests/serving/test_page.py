@@ -12,7 +12,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import heliograph as hg
+
 pytest.importorskip("uvicorn")
+from heliograph.files.sources import Sources
+from heliograph.live.plant import Link
 from heliograph.numerics.types import NameWithUnit
 from heliograph.serving.page import Door, Tallies, door, shown
 from heliograph.serving.running_nis import DOUBT, MEMORY, RunningNis
@@ -168,6 +172,24 @@ def test_a_page_that_is_open_does_not_hold_a_service_that_ends(capfd):
     with reader:
         looked(look, Scripted())
     assert capfd.readouterr().err == ""
+
+
+def test_what_is_lost_of_messages_without_a_count_is_not_counted():
+    """It was 0, which nobody knows; nodes that count have theirs."""
+    sources = {
+        "attic": hg.files.json_field("t", "a", time_unit="step", time="k"),
+        "cellar": hg.files.json_field("t", "b", time_unit="step", time="k", sequence="n"),
+    }
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    node = hg.Node(sensor, hg.perfect(), {"kalman": hg.kalman_filter(plant, sensor)})
+    network = hg.Network(plant, {"a": node, "b": node})
+    uncounted = Sources(sources, network).uncounted
+    assert uncounted == {"a"}
+    watch = watch_of(network, "house", uncounted)
+    watch.totals.add("", {name: Link(used=3, lost=0) for name in "ab"})
+    assert {name: link["lost"] for name, link in watch.links().items()} == {"a": None, "b": 0}
+    said = Tallies(watch).text().decode()
+    assert 'heliograph_lost{node="b"} 0' in said and 'heliograph_lost{node="a"}' not in said
 
 
 def test_many_nodes_have_one_warning_of_a_kind():

@@ -98,6 +98,13 @@ class Sources:
             if source.sequence is not None and source.sequence.period
         }
 
+    @property
+    def uncounted(self) -> set[str]:
+        """Return the nodes whose messages carry no count, so that nothing is known of lost ones."""
+        mapped = [(source, places) for items in self._table.values() for source, _, places in items]
+        counted = {node for source, places in mapped for node in places if source.sequence is not None}
+        return {node for _, places in mapped for node in places} - counted
+
     def of(self, topic: str) -> list[Mapped]:
         """Return the sources of a topic, each with the places of its values in the node's measurement."""
         if topic not in self._known:

@@ -89,9 +89,10 @@ def _links(watch: Watch) -> Iterable[Metric]:
     dropped = CounterMetricFamily("heliograph_dropped", what, labels=["node"])
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
-            messages.add_metric([node, verdict], tally[verdict])
-        lost.add_metric([node], tally["lost"])
-        dropped.add_metric([node], tally["dropped"])
+            messages.add_metric([node, verdict], tally[verdict] or 0)
+        if tally["lost"] is not None:
+            lost.add_metric([node], tally["lost"])
+        dropped.add_metric([node], tally["dropped"] or 0)
     return messages, lost, dropped
 
 

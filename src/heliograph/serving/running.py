@@ -275,10 +275,13 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
     if settings.page is None:
         yield lambda service: service
         return
+    from heliograph.files.sources import Sources
     from heliograph.serving.page import door, shown
     from heliograph.serving.watch import watch_of
 
-    watch = watch_of(settings.network, settings.name)
+    table = settings.sources
+    uncounted = set() if table is None else Sources(table, settings.network).uncounted
+    watch = watch_of(settings.network, settings.name, uncounted)
     async with shown(watch, door(settings.page, hosts=settings.hosts)):
         yield watch.over
 

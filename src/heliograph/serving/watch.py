@@ -110,6 +110,7 @@ class Watch:
         time_unit: unit of times that are numbers.
         fused: by the name of a fusion its claim, and the (node, filter) that it fuses, by which it is judged.
         names: names of the received numbers by node and filter.
+        uncounted: nodes whose messages carry no count: how many are lost is not known, and None.
     """
 
     def __init__(
@@ -119,9 +120,10 @@ class Watch:
         time_unit: str = "",
         fused: Mapping[str, tuple[Claim, Sequence[tuple[str, str]]]] | None = None,
         names: Mapping[tuple[str, str], Sequence[str]] | None = None,
+        uncounted: Collection[str] = (),
     ):
         self.states, self.title, self.time_unit = list(states), title, time_unit
-        self.fused = dict(fused or {})
+        self.fused, self.uncounted = dict(fused or {}), uncounted
         # Of all plants together, of each plant, and histograms.
         self.lock, self._count = threading.Lock(), 0
         self.services: list[Serves] = []
@@ -210,12 +212,15 @@ class Watch:
         for service in self.services:
             yield from ((name, service.plants[name]) for name in names if name in service.plants)
 
-    def links(self) -> dict[str, dict[str, int]]:
+    def links(self) -> dict[str, dict[str, int | None]]:
         """Sum the counts over all plants, by node: messages by verdict, lost ones, and values beyond limits.
 
         Also of plants that have left the memory.
         """
-        return self.totals.as_table()
+        return self._as_counted(self.totals.as_table())
+
+    def _as_counted(self, links: Mapping[str, dict[str, int]]) -> dict[str, dict[str, int | None]]:
+        return {node: tally | ({"lost": None} if node in self.uncounted else {}) for node, tally in links.items()}
 
     def worst(self) -> list[Wrong]:
         """Return the plants with something wrong, the worst first."""
@@ -263,7 +268,7 @@ class Watch:
                 "since": since,
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
-                "links": _added(results),
+                "links": self._as_counted(_added(results)),
                 "senders": senders,
                 "tests": [_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
                 "outputs": [output_row(output) for output in health],
@@ -374,8 +379,8 @@ def _test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, object
     return names | {"ratio": test.ratio, "low": low, "high": high, "numbers": test.numbers}
 
 
-def watch_of(network: Network, title: str) -> Watch:
-    """Return the observer of services of a network, whose name is `title`."""
+def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> Watch:
+    """Return the observer of services of a network, whose name is `title`; `uncounted` as of a `Watch`."""
     claims = network.claims()
     fused = {
         name: (claims[FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
@@ -388,4 +393,4 @@ def watch_of(network: Network, title: str) -> Watch:
     all_names = [f"{node}: {name}" for node, receiver in network.nodes.items() for name in receiver.received_names]
     names |= {(FUSED, name): all_names for name in network.fused}
     unit = units_in(network.inputs).get(TIME_STEP, "s") if TIME_STEP in network.inputs else "steps"
-    return Watch(network.states, title, unit, fused, names)
+    return Watch(network.states, title, unit, fused, names, uncounted)

@@ -96,14 +96,18 @@ function show(view) {
   outputs(view);
 }
 
+function counted(number) {  // messages without a count of their own say nothing of lost ones
+  return number === null ? "not counted" : number.toLocaleString("en");
+}
+
 function keys(view) {
   const sum = (name, of) => Object.values(of).reduce((total, link) => total + link[name], 0);
   const all = view.all;
-  const rows = [["plants", view.count], ["messages used", sum("used", all)], ["lost", sum("lost", all)],
+  const rows = [["plants", view.count], ["messages used", sum("used", all)], ["lost", Object.values(all).some((link) => link.lost !== null) || !Object.keys(all).length ? sum("lost", all) : null],
     ["too late", sum("late", all)], ["copies", sum("duplicate", all)], ["implausible", sum("implausible", all)],
     ["not readable", view.malformed]];
   at("keys").replaceChildren(...rows.map(([name, value]) => {
-    const key = made("div", undefined, "key"), shown = made("dd", value.toLocaleString("en"));
+    const key = made("div", undefined, "key"), shown = made("dd", counted(value));
     if (name === "plants" && value > 1) {  // all of them, the worst first
       const link = made("a", shown.textContent + (view.wrong ? " (" + view.wrong.toLocaleString("en") + " wrong)" : ""));
       link.href = "plants";
@@ -228,7 +232,7 @@ function links(view) {
     const doubted = checks.some((test) => test.doubt);
     const judged = made("td", checks.length ? (doubted ? "doubtful" : "hold") : "", doubted ? "doubt" : "fine");
     const counts = [link.used, link.lost, link.late, link.duplicate];
-    return row(node, [...counts.map((n) => n.toLocaleString("en")), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
+    return row(node, [...counts.map(counted), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
   }));
 }
 
