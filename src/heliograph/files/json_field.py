@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from typing_extensions import TypeAliasType
@@ -239,6 +239,40 @@ def json_field(
     )  # fmt: skip
 
 
+class _Uplinks(NamedTuple):
+    """Uplinks of a LoRaWAN server: their topic, and the paths of the decoded values, time, frame count and device."""
+
+    topic: str
+    values: str
+    time: str
+    count: str
+    device: str
+
+    def sources(self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float) -> "dict[str, Source]":
+        """Return the source of its topic, a plant for each device."""
+        source = json_field(
+            _below(self.values, path),
+            node,
+            output,
+            scale=scale,
+            offset=offset,
+            time=self.time,
+            sequence=Count(self.count, COUNT_BITS),
+            plant=self.device,
+        )
+        return {self.topic: source}
+
+
+THE_THINGS_STACK = _Uplinks(
+    "v3/+/devices/+/up",
+    "uplink_message.decoded_payload",
+    "received_at",
+    "uplink_message.f_cnt",
+    "end_device_ids.device_id",
+)
+CHIRPSTACK = _Uplinks("application/+/device/+/event/up", "object", "time", "fCnt", "deviceInfo.devEui")
+
+
 def the_things_stack(
     path: "Paths",
     node: "Name",
@@ -262,17 +296,7 @@ def the_things_stack(
     Raises:
         ValueError: what `json_field` refuses.
     """
-    source = json_field(
-        _below("uplink_message.decoded_payload", path),
-        node,
-        output,
-        scale=scale,
-        offset=offset,
-        time="received_at",
-        sequence=Count("uplink_message.f_cnt", COUNT_BITS),
-        plant="end_device_ids.device_id",
-    )
-    return {"v3/+/devices/+/up": source}
+    return THE_THINGS_STACK.sources(path, node, output, scale, offset)
 
 
 def chirpstack(
@@ -297,17 +321,7 @@ def chirpstack(
     Raises:
         ValueError: what `json_field` refuses.
     """
-    source = json_field(
-        _below("object", path),
-        node,
-        output,
-        scale=scale,
-        offset=offset,
-        time="time",
-        sequence=Count("fCnt", COUNT_BITS),
-        plant="deviceInfo.devEui",
-    )
-    return {"application/+/device/+/event/up": source}
+    return CHIRPSTACK.sources(path, node, output, scale, offset)
 
 
 def _below(prefix: str, path: Paths) -> Paths:
