@@ -14,7 +14,7 @@ from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, con
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import is_traced, traced_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
     AbstractNoise,
@@ -161,6 +161,7 @@ class JointNoise(Module):
 class Plant(AbstractPlant):
     """A nonlinear plant: `transition(x, u)` written with jax.numpy, u of shape (len(inputs),).
 
+    Tables that it uses are made with np.asarray: JAX makes arrays in single precision by default, which is warned of.
     `noise` is a covariance, a noise law, or a function of u that returns a covariance (zero-mean Gaussian noise).
     `initial_covariance` is a covariance, or a noise law of x_0 - initial_mean where x_0 is not Gaussian.
     An input named "dt" is filled with the time since the previous row when recorded data has no such column.
@@ -337,8 +338,7 @@ def angles_among(angles: "Sequence[int] | AnyPlant", states: int) -> Angles:
 def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:
     """Raise ValueError unless a user's function returns an array of `shape`."""
     try:
-        with jax.enable_x64(True):
-            got = jax.eval_shape(lambda *args: jnp.asarray(called(*args)), *values).shape
+        got = traced_shape(name, called, *values)
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
         raise fail(name, f"a function in operations of jax.numpy, of shape {shape}", shown_error(error)) from error
     if got != shape:

@@ -16,6 +16,7 @@ from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.numerics.traced import traced_shape
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
@@ -49,8 +50,7 @@ class AbstractSensor(Module):
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""
         try:
-            with jax.enable_x64(True):
-                got = jax.eval_shape(self.measure, np.zeros(states)).shape
+            got = traced_shape("measure(x) of a sensor", self.measure, np.zeros(states))
         except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
             raise fail("sensor", f"to measure a state of length {states}", shown_error(error)) from error
         if got != (len(self.outputs),):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.masked import unmasked
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import is_traced, warn_of_single
 from heliograph.numerics.types import ArrayLike, Names, NameWithUnit
 
 
@@ -141,6 +141,8 @@ def _numbers(name: str, value: ArrayLike) -> Any:
     if np.issubdtype(numbers.dtype, np.complexfloating):
         raise fail(name, "real numbers", "complex ones")
     if known is not None:
+        if isinstance(value, jax.Array):
+            warn_of_single(name, value)
         return known
     return numbers if jnp.issubdtype(numbers.dtype, jnp.floating) else numbers.astype(float)
 

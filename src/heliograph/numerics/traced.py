@@ -4,7 +4,8 @@ A model's moments are plain numbers in ordinary use, and functions of traced par
 `jax.jit`. What is decided by a number's value (is it zero, is it certain) is decided for known numbers only.
 """
 
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -24,6 +25,37 @@ def is_traced(*values: object) -> bool:
         and not isinstance(value, Iterator)  # which is no tree of numbers to JAX
         for leaf in jax.tree.leaves(value)
     )
+
+
+def warn_of_single(name: str, value: object) -> None:
+    """Warn of an array of single precision with an entry that was rounded to it, as JAX makes 0.1 by default.
+
+    The double that the shortest decimal of an entry means, which the user will have written, is another number then.
+    """
+    if isinstance(value, jax.core.Tracer) or getattr(value, "dtype", None) != np.float32:
+        return
+    numbers: np.ndarray = np.asarray(value)
+    finite = numbers[np.isfinite(numbers)]
+    meant = finite.astype(str).astype(float)
+    rounded = np.flatnonzero(meant != finite)
+    if len(rounded):
+        example = f"{meant[rounded[0]]:g} in it is {float(finite[rounded[0]]):.10g}"
+        warnings.warn(
+            f"{name}: expected double precision, got a JAX array of single precision of shape {numbers.shape}, "
+            f"{example}; make it with np.asarray, or after jax.config.update('jax_enable_x64', True)",
+            stacklevel=2,
+        )
+
+
+def traced_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
+    """Return the shape of a function's result, traced in double precision; warn of arrays in it that have less."""
+    with jax.enable_x64(True):
+        made = jax.make_jaxpr(lambda *values: jnp.asarray(function(*values)))(*arguments)
+    for constant in made.consts:
+        if isinstance(constant, jax.Array):
+            warn_of_single(name, constant)
+    shape: tuple[int, ...] = made.out_avals[0].shape
+    return shape
 
 
 def library(*values: object) -> Any:
