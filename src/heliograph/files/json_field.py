@@ -240,12 +240,12 @@ def json_field(
 
 
 class _Uplinks(NamedTuple):
-    """Uplinks of a LoRaWAN server: their topic, and the paths of the decoded values, time, frame count and device."""
+    """Uplinks of a LoRaWAN server: their topic, and the paths of the values, time, count of frames, device."""
 
     topic: str
     values: str
     time: str
-    count: str
+    frames: str
     device: str
 
     def sources(self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float) -> "dict[str, Source]":
@@ -257,7 +257,7 @@ class _Uplinks(NamedTuple):
             scale=scale,
             offset=offset,
             time=self.time,
-            sequence=Count(self.count, COUNT_BITS),
+            sequence=Count(self.frames, COUNT_BITS),
             plant=self.device,
         )
         return {self.topic: source}
