@@ -197,6 +197,26 @@ def test_bad_input_steps_of_any_length_are_no_steps_of_all_nodes():
         node_network(hg.Network(plant, {"a": node, "b": None}, {"mesh": item}), "b")
 
 
+def test_a_node_named_by_a_topic_or_a_field_is_read_by_its_own_process_alone():
+    """Such sources were dropped without a word, and with them all measurements of the node."""
+    sources = {
+        "garden/+/t": hg.files.json_field("t", node=hg.files.Level(1), time="at", step=60.0),
+        "house": hg.files.json_field("t", node=hg.files.Field("who", {"7": "c"}), time="at", step=60.0),
+    }
+    settings = ServiceSettings(chain(link=LOSSY), Options(), sources=sources, broker=address("mqtt://hub/rooms", {}))
+    alone = {name: of_node(settings, name) for name in "abc"}
+    assert [sorted(item.sources or {}) for item in alone.values()] == [list(sources), [], list(sources)]
+    for name, other in ("ac", "ca"):
+        reads = Translator(alone[name].sources, alone[name].network, alone[name].others)
+        at = json.dumps({"t": 0.5, "at": NOON.isoformat(), "who": 7}).encode()
+        (mine,) = reads.read(f"garden/{name}/t", at, NOON)
+        assert mine.node == name and mine.values == [0.5]
+        assert reads.read(f"garden/{other}/t", at, NOON) == []
+        assert len(reads.read("house", at, NOON)) == (name == "c")
+        (unknown,) = reads.read("garden/z/t", at, NOON)
+        assert "expected one of" in unknown and "'z'" in unknown
+
+
 def test_bad_input_no_node_no_broker():
     settings = ServiceSettings(chain(), Options())
     with pytest.raises(ValueError, match=r"--node: expected a broker between the nodes .* got none"):

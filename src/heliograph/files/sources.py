@@ -1,7 +1,7 @@
 """Sources of data, read by a network: messages of topics to measurements of nodes and inputs of the plant."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
 from typing import NamedTuple
 
@@ -53,13 +53,15 @@ class Sources:
     Args:
         table: sources by topic, as in a network's file.
         network: the network.
+        others: nodes that other processes are, whose messages are left out.
 
     Raises:
         ValueError: no such table, an unknown node or output, a time in steps where the network has continuous time or
             the other way round, a wildcard that merges sensors. One line that names the topic.
     """
 
-    def __init__(self, table: object, network: Network):
+    def __init__(self, table: object, network: Network, others: Collection[str] = ()):
+        self.others = others
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
@@ -161,6 +163,8 @@ class Sources:
                 return None
         # Node, plant and count name a measurement.
         node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
+        if node in self.others:
+            return None
         if node not in places:
             raise fail(f"{where}, node", f"one of {', '.join(places)}", _near(node, places))
         plant = "" if source.plant is None else source.plant.of(topic, message, where)

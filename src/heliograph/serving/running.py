@@ -152,6 +152,7 @@ class ServiceSettings:
         hosts: names by which others ask for the page, such as a proxy's.
         anew: names of plants that begin anew.
         sources: sources of messages that others make, by topic; None reads messages in our own form alone.
+        others: nodes that other processes are, whose messages are left out.
         name: name of the network on the page.
         accept_changes: whether the plants of a store whose network has changed go on with what fits.
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
@@ -172,6 +173,7 @@ class ServiceSettings:
     hosts: tuple[str, ...] = ()
     anew: tuple[str, ...] = ()
     sources: object = None
+    others: tuple[str, ...] = ()
     name: str = ""
     accept_changes: bool = False
     every: float | None = None
@@ -222,7 +224,9 @@ def of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
     if isinstance(table, Mapping):
         items = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in table.items()}
         step = next((row.step for rows in items.values() for row in rows if isinstance(row, Source)), step)
-        mine = {topic: [row for row in rows if getattr(row, "node", node) in (node, INPUTS)]
+        measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
+        mine = {topic: [row for row in rows if not isinstance(row, Source) or row.node in (node, INPUTS)
+                        or (measures and not isinstance(row.node, str))]
                 for topic, rows in items.items()}  # fmt: skip
         table = {topic: rows for topic, rows in mine.items() if rows} or None
     return replace(
@@ -231,6 +235,7 @@ def of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
         options=settings.options._replace(step=step),
         broker=replace(settings.broker, topic=f"{settings.broker.topic}/{word(node)}"),
         sources=table,
+        others=tuple(name for name in settings.network.names if name != node),
         name=f"{settings.name} {node}",
     )
 
@@ -289,7 +294,7 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
 async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     """Serve all messages in one process."""
     stop = asyncio.Event()
-    reads = None if settings.sources is None else Translator(settings.sources, settings.network)
+    reads = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
     step = settings.options.step if reads is None else reads.sources.step
     fleet = Fleet(lanes, settings.options._replace(step=step))
     fleet.periods = {} if reads is None else reads.sources.periods

@@ -1,6 +1,7 @@
 """Messages of topics that others make, to messages of a network by its sources."""
 
 from collections import Counter, OrderedDict
+from collections.abc import Collection
 from datetime import UTC, datetime, timedelta
 
 from heliograph.files.event_columns import YEAR
@@ -30,13 +31,14 @@ class Translator:
     Args:
         table: sources by topic, as in a network's file.
         network: the network.
+        others: nodes that other processes are, whose messages are left out.
 
     Raises:
         ValueError: sources that do not fit the network.
     """
 
-    def __init__(self, table: object, network: Network):
-        self.sources = Sources(table, network)
+    def __init__(self, table: object, network: Network, others: Collection[str] = ()):
+        self.sources = Sources(table, network, others)
         self._counts, self._stored = Counter[tuple[str, str]](), 0
         # Values of the newest times of each plant and node without a count.
         self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
