@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood.maximise import maximise
+from heliograph.learning.likelihood.maximise import maximise, trust_region_step
 
 NATS = 1e-3  # below another search
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -149,3 +149,12 @@ def test_a_gradient_that_the_information_overstates_is_climbed_to_the_end():
 
     end = maximise(evaluate, np.array([[3.0, -2.0]]))
     assert end.converged.all() and np.abs(end.x).max() < 1e-4 and end.steps < 50
+
+
+def test_a_model_of_which_two_directions_are_one_to_the_last_digit_has_a_step():
+    """B = 1e6 [1 1; 1 1] and g = (1, 1): of all p with B p = g the shortest is g / 2e6."""
+    one, model = np.eye(2)[None], 1e6 * np.ones((1, 2, 2))
+    everything = np.ones((1, 2), dtype=bool)
+    step, length, foretold = trust_region_step(np.ones((1, 2)), one, model, np.ones(1), everything, everything[0])
+    np.testing.assert_allclose(step, 5e-7, rtol=1e-6)
+    assert length[0] == pytest.approx(5e-7 * np.sqrt(2)) and foretold[0] == pytest.approx(5e-7)

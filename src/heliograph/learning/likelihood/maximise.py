@@ -288,13 +288,12 @@ def trust_region_step(
 
 
 def _solved(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(B + s D^2)^-1 g of each lane."""
+    """(B + s D^2)^-1 g of each lane; nothing along directions in which the matrix is singular."""
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
     except np.linalg.LinAlgError:  # a pivot that is exactly 0
-        shifted = matrix + ROUNDING * np.eye(b.shape[1])
-        return np.asarray(np.linalg.solve(shifted, right[..., None])[..., 0])
+        return _times(np.linalg.pinv(matrix, ROUNDING, hermitian=True), right)
 
 
 def gain_of(
