@@ -90,6 +90,18 @@ def test_costly_cases_are_said_run_by_run_and_have_derivatives():
     np.testing.assert_allclose(jax.vmap(jax.grad(cube))(x), [1.0, 12.0, 27.0])
 
 
+def test_derivatives_of_one_run_in_several_directions_compute_one_case():
+    """A condition of one run alone stays one, so that what is costly is not computed in each direction for nothing."""
+
+    def of(pick):
+        return lambda x: pick(jnp.all(x > 1), lambda: x**3, lambda: x)
+
+    cube, x = runs_last(of(where_any), of(where_each)), jnp.asarray([0.5, 2.0])
+    assert "cond" in str(jax.make_jaxpr(jax.jacfwd(cube))(x))
+    np.testing.assert_allclose(jax.jacfwd(cube)(x), np.eye(2))
+    np.testing.assert_allclose(jax.vmap(jax.jacfwd(cube))(jnp.stack([x, x + 1]))[1], np.diag([6.75, 27.0]))
+
+
 def test_names_of_arguments_may_be_given():
     np.testing.assert_allclose(product(A[0, 0], b=B)[0], A[0, 0] @ B, rtol=1e-6)
 

@@ -209,6 +209,9 @@ def where_any(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]
 
 
 def where_each(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
-    """The same by computing both."""
+    """The same run by run: of a single run one of both is computed, else both."""
+    if jnp.ndim(needed) == 0:
+        one: R = jax.lax.cond(needed, costly, cheap)
+        return one
     chosen: R = jax.tree.map(lambda a, b: jnp.where(needed, a, b), costly(), cheap())
     return chosen
