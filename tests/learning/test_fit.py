@@ -153,6 +153,22 @@ def test_who_interrupts_keeps_the_best_so_far(recording):
     assert all(np.isfinite(row.estimate) for row in fitted.rows())
 
 
+def test_who_interrupts_as_the_second_form_begins_keeps_the_first(recording, monkeypatch):
+    """Before the second form's first point there is none of it: the first form's maximum is the best so far."""
+    evaluations = Surface.evaluations
+
+    def stopping(surface, x):
+        if surface.objective.form == "conditional" and len(x) == 1:
+            raise KeyboardInterrupt
+        return evaluations(surface, x)
+
+    monkeypatch.setattr(Surface, "evaluations", stopping)
+    fitted = hg.fit(network, recording, INPUTS, starts=1)
+    assert fitted.stopped and [solution.form for solution in fitted.solutions] == ["linear"]
+    assert fitted.best.converged and np.isfinite(fitted.best.total)
+    assert "Stopped before the end: this is the best so far." in fitted.sentences
+
+
 def chain():
     first = hg.hop(hg.Rayleigh(hg.free(0.7, "fading")), 0.2)
     plant = hg.LinearPlant([[0.95]], 0.2, [0.0], [[1.0]], [[1.0]])

@@ -188,22 +188,39 @@ def fit(
     surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
     points = _starts(surfaces[0], starts, check_seed("seed", seed))
     identified = identified_by(surfaces[-1], points[0], seed)
-    # search each form, from the best end of the one before
-    stopped, ends, solutions = False, np.zeros(0), []
+    solutions, ends, stopped = _searched(surfaces, points, seed, identified.ridges, progress or (lambda line: None))
+    try:
+        identified = identified.at(solutions[-1])
+    except KeyboardInterrupt:  # what is left out are the intervals in its sentences
+        stopped = True
+    return Fit(description, tuple(solutions), identified, ends, stopped, delays)
+
+
+def _searched(
+    surfaces: list[Surface], points: np.ndarray, seed: int, ridges: int, progress: Progress
+) -> tuple[list[Solution], Float[np.ndarray, " starts"], bool]:
+    """Search each form, from the best end of the one before: solutions, ends of the first, and whether it was stopped.
+
+    Raises:
+        KeyboardInterrupt: before there was a first point.
+    """
+    ends, solutions = np.zeros(0), list[Solution]()
     for surface in surfaces:
-        search = Search(surface, _progress(surface, progress or (lambda line: None)))
+        search = Search(surface, _progress(surface, progress))
         try:
-            top = search.run(points, seed)
+            top, stopped = search.run(points, seed), False
         except KeyboardInterrupt:
-            if search.best is None:
+            if search.best is None and not solutions:
                 raise
+            if search.best is None:  # the form before has the best so far
+                return solutions, ends, True
             top, stopped = search.best, True
         ends = ends if len(ends) else search.ends
-        solutions.append(Solution(surface, top, identified.ridges))
+        solutions.append(Solution(surface, top, ridges))
         if stopped:
-            break
+            return solutions, ends, True
         points = top.x[None]
-    return Fit(description, tuple(solutions), identified.at(solutions[-1]), ends, stopped, delays)
+    return solutions, ends, False
 
 
 def _rows_and_delays(recording: Any) -> tuple[object, dict[str, Delays]]:

@@ -81,7 +81,7 @@ class Search:
         none = np.zeros(starts.shape[1])
         climbed = self._climb(starts, none)
         top = self._proved(climbed)
-        ends = climbed.total
+        self.best, ends = top._replace(converged=False, reason=""), climbed.total
         if len(starts) > 1:
             climbed = self._climb(self._around(top, len(starts) - 1, seed), none)
             ends = np.concatenate([ends, climbed.total])
