@@ -209,8 +209,17 @@ def test_each_plant_has_estimates_of_its_own(folder, capsys):
     agrees(hg.files.read_table("out.a.csv"), [0, 60, 120, 180], [20.0, 20.1, 20.2, 20.3])
     assert len(hg.files.read_table("out.b.csv")["x"]) == 3 and not (folder / "out.csv").exists()
     capsys.readouterr()
-    # A page is of one plant; the option that it names makes one.
-    assert cli.main([*command, "--report", "page"]) == 2
+    # The report is an overview of all plants, which leads to a page of each; of one that is named it is its page.
+    assert cli.main([*command, "--report", "page"]) == 0
+    overview = (folder / "page" / "report.html").read_text()
+    for plant, rows in (("a", 4), ("b", 3)):
+        assert f'<a href="plant.{plant}/report.html">{plant}</a>' in overview and f"<td>{rows}</td>" in overview
+        assert f"{plant}" in (folder / "page" / f"plant.{plant}" / "report.html").read_text()
+    assert json.loads((folder / "page" / "summary.json").read_text()).keys() == {"a", "b"}
+    assert cli.main([*command, "--report", "page", "--plant", "a"]) == 0
+    assert not (folder / "page" / "plant.a").exists()
+    capsys.readouterr()
+    assert cli.main(["fit", *command[1:], "--out", "fit"]) == 2
     said = capsys.readouterr().err
     assert "expected one plant here, which --plant names (--plant a), got 'a', 'b'" in said
     assert cli.main([*command, "--out", "one.csv", "--plant", "c"]) == 2

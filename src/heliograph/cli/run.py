@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app import path_option
-from heliograph.cli.reading import Measured, ReadingOptions, read_measured, single
+from heliograph.cli.reading import Measured, ReadingOptions, read_measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
+    from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing.modes import AbstractSmoothing
@@ -45,7 +46,8 @@ def run(
     A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
     A bag (.mcap, .db3, .bag, or a folder), a log or a table of somebody else's making is events too, by the `sources`
     of the network's file. The estimates are those of the events that a timeline uses, in the order of measuring; with
-    --lag, those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT.
+    --lag, those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT, and
+    a page of its own behind the report's overview, which has the most doubted first.
 
     Parameters
     ----------
@@ -70,8 +72,6 @@ def run(
         measured = read_measured(measurements, network, loaded, module, options, advance)
         if lag is not None and measured[0].events is None:
             raise fail("--lag", "messages or events", f"rows of time in {measurements}")
-        if report is not None:
-            single(measurements, measured)
         # Each plant by itself.
         done = []
         for data in measured:
@@ -87,9 +87,9 @@ def run(
                 lines += _lagged(loaded, data, lag, options, place, write)
             done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines))
     # Report, then warnings and a summary.
-    for data, record, written, place, doubts, lines in done:
-        if report is not None:
-            _write_report(network, loaded, record, data.recording, report)
+    if report is not None:
+        _write_report(network, loaded, {data.plant: (record, data.recording) for data, record, *_ in done}, report)
+    for _, _, written, place, doubts, lines in done:
         _print_lines(list(dict.fromkeys(doubts)), [*_written(written, place, report), *lines])
 
 
@@ -260,14 +260,22 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
         check_replaceable(report, SUMMARY)
 
 
-def _write_report(name: str, network: "Network", record: "Record", recording: "Recording", report: Path) -> None:
+def _write_report(
+    name: str, network: "Network", plants: "Mapping[str, tuple[Record, Recording]]", report: Path
+) -> None:
     from heliograph.report.health import Health, examine
     from heliograph.report.results import Results, write_results
 
-    def results_of(health: Health) -> Results:
-        from heliograph.report.run_page import run_results
+    def examined(advance: "Advance") -> dict[str, Health]:
+        return {
+            plant: examine(network, record, recording.inputs, advance) for plant, (record, recording) in plants.items()
+        }
 
-        return run_results(health, name)
+    def results_of(health: dict[str, Health]) -> Results:
+        from heliograph.report.run_page import results_of_plants, run_results
 
-    count = sum(map(len, network.claims().values()))
-    write_results(report, count, lambda advance: examine(network, record, recording.inputs, advance), results_of)
+        (first, *more) = health.values()
+        return results_of_plants(health, name) if more else run_results(first, name)
+
+    count = len(plants) * sum(map(len, network.claims().values()))
+    write_results(report, count, examined, results_of)

@@ -50,7 +50,8 @@ class Table:
     """Rows of cells under headers; the first column names the row, with a dot in its colour if `colours` are given.
 
     Cells are numbers, set to the right, unless `wordy`: then they are set to the left and broken into lines. On a phone
-    a table that is too wide is moved sideways under its first column, which stays.
+    a table that is too wide is moved sideways under its first column, which stays. `links` are addresses of what the
+    rows are about.
     """
 
     headers: Sequence[str]
@@ -58,6 +59,7 @@ class Table:
     caption: str = ""
     colours: Sequence[str] | None = None
     wordy: bool = False
+    links: Sequence[str] | None = None
     kind: str = "table"
 
 

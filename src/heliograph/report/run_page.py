@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
+from urllib.parse import quote
 
 import matplotlib
 import numpy as np
@@ -26,7 +28,7 @@ from heliograph.report.innovations import (
 from heliograph.report.outputs import errors_of, output_numbers, rounded
 from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.position_map import coordinates_of, map_figure
-from heliograph.report.results import Json, Results
+from heliograph.report.results import Json, Results, write_into
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record
 
@@ -38,6 +40,38 @@ DOUBTS = 3  # that the page shows; `summary.json` has all
 def run_results(health: Health, network: str) -> Results:
     """Return the content of the results folder; `network` is the user's name of the network."""
     return Results(run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None)
+
+
+def results_of_plants(examined: Mapping[str, Health], network: str) -> Results:
+    """Return the results of several plants: an overview, the most doubted first, and beside it a folder for each."""
+    folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
+
+    def write(folder: Path) -> None:
+        for plant, health in examined.items():
+            place = folder / folders[plant]
+            place.mkdir()
+            write_into(run_results(health, f"{network}, {plant}"), place)
+
+    summary: dict[str, Json] = {plant: run_summary(health) for plant, health in examined.items()}
+    return Results({}, lambda _: _overview(examined, network, folders), summary, write)
+
+
+def _overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
+    doubts = {plant: health.warnings() for plant, health in examined.items()}
+    worst = sorted(examined, key=lambda plant: len(doubts[plant]), reverse=True)
+    rows = []
+    for plant in worst:
+        more = f"; and {len(doubts[plant]) - DOUBTS} more" if len(doubts[plant]) > DOUBTS else ""
+        said = "; ".join(map(visible, doubts[plant][:DOUBTS])) + more
+        rows.append([visible(plant) or "(no name)", f"{len(examined[plant].record.time):,}", said or "nothing"])
+    wrong = sum(map(bool, doubts.values()))
+    title = (
+        f"{_counted(len(examined), 'plant')}, {wrong} with doubts" if wrong else f"{len(examined)} plants, no doubts"
+    )
+    links = [f"{quote(folders[plant])}/report.html" for plant in worst]
+    lead = f"The filters of `{visible(network)}` ran over each plant by itself. The most doubted come first."
+    table = Table(["plant", "rows", "doubts"], rows, wordy=True, links=links)
+    return Page(f"Heliograph run: {visible(network)}", title, lead, [Section("Plants", [table])])
 
 
 def run_figures(health: Health) -> dict[str, Figure]:
