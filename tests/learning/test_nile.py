@@ -1,4 +1,4 @@
-"""The Nile's flow at Aswan, 1871 to 1970, with a step of the level in 1899, against a likelihood written in one line."""
+"""The Nile at Aswan, 1871 to 1970, with a step of its level in 1899, against the density of all flows at once."""
 
 import numpy as np
 import pytest

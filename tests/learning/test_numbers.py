@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from heliograph.learning.intervals import bartlett, block_sums, cosines, white
+from heliograph.learning.intervals import bartlett, block_sums, cosines, of_model, told_by_few, white
 from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.parameters import Parameter, Parameters
 from heliograph.learning.ridges import confounded, product_text, rank_of, sum_text
@@ -110,3 +110,20 @@ def test_two_ridges_apart_one_that_is_neither_and_nothing_at_all():
     (group,) = groups_of(lambda v: np.array([v[0], 0 * v[1]]), *(POSITIVE,) * 2)
     assert group.places == (1,) and group.fix == 1
     assert groups_of(lambda v: v, *(POSITIVE,) * 3) == []
+
+
+def test_a_step_is_told_of_by_few_rows_and_a_mean_by_all():
+    """Of 100 rows: all at one, all alike, as a chi-square tells, and in the second half."""
+    step, half = (np.arange(100) == 50).astype(float), (np.arange(100) >= 50).astype(float)
+    columns = [step, np.ones(100), np.random.default_rng(0).normal(size=100) ** 2, half]
+    assert told_by_few([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
+    assert not told_by_few([np.ones((40, 1)), np.ones((60, 1))]).any()
+
+
+def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():
+    """s = L e, e white: of s - H_.K H_KK^-1 s_K and of what the model says of the rest the sum is H = L L'."""
+    lower = np.array([[1.0, 0.0, 0.0], [0.7, 1.2, 0.0], [-0.4, 0.3, 0.8]])
+    rows = np.linalg.qr(np.random.default_rng(1).normal(size=(50, 3)))[0] @ lower.T
+    rest, known = of_model([rows], lower @ lower.T, np.array([False, True, False]))
+    np.testing.assert_allclose(white(rest).covariance + known, lower @ lower.T, atol=1e-14)
+    np.testing.assert_allclose(rest[0][:, 1], 0.0, atol=1e-15)

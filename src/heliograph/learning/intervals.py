@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 import scipy
 
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Bool, Float
 
 
 def long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
@@ -23,6 +23,7 @@ Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profil
 METHODS = get_args(Method)
 LEVEL = 0.95
 DRAWS = 999  # of the bootstrap
+FEW = 1 / 3  # share of the data in which the information on a number lies, below which scores do not tell its spread
 
 Scores = list[Float[np.ndarray, "steps p"]]
 
@@ -34,6 +35,37 @@ class LongRun(NamedTuple):
     freedom: float
 
 
+def waves(steps: int) -> int:
+    """Number of cosines, nu = floor(0.4 T^(2/3))."""
+    return max(int(0.4 * steps ** (2 / 3)), 1)
+
+
+def told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
+    """Numbers (k,) whose information lies in a few of the nu stretches of the data.
+
+    (sum_b V_b)^2 / sum_b V_b^2, of V_b in stretch b, is the number of stretches if all tell the same, and 1 if one
+    tells all. Scores vary over time only where they are told of: cosines that hardly change there see next to nothing.
+    """
+    stretches = np.concatenate([
+        np.add.reduceat(rows, np.arange(waves(len(rows))) * len(rows) // waves(len(rows)), axis=0)
+        for rows in information
+    ])  # fmt: skip
+    stretches = np.maximum(stretches, 0.0)
+    return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
+
+
+def of_model(
+    scores: Scores, hessian: Float[np.ndarray, "p p"], few: Bool[np.ndarray, " p"]
+) -> tuple[Scores, Float[np.ndarray, "p p"]]:
+    """Scores less what is foretold of them by those of a few numbers, and the covariance of that by the model.
+
+    s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., of the numbers K: where the model is true the two are uncorrelated, and
+    the covariances of their sums add up to H.
+    """
+    shares = np.linalg.solve(hessian[np.ix_(few, few)], hessian[few])
+    return [s - s[:, few] @ shares for s in scores], hessian[:, few] @ shares
+
+
 def cosines(scores: Scores) -> LongRun:
     """(T/nu) sum_j G_j G_j', G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)).
 
@@ -43,7 +75,7 @@ def cosines(scores: Scores) -> LongRun:
     parts, weights = [], []
     for s in scores:
         steps = len(s)
-        count = max(int(0.4 * steps ** (2 / 3)), 1)
+        count = waves(steps)
         g = np.sqrt(1 / (2 * steps)) * scipy.fft.dct(s, axis=0)[1 : count + 1]
         parts.append(steps / count * g.T @ g)
         weights.append((steps, count))
@@ -87,8 +119,10 @@ def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draw
 
 
 def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) -> LongRun:
-    """Covariance of the sum of scores by one of the methods that have one."""
+    """Covariance of the sum of scores by a method."""
     match method:
+        case "bootstrap":
+            return LongRun(np.atleast_2d(np.cov(block_sums(scores, DRAWS, 0).T)), np.inf)
         case "cosines":
             return cosines(scores)
         case "bartlett":

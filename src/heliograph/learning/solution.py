@@ -6,7 +6,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.learning.intervals import DRAWS, LEVEL, Method, Scores, block_sums, fall, long_run, quantile, sandwich
+from heliograph.learning.intervals import (
+    DRAWS,
+    LEVEL,
+    Method,
+    Scores,
+    block_sums,
+    fall,
+    long_run,
+    of_model,
+    quantile,
+    sandwich,
+    told_by_few,
+)
 from heliograph.learning.likelihood.objective import Form
 from heliograph.learning.likelihood.search import FURTHER, Top
 from heliograph.learning.likelihood.surface import Surface
@@ -160,13 +172,27 @@ class Solution:
     def _reduced(self, matrix: np.ndarray) -> np.ndarray:
         return np.asarray(self.basis.T @ matrix @ self.basis)
 
+    @cached_property
+    def few(self) -> Bool[np.ndarray, " active"]:
+        """Which active coordinates are real numbers of which a few stretches of the data tell: a step, a start."""
+        places = np.flatnonzero(self.active & self.surface.domains.free)
+        few = np.zeros(len(self.active), dtype=bool)
+        if len(places) and not self.rank.flat.size:
+            few[places] = told_by_few(self.surface.information_by_row(self.top.x, places))
+        return np.asarray(few[self.active])
+
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
-        """Covariance of the active coordinates along the identified directions, and degrees of freedom."""
-        scores = [s @ self.basis for s in self.scores]
-        if method == "bootstrap":
-            drawn = np.linalg.solve(self.hessian, block_sums(scores, DRAWS, 0).T)
-            return np.asarray(self.basis @ np.cov(drawn).reshape(len(drawn), -1) @ self.basis.T), np.inf
-        estimate = long_run(method, scores, self.hessian)
+        """Covariance of the active coordinates along the identified directions, and degrees of freedom.
+
+        Of numbers of which a few stretches of the data tell the scores' covariance is the model's.
+        """
+        scores, known = self.scores, np.zeros((len(self.few), len(self.few)))
+        if self.few.any():
+            back = np.linalg.inv(self.basis)
+            scores, known = of_model(scores, back.T @ self.hessian @ back, self.few)
+        estimate = long_run(method, [s @ self.basis for s in scores], self.hessian)
+        if method != "hessian":
+            estimate = estimate._replace(covariance=estimate.covariance + self._reduced(known))
         return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
@@ -211,7 +237,8 @@ class Solution:
             low, high = self._cut(entry.coordinate, first, fall(level))
             return low, high
         center = float(link(entry.domain, value))
-        if method == "bootstrap":
+        few = entry.coordinate is not None and self.few[np.count_nonzero(self.active[: entry.coordinate])]
+        if method == "bootstrap" and not few:
             low, high = center + self._drawn(slopes, level)
             return low, high
         half = quantile(freedom, level) * error

@@ -72,6 +72,18 @@ class Surface:
         hessian[np.ix_(moving, moving)] = (block + block.T) / 2
         return hessian
 
+    def information_by_row(self, x: Float[np.ndarray, " p"], places: np.ndarray) -> list[Float[np.ndarray, "steps k"]]:
+        """What each row of each recording tells of some coordinates: -ds_k/dx_k by central differences."""
+        deviation = self.standard_errors(x)[places]
+        width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
+        shifts = np.zeros((len(places), len(x)))
+        shifts[np.arange(len(places)), places] = width
+        score = self.evaluations(np.concatenate([x + shifts, x - shifts])).score
+        further, back = (np.stack([s[..., k] for s, k in zip(half, places, strict=True)], axis=-1)
+                         for half in (score[: len(places)], score[len(places) :]))  # fmt: skip
+        told = (back - further) / np.where(width > 0, 2 * width, 1.0)
+        return [rows[:steps] for rows, steps in zip(told, self.data.lengths, strict=True)]
+
     def standard_errors(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Standard error of each number at a point, were the others known; infinite if the data say nothing of it."""
         information: np.ndarray = self.evaluations(x[None]).information[0]
