@@ -114,6 +114,33 @@ def test_a_network_in_which_nothing_is_free_is_informed(folder, tmp_path, capsys
 
 
 @pytest.mark.slow
+def test_a_sender_that_decides_is_refused_with_what_learns_it(tmp_path, capsys):
+    """What the line says is done: noise of 1, of 60 rows of which some are silent."""
+    path, true, data = tmp_path / "event.py", tmp_path / "true.py", tmp_path / "data.csv"
+    true.write_text(
+        "import heliograph as hg\n"
+        "plant = hg.LinearPlant([[0.9]], hg.free(1.0, 'plant noise'), [0.0], 1.0)\n"
+        "sensor = hg.LinearSensor([[1.0]], 0.05, outputs=['level'])\n"
+        "node = hg.Node(sensor, hg.perfect(), {}, trigger=hg.SendOnDelta(0.5))\n"
+        "network = hg.Network(plant, {'a': node})\n"
+    )
+    path.write_text(true.read_text().replace("free(1.0", "free(0.3"))
+    network = hg.files.load_network(str(true))
+    z = hg.monte_carlo(network, horizon=60, runs=1, key=1).measurements["a"][0]
+    write_recording(Recording({"a": z}, np.zeros((60, 0)), np.arange(60.0)), network, data)
+    assert main(["fit", str(path), "--measurements", str(data), "--out", str(tmp_path / "out")]) == 2
+    line = capsys.readouterr().err.strip()
+    assert line.endswith(
+        "network to be learned: expected no trigger of a node "
+        "(in Python hg.fit(hg.files.fitted.NetworkAgain(FILE), recording) learns it), got one with a trigger"
+    )
+    recording = hg.files.read_recording(data, network)
+    found = hg.fit(hg.files.fitted.NetworkAgain(str(path)), recording, starts=1)
+    (row,) = found.rows()
+    assert found.converged and row.low < 1.0 < row.high
+
+
+@pytest.mark.slow
 def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypatch):
     """The interrupt comes at the third look at how far the search has come."""
     from heliograph.learning import fitting

@@ -97,7 +97,8 @@ def learn(
     build = NetworkAgain(network)
     start = build()
     if decides(start):
-        raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
+        again = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
+        raise fail("network to be learned", f"no trigger of a node (in Python {again} learns it)", "one with a trigger")
     data = _data(measurements, network, start, advance, truth, reading)
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
