@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.fields import at, decoded, nanoseconds
-from heliograph.files.sources import Sources, matches
+from heliograph.files.fields import at, decoded, matches, nanoseconds
+from heliograph.files.sources import Sources
 
 json_field = hg.files.json_field
 PLANT = hg.Plant(

@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .availability import (
+    Available as Available,
+)
 from .bag_output import (
     Pose as Pose,
 )

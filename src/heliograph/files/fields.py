@@ -1,4 +1,4 @@
-"""Fields of messages: what stands at a dotted path, and its conversion to a number, a time, a count or a name."""
+"""Topics and fields of messages: patterns of topics, what stands at a dotted path, and its conversion to a number."""
 
 import json
 import re
@@ -69,6 +69,16 @@ def decoded(text: str | bytes, name: str) -> Any:
         raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
     except (ValueError, RecursionError):  # also bytes that are no text
         raise fail(name, "JSON", shown(text)) from None
+
+
+def matches(topic: str, pattern: str) -> bool:
+    """Return whether a topic matches a pattern with the wildcards of MQTT: + for one word, # for all that follow."""
+    if topic == pattern:
+        return True
+    words, parts = topic.split("/"), pattern.split("/")
+    if parts[-1] == "#":
+        words, parts = words[: len(parts) - 1], parts[:-1]
+    return len(words) == len(parts) and all(level in ("+", word) for word, level in zip(words, parts, strict=True))
 
 
 def at(message: object, path: str, where: str) -> Any:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.files.availability import Available
 from heliograph.files.fields import TimeUnit, at, name_of
 from heliograph.numerics.check import TINY, fail, flag, scalar, shown
 from heliograph.numerics.module import readable
@@ -119,7 +120,9 @@ Texts = TypeAliasType("Texts", str | Sequence[str] | None)
 Time = TypeAliasType("Time", str | Stamp | None)
 Counted = TypeAliasType("Counted", str | Count | None)
 Plant = TypeAliasType("Plant", str | Level | Field | None)
-Conditions = TypeAliasType("Conditions", Mapping[str, object] | None)
+Condition = TypeAliasType("Condition", Mapping[str, object] | Available)
+Conditions = TypeAliasType("Conditions", Condition | Sequence[Condition] | None)
+Devices = TypeAliasType("Devices", tuple[Available, ...])
 Containers = TypeAliasType("Containers", dict[str, Container[object]])
 Numbers = TypeAliasType("Numbers", tuple[float, ...])
 
@@ -141,6 +144,7 @@ class Source:
         plant: the `Level` or `Field` that names the plant; None for a single plant.
         step: seconds of a step where times are counted in steps; None where they are not.
         where: the values, or a container of them, that the field at each dotted path may have.
+        available: conditions on what the device says of itself on another topic.
         quoted: whether numbers may be texts.
     """
 
@@ -155,6 +159,7 @@ class Source:
     plant: "Level | Field | None"
     step: "float | None"
     where: "Containers"
+    available: "Devices"
     quoted: bool
 
     @property
@@ -209,7 +214,8 @@ def json_field(
         plant: dotted path of the plant's name, or the `Level` or `Field` that has it; None if there is one plant.
         step: seconds of a step of a network that counts steps, where times are dates; None for any other.
         where: for each dotted path the value that the field must have, or several (a list, a set, a range), for the
-            message to be used, such as {"status": ["Good", "Uncertain"]} None for all messages.
+            message to be used, such as {"status": ["Good", "Uncertain"]}; or `Available`, for a topic on which the
+            device says whether it is online; or a list of these. None for all messages.
         quoted: whether numbers in quotes are numbers too (default False: they are refused).
 
     Raises:
@@ -235,7 +241,7 @@ def json_field(
     factors, shifts = (_per_path(name, value, len(paths)) for name, value in (("scale", scale), ("offset", offset)))
     return Source(
         paths, whose, outputs, factors, shifts, stamp, time_unit, count, None if of is None else _named("plant", of),
-        seconds, _conditions(where), flag("json_field, quoted", quoted),
+        seconds, *_conditions(where), flag("json_field, quoted", quoted),
     )  # fmt: skip
 
 
@@ -343,17 +349,26 @@ def _named(name: str, value: object) -> Any:
     return value
 
 
-def _conditions(where: object) -> dict[str, Container[object]]:
-    if where is None:
-        return {}
-    if not isinstance(where, Mapping) or not all(isinstance(path, str) for path in where):
-        raise fail("json_field, where", "a dictionary of paths with their values", shown(where))
-    single = str, int, float, bool, type(None)
-    values = {path: (value,) if isinstance(value, single) else value for path, value in where.items()}
-    for path, several in values.items():
-        if not isinstance(several, Container):
-            raise fail(f"json_field, where, {path!r}", "a value, or a list, set or range of them", shown(several))
-    return values
+def _conditions(where: object) -> tuple[Containers, tuple[Available, ...]]:
+    """Return the conditions on fields, and those on what devices say of themselves."""
+    several = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
+    available = tuple(single for single in several if isinstance(single, Available))
+    pairs = list[tuple[str, object]]()
+    for single in several:
+        if isinstance(single, Available):
+            continue
+        if not isinstance(single, Mapping) or not all(isinstance(path, str) for path in single):
+            raise fail("json_field, where", "a dictionary of paths with their values, or Available", shown(where))
+        pairs += single.items()
+    plain, values = (str, int, float, bool, type(None)), dict[str, Container[object]]()
+    for path, value in pairs:
+        if path in values:
+            raise fail("json_field, where", "each path once", shown(path))
+        allowed = (value,) if isinstance(value, plain) else value
+        if not isinstance(allowed, Container):
+            raise fail(f"json_field, where, {path!r}", "a value, or a list, set or range of them", shown(allowed))
+        values[path] = allowed
+    return values, available
 
 
 def _texts(name: str, value: object) -> tuple[str, ...]:

@@ -119,6 +119,8 @@ def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable
     if topic is None:
         topic = path.name if sources.of(path.name) else message_name(path)
     try:
+        if sources.hear(topic, message.content, message.where):
+            return
         # The payload of a topic that nobody asks for may be anything.
         content = payload_of(message) if sources.of(topic) else None
         came = None if message.arrival is None else nanoseconds(message.arrival, "s", f"{message.where}, arrival")
@@ -146,9 +148,7 @@ def _conclude(path: Path, sources: Sources, events: EventTable) -> None:
     if sources.unknown.total():
         counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
         events.notes.append(f"{path}: not among the sources: {counts}")
-    if sources.excluded:
-        counts = ", ".join(f"{topic} ({count})" for topic, count in sources.excluded.items())
-        events.notes.append(f"{path}: left out by where=: {counts}")
+    events.notes += [f"{path}: {note}" for note in sources.notes]
     if sources.stored:
         events.notes.append(f"{path}: {sources.stored} stored messages were left out: without time= they have no date")
     if sources.steps is False and not len(events) and not events.reasons and not events.broken:

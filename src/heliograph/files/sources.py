@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.fields import MissingFieldError, at, count, nanoseconds, number
+from heliograph.files.availability import LastWords
+from heliograph.files.fields import MissingFieldError, at, count, matches, nanoseconds, number
 from heliograph.files.json_field import Source, Yaw
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
@@ -16,6 +17,7 @@ from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
 SECOND = 10**9  # nanoseconds
+LISTED = 8  # topics in one line
 COPY = 10 * SECOND  # a message that comes again so soon, with its count and values, is a copy
 
 
@@ -65,6 +67,7 @@ class Sources:
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
+        self.offline = Counter[str]()  # messages of devices that had said that they are offline, by topic
         self.absent = dict[
             tuple[str, str], str
         ]()  # by source's topic and path, what was said of the first without the field
@@ -79,7 +82,9 @@ class Sources:
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", shown(table))
         self._table = {topic: self._checked(topic, items) for topic, items in table.items()}
         self._known: dict[str, list[Mapped]] = {}
-        steps = {source.step for items in self._table.values() for source, *_ in items}
+        mapped = [single for several in self._table.values() for single in several]
+        self._words = LastWords(condition for single in mapped for condition in single.source.available)
+        steps = {single.source.step for single in mapped}
         if len(steps) > 1:
             raise fail("sources, step", "the same of all", sorted(map(str, steps)))
         self.step = next(iter(steps), None)
@@ -88,6 +93,23 @@ class Sources:
     def topics(self) -> list[str]:
         """Return the topics of the table, wildcards included."""
         return list(self._table)
+
+    @property
+    def subscribed(self) -> list[str]:
+        """Return the topics of the table, and those on which devices say whether they are online."""
+        return list(dict.fromkeys([*self._table, *self._words.topics]))
+
+    @property
+    def notes(self) -> list[str]:
+        """Return lines on conditions that left messages out, and on devices that never said whether they are online."""
+        lines = []
+        for counts, why in ((self.excluded, "left out by where="), (self.offline, "left out, of devices offline")):
+            if counts:
+                named = ", ".join(f"{topic} ({number})" for topic, number in counts.most_common(LISTED))
+                lines.append(f"messages {why}: {named}{_more(len(counts))}")
+        if silent := self._words.unheard:
+            lines.append(f"no word of online or offline came: {', '.join(silent[:LISTED])}{_more(len(silent))}")
+        return lines
 
     @property
     def periods(self) -> dict[str, int]:
@@ -113,6 +135,19 @@ class Sources:
             matching = [items for pattern, items in self._table.items() if matches(topic, pattern)]
             self._known[topic] = [source for items in matching for source in items]
         return self._known[topic]
+
+    def hear(self, topic: str, payload: object, where: str) -> bool:
+        """Take what a device says of itself, online or offline; return whether the message says that.
+
+        Args:
+            topic: the topic of the message.
+            payload: its payload, as text or decoded.
+            where: place of the message, for errors.
+
+        Raises:
+            ValueError: a word that is neither online nor offline; one line.
+        """
+        return self._words.hear(topic, payload, where)
 
     def read(self, topic: str, message: object, where: str) -> list[Reading]:
         """Read the message of a topic, one reading for each source; none, and counted, if the topic is unknown.
@@ -161,6 +196,9 @@ class Sources:
             if at(message, field, where) not in allowed:
                 self.excluded[topic] += 1
                 return None
+        if any(self._words.offline(condition, topic) for condition in source.available):
+            self.offline[topic] += 1
+            return None
         # Node, plant and count name a measurement.
         node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
         if node in self.others:
@@ -232,6 +270,8 @@ class Sources:
             found = {able_one: self._columns(name, source, able_one) for able_one in able if able_one != INPUTS}
             if not found:
                 raise fail(f"{name}, output", "outputs of a node", shown(source.outputs or len(source.paths)))
+        for condition in source.available if "#" not in topic else ():
+            condition.of(topic)
         # Either all times are moments, or all are steps.
         if self.steps != (source.step is not None or (source.time is not None and source.time_unit == "step")):
             expected = (
@@ -254,14 +294,8 @@ class Sources:
         return np.array([known.index(output) for output in outputs])
 
 
-def matches(topic: str, pattern: str) -> bool:
-    """Return whether a topic matches a pattern with the wildcards of MQTT: + for one word, # for all that follow."""
-    if topic == pattern:
-        return True
-    words, parts = topic.split("/"), pattern.split("/")
-    if parts[-1] == "#":
-        words, parts = words[: len(parts) - 1], parts[:-1]
-    return len(words) == len(parts) and all(level in ("+", word) for word, level in zip(words, parts, strict=True))
+def _more(count: int) -> str:
+    return "" if count <= LISTED else f" and {count - LISTED} more"
 
 
 def _value(message: object, path: str | Yaw, where: str, quoted: bool) -> float:

@@ -155,6 +155,51 @@ def test_subjects_of_nats_are_the_same_sources(server, translator):
     asyncio.run(work())
 
 
+@pytest.mark.real("MQTT")
+def test_the_stored_word_of_a_device_holds_for_a_service_that_begins_later(server, file):
+    """zigbee2mqtt stores "offline" at the broker; a service that comes afterwards leaves values out until "online"."""
+    from heliograph.files.network_file import load_module
+
+    network, _ = load_module(str(file))
+    here = hg.files.Available("den2mqtt/+/availability")
+    source = hg.files.json_field("temperature", "garden", plant=hg.files.Level(1), where=here)
+    translator, where = Translator({"den2mqtt/+": source}, network), at(server, "mqtt", "den")
+
+    async def until(holds):
+        for _ in range(400):
+            if holds():
+                return
+            await asyncio.sleep(0.05)
+
+    async def work() -> None:
+        client = Client(CallbackAPIVersion.VERSION2)
+        client.connect(where.host, where.port)
+        client.loop_start()
+        client.publish("den2mqtt/a/availability", b"offline", 1, retain=True).wait_for_publish(20)
+        transport = connected(where, translator=translator)
+        read = asyncio.ensure_future(transport.receive())
+        try:
+            # Brokers keep the order within a topic only: the word, the values, and "online" wait for each other.
+            await until(lambda: not translator.sources.notes)
+            for payload in (b'{"temperature": 90.0}', b'{"temperature": 91.0}'):
+                client.publish("den2mqtt/a", payload, 1)
+            await until(lambda: translator.sources.offline["den2mqtt/a"] == 2)
+            client.publish("den2mqtt/a/availability", b'{"state": "online"}', 1, retain=True)
+            await until(lambda: not translator.sources._words._offline)
+            client.publish("den2mqtt/a", b'{"temperature": 18.0}', 1)
+            batch = await asyncio.wait_for(read, 20)
+            assert [message.values for message in batch.payloads] == [[18.0]]
+            await batch.acknowledge()
+        finally:
+            client.publish("den2mqtt/a/availability", b"", 1, retain=True).wait_for_publish(20)
+            await transport.close()
+            client.disconnect()
+            client.loop_stop()
+        assert translator.left_out() == ["messages left out, of devices offline: den2mqtt/a (2)"]
+
+    asyncio.run(work())
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_inspect_lists_the_topics_of_a_broker(server, capsys, kind):
     """Forty messages a second while it listens: their rate, the lateness of their date, and sources that run."""

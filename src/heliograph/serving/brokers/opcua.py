@@ -170,7 +170,7 @@ class OpcUa:
         client = _client(self.address)
         await client.connect()
         self._client = client
-        for name in self._translator.sources.topics:
+        for name in self._translator.sources.subscribed:
             node = _node(client, name)
             self._first.add(node.nodeid.to_string())
             self.reporting[name] = await _monitor(client, node, self)

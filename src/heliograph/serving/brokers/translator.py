@@ -84,9 +84,7 @@ class Translator:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
             lines.append(f"topics that are not among the sources: {named}{more}")
-        if self.sources.excluded:
-            named = ", ".join(f"{topic} ({count})" for topic, count in self.sources.excluded.most_common(LISTED))
-            lines.append(f"messages left out by where=: {named}")
+        lines += self.sources.notes
         if said := self.sources.never():
             lines.append(f"a field that no message had: {said}")
         if self._stored:
@@ -97,11 +95,13 @@ class Translator:
         self, topic: str, payload: bytes, arrival: datetime | None, stored: bool, again: bool
     ) -> list[Message | str]:
         """Read a payload; `again`: a message may be sent again."""
-        if not self.sources.of(topic):  # whatever it is
-            self.sources.unknown[topic] += 1
-            return []
         results: list[Message | str] = []
         try:
+            if self.sources.hear(topic, payload, topic):
+                return []
+            if not self.sources.of(topic):  # whatever it is
+                self.sources.unknown[topic] += 1
+                return []
             for reading in self.sources.read(topic, _decoded(payload, topic), topic):
                 if stored and reading.time is None:
                     self._stored += 1
