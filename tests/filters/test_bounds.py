@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.transform import PolynomialMoments
+from heliograph.factors.gaussian import given
+from heliograph.filters.gaussian.signal import Signal
+from heliograph.filters.gaussian.transform import PolynomialMoments, Transformed, image_of_moments
 from tests import machine
 from tests.filters.gaussian.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
 from tests.machine import STRONG
@@ -64,7 +65,11 @@ def test_too_many_points_are_refused():
 
 
 @eqx.filter_jit
-def correct(update, prior, signal, described):
+def correct(update, prior, moments, described):
+    """Gain and bound for a prior covariance and the moments of y: its mean, covariance, Cov(x, y) and E[y y']."""
+    x, (mean, spread, cross, second) = given(jnp.zeros(len(prior)), prior), moments
+    image = image_of_moments(Transformed(mean, spread, cross), x)
+    signal = Signal(x, image.mean, image.slopes, image.curvature, second, jnp.diagonal(second))
     return update.correct(prior, signal, described, jnp.ones(2, bool))
 
 
@@ -80,7 +85,7 @@ def one_step(update):
     mean, p = oracle.predict_cubature(s["xbar0"], s["Xi0"], s)
     yhat, v = oracle.measure(mean, p, s["C"][0], s)
     with jax.enable_x64(True):
-        signal = Signal(*(jnp.asarray(a) for a in (yhat, v.Pyy, v.Pxy, v.Y)))
+        signal = tuple(jnp.asarray(a) for a in (yhat, v.Pyy, v.Pxy, v.Y))
         gain, bound = correct(update, jnp.asarray(p), signal, strong_channel(type(update)))
     return p, signal, np.asarray(gain), np.asarray(bound)
 
@@ -168,7 +173,7 @@ def check_by_enumeration(build, usable=anything):
         joint, y = case.joint, slice(7, 9)
         e, ey = joint[:5, :5], joint[5:7, 5:7]
         yy = ey + joint[y, y] + joint[5:7, y] + joint[y, 5:7]
-        signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
+        signal = np.zeros(2), ey, joint[:5, 5:7], yy
         update = build(hg.filters.Scalars(*case.scalars))
         with jax.enable_x64(True):
             described = update.describe(case.channel)
@@ -229,7 +234,7 @@ def too_small(radius, shrink, seeds=range(20)):
         joint = a @ a.T  # nearly one direction: e and y move together, the worst for a shifted mean
         ey = joint[5:7, 5:7]
         yy = ey + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
-        signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
+        signal = np.zeros(2), ey, joint[:5, 5:7], yy
         with jax.enable_x64(True):
             gain, bound = (np.asarray(v) for v in correct(update, jnp.asarray(joint[:5, :5]), signal, shrink(right)))
         for corner in laws:
@@ -240,7 +245,9 @@ def too_small(radius, shrink, seeds=range(20)):
 
 def test_the_enumeration_finds_bounds_that_are_too_small():
     """Half the spread, or no shift, is caught; the description as it is is not: the checks above can fail."""
-    half = lambda d: eqx.tree_at(lambda x: x.spread.center, d, d.spread.center / 2)  # noqa: E731
+    half = lambda d: eqx.tree_at(  # noqa: E731
+        lambda x: (x.gain_spread, x.noise.weights), d, (d.gain_spread / 2, d.noise.weights / 2)
+    )
     still = lambda d: eqx.tree_at(lambda x: x.shift.center, d, 0 * d.shift.center)  # noqa: E731
     assert too_small(0.0, half)
     assert too_small(0.15, still)

@@ -13,8 +13,6 @@ from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import RESERVED, step_program
 from heliograph.export.text import CText, Form, c_text
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.factored import factored
-from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance, shown
 
@@ -95,8 +93,6 @@ def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[
     """Return the text of both files of a filter."""
     names = received_names(filter) if received is None else received
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
-    if real == "float" and not isinstance(filter, ScheduledFilter):  # whose covariances are a table
-        filter, kind = factored(filter), f"{kind}, its covariance as L D L'"
     return c_text(step_program(filter, real), Form(prefix, real, names, kind))
 
 

@@ -11,7 +11,7 @@ from .base import (
 from .wrappers.clock import (
     clock_filter as clock_filter,
 )
-from .gaussian.correction import (
+from .gaussian.bounds import (
     Scalars as Scalars,
 )
 from .wrappers.delay import (

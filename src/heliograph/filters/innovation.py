@@ -7,14 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian.correction import Signal, homogeneous
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.linalg import (
     OFF_SUPPORT,
     OFF_VALUE,
     PIVOT_TOLERANCE,
     UNROLL_LIMIT,
-    congruence,
     negative_tolerance,
     rounding,
 )
@@ -22,7 +20,6 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import Array, Float
-from heliograph.random_affine.moments.second_moments import SecondOrder
 
 LOG_TURN = float(np.log(2 * np.pi))
 
@@ -46,18 +43,6 @@ def gaussian_innovation(
 def no_innovation() -> Innovation:
     """Return the empty innovation of a filter that uses no measurements."""
     return Innovation(jnp.zeros(0), jnp.zeros((0, 0)), jnp.zeros(()))
-
-
-def innovation_covariance(signal: Signal, channel: SecondOrder) -> Float[Array, "m m"]:
-    """M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law, from the prior moments of the signal y."""
-    return _innovation_covariance(signal, channel)
-
-
-@runs_last
-def _innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
-    second = homogeneous(signal.second, signal.mean, 1.0)
-    everything = jnp.ones((len(channel.mean_gain), *second.shape[2:]), dtype=bool)
-    return congruence(channel.mean_gain, signal.covariance) + channel.nominal.middle(second, everything)
 
 
 def mixed_innovation(

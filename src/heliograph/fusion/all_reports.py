@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian.correction import homogeneous
+from heliograph.filters.gaussian.signal import homogeneous
 from heliograph.fusion.cross_covariance import Errors, observation_noise
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.quantizer import widen

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.factors.columns import Columns, columns_of, eliminated, square_root
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, shown
-from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.numerics.types import ArrayLike, Float
@@ -45,6 +45,11 @@ class AbstractNoise(Module):
         """Length of the noise vector."""
         return int(self.mean.shape[-1])
 
+    @property
+    def columns(self) -> Columns:
+        """Covariance as a sum of squares W diag(w) W': by the root that is drawn from, where there is one."""
+        return columns_of(self.covariance)
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw one vector; shape (dimension,)."""
         raise unwritten(self, "sample")
@@ -62,20 +67,28 @@ class Gaussian(AbstractNoise):
 
     covariance: Square
     mean: Vector
-    factor: Square  # A with A A' = covariance; its columns are eigenvectors, or of Cholesky's factor where it is traced
+    factor: Square  # A diag(w) A' is the covariance: of eigenvectors, with w = 1; where it is traced, L and d of L D L'
+    weights: Vector
 
     def __init__(self, covariance: ArrayLike, mean: ArrayLike | None = None):
         self.covariance = check.covariance("noise covariance", covariance)
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
-            self.factor = cholesky(jnp.asarray(self.covariance))
+            self.factor, self.weights = eliminated(jnp.asarray(self.covariance))
             return
         self.factor = _root(self.covariance)
+        self.weights = np.ones(n)
+
+    @property
+    def columns(self) -> Columns:
+        """A diag(w) A'."""
+        return Columns(self.factor, self.weights)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw mean + A w with w standard normal."""
-        return jnp.asarray(self.mean + self.factor @ jax.random.normal(key, self.mean.shape, dtype=float))
+        """Draw mean + A e with e normal of variances w."""
+        draw = jax.random.normal(key, self.mean.shape, dtype=float)
+        return jnp.asarray(self.mean + self.factor @ (square_root(jnp.asarray(self.weights)) * draw))
 
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] by E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j] (Isserlis, Stein)."""
@@ -162,6 +175,14 @@ class Independent(AbstractNoise):
         self.mean = library(means).concatenate(means)
         self.covariance = scipy_for(blocks).linalg.block_diag(*blocks)
 
+    @property
+    def columns(self) -> Columns:
+        """Those of the parts, one after another."""
+        parts = [component.columns for component in self.parts]
+        matrices = [part.matrix for part in parts]
+        weights = library(parts).concatenate([part.weights for part in parts])
+        return Columns(scipy_for(parts).linalg.block_diag(*matrices), weights)
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""
         keys = jax.random.split(key, len(self.parts))
@@ -197,6 +218,11 @@ class Shaped(AbstractNoise):
         self.source = source
         self.mean = self.matrix @ source.mean
         self.covariance = self.matrix @ source.covariance @ self.matrix.T
+
+    @property
+    def columns(self) -> Columns:
+        """B W diag(w) (B W)'."""
+        return self.source.columns.through(self.matrix)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw B u."""

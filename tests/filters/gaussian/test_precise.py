@@ -85,27 +85,18 @@ def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
 WIDE, PRECISE = 10.0 ** np.arange(0, 15, 2), 10.0 ** np.arange(-14, 1, 2)
 
 
-def test_what_rounding_leaves_of_a_variance_is_right_or_is_no_less():
-    """A wide prior ties position and velocity to the last digit: after the second position no digit may be left.
+def test_a_wide_prior_and_a_precise_sensor_leave_the_exact_variance():
+    """A wide prior ties position and velocity to the last digit, and no digit is lost: within 2 % in every case.
 
-    Then the velocity's variance is claimed by 1e-14 of the prior's too large, and with the next positions what is true
-    comes back: after four at most two and a half times it. Where the sensor's is 1e-11 of the prior's, a variance is
-    claimed to 1e-3.
+    Rows of sums of squares are known to eps, so that variances are to eps^2 of the largest; 1e-28 of it is the least.
     """
     noise = [[1e-9, 0.0], [0.0, 1e-9]]
-    lost = 0
     for wide in WIDE:
         plant = hg.LinearPlant(A, noise, [0.0, 0.0], wide)
         for precise in PRECISE:
             expected = exact(A, noise, precise, [[wide, 0.0], [0.0, wide]])
             item = hg.linear_filter(plant, hg.LinearSensor(C, precise), hg.perfect(1))
-            result = claimed(item)
-            if precise + 1e-9 >= 1e-11 * wide:
-                np.testing.assert_allclose(result, expected, rtol=1e-3, err_msg=f"{wide} {precise}")
-            lost += np.sum(result > 1.05 * expected)
-            assert np.all((result >= 0.95 * expected) & (result <= 1.05 * expected + 5e-14 * wide)), (wide, precise)
-            assert np.all(result[-1] <= 2.51 * expected[-1]), (wide, precise)
-    assert 0 < lost < WIDE.size * PRECISE.size * STEPS
+            np.testing.assert_allclose(claimed(item), expected, rtol=0.02, err_msg=f"{wide} {precise}")
 
 
 @pytest.mark.parametrize("tied", [0.0, 0.9])
@@ -128,18 +119,19 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
 @pytest.mark.parametrize("outputs", [1, 2])
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
-    """x = v a with one unknown a: the first output tells it, a second only what the mean's rounding is.
+    """x = v a with one unknown a: the first output tells it, and what stays unknown is the rounding of z and of x.
 
-    P is known to eps P, which does not say that nothing else is unknown: a hundred eps |I - K H| |P| |I - K H|' remain.
+    Four eps of what z is made of, through the gain v / (h v): at most a hundred eps of |I - K H| |v|, and no less than
+    the error, which is of the same size.
     """
     random = np.random.default_rng(seed)
     v, h = random.normal(size=3), random.normal(size=(outputs, 3))
     plant = hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), np.outer(v, v))
     item = hg.kalman_filter(plant, hg.LinearSensor(h, np.zeros((outputs, outputs))))
-    estimate = item.estimate(item.correct(item.init(), h @ v / (h[0] @ v))[0])
-    np.testing.assert_allclose(estimate.mean, v / (h[0] @ v), rtol=1e-12)
+    estimate = item.estimate(item.correct(item.predict(item.init()), h @ v / (h[0] @ v))[0])
+    error, claimed = np.abs(estimate.mean - v / (h[0] @ v)), np.sqrt(np.diagonal(estimate.covariance))
     left = np.abs(np.eye(3) - np.outer(v / (h[0] @ v), h[0])) @ np.abs(v)
-    np.testing.assert_allclose(np.diagonal(estimate.covariance), 100 * np.finfo(float).eps * left**2, rtol=1e-3)
+    assert np.all(claimed <= 100 * np.finfo(float).eps * left) and np.all(error <= 30 * claimed)
 
 
 def test_what_noise_that_ties_states_hides_stays_unknown():
@@ -236,11 +228,11 @@ def test_a_premise_about_the_mean_is_not_used_where_the_law_is_known(channel, le
 def test_a_combination_free_of_noise_is_known(noise, combined):
     """z_2 - z_1 = x, or 3 z_1 - z_2 = x: the state is known to the rounding of z, and no less than nothing.
 
-    That is 3 eps of the signal's deviation and of the noise's, in each output; a quarter more for what rounding leaves
-    of the covariance itself. Of what is smoothed too. The error is a few roundings of states of size 5.
+    That is 4 eps of the signal's deviation and of the noise's, in each output. Of what is smoothed too. The error is a
+    few roundings of states of size 5.
     """
-    rounded = 3 * np.finfo(float).eps * (np.array([1.0, 2.0]) * np.sqrt(3.0) + np.sqrt(np.diag(noise)))
-    most = 1.25 * np.square(combined) @ rounded**2
+    rounded = 4 * np.finfo(float).eps * (np.array([1.0, 2.0]) * np.sqrt(3.0) + np.sqrt(np.diag(noise)))
+    most = np.square(combined) @ rounded**2
     plant, sensor = hg.LinearPlant([[0.9]], 0.16, [0.0], 3.0), hg.LinearSensor([[1.0], [2.0]], noise)
     items = {"linear": hg.linear_filter(plant, sensor, hg.perfect(2)), "kalman": hg.kalman_filter(plant, sensor)}
     network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(2), items)})

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
+from heliograph.factors.gaussian import Gaussian, given
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import cut_to_ball
 from heliograph.filters.event.moments import arriving, augmented, moved, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
-from heliograph.filters.gaussian.belief import Belief, moments_around
+from heliograph.filters.gaussian.belief import moments_around
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -334,16 +335,17 @@ class EventFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
         """Mean and covariance of the whole sum."""
-        return Estimate(*self._whole(state), self.claim)
+        whole = self._whole(state)
+        return Estimate(whole.mean, whole.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """The moments of the joined sums around the update."""
         return moments_around(self, step, self._whole)
 
-    def _whole(self, state: EventBelief) -> Belief:
+    def _whole(self, state: EventBelief) -> Gaussian:
         """Mean and covariance of the state by the whole sum."""
         n, whole = len(self.states), join(state.parts)
-        return Belief(whole.mean[0, :n], whole.covariance[0, :n, :n])
+        return given(whole.mean[0, :n], whole.covariance[0, :n, :n])
 
 
 def _sent(label: jax.Array, lost: bool) -> jax.Array:

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.gaussian import given
 from heliograph.filters.event.parts import Parts
-from heliograph.filters.gaussian.belief import Belief, predicted
-from heliograph.filters.gaussian.gaussian import signal_of
+from heliograph.filters.gaussian.belief import image_of
+from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
 from heliograph.model.plant import AbstractPlant, LinearPlant
@@ -20,7 +21,8 @@ def augmented(
     """Each Gaussian of (x, r) with y = h(x) + v as well."""
 
     def single(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-        signal = signal_of(plant, sensor, transform, Belief(mean[:n], covariance[:n, :n]))
+        x = given(mean[:n], covariance[:n, :n])
+        signal = signal_of(plant, sensor, transform, x, jnp.zeros(n))
         slope = _slope(sensor, covariance[:n, :n], signal.cross)
         cross = jnp.concatenate([signal.cross, covariance[n:, :n] @ slope.T])
         wide = jnp.concatenate([covariance, cross.T])
@@ -42,13 +44,15 @@ def moved(
 ) -> tuple[jax.Array, jax.Array]:
     """(x, r) a step later."""
     n = len(plant.states)
-    x = Belief(mean[:n], covariance[:n, :n])
-    moved = predicted(plant, transform, x, u)
-    slope = plant.transition_matrix(u) if isinstance(plant, LinearPlant) else psd_solve(x.covariance, moved.cross).T
+    x = given(mean[:n], covariance[:n, :n])
+    image = image_of(plant, transform, x, u)
+    total = image.columns_from(x).covariance + plant.noise_covariance(u)
+    both = (x.root * x.variances) @ image.slopes.T
+    slope = plant.transition_matrix(u) if isinstance(plant, LinearPlant) else psd_solve(covariance[:n, :n], both).T
     cross = slope @ covariance[:n, n:]
-    upper = jnp.concatenate([moved.covariance, cross], axis=1)
+    upper = jnp.concatenate([total, cross], axis=1)
     lower = jnp.concatenate([cross.T, covariance[n:, n:]], axis=1)
-    return jnp.concatenate([moved.mean, mean[n:]]), jnp.concatenate([upper, lower])
+    return jnp.concatenate([image.mean + plant.noise_mean(), mean[n:]]), jnp.concatenate([upper, lower])
 
 
 def updated(

@@ -1,6 +1,6 @@
 """One Gaussian behind a sender whose silence is Gaussian: one that sends by chance, or by schedule."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
+from heliograph.factors.columns import eliminated, joined
+from heliograph.factors.gaussian import Gaussian, given, observe
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
-from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
-from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.gaussian import signal_of
-from heliograph.filters.gaussian.precise import initial_size
+from heliograph.filters.gaussian.belief import moments_around, predicted, start_of
+from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
-from heliograph.filters.modes.multiple_model import receive
+from heliograph.filters.modes.multiple_model import receive, repeated
 from heliograph.filters.modes.side_information import SideInformation, append_flag
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.centred import predicted_signal
@@ -30,13 +30,27 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 
 class StochasticBelief(NamedTuple):
-    """Mean (n,), covariance (n, n), the modes' law (M,) and the shared reference (m,) of the sender."""
+    """Mean (n,), factors, the modes' law (M,) and the shared reference (m,) of the sender.
+
+    Shapes: mean, variances (n,), lower (n (n - 1) / 2,).
+    """
 
     mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " n"]
     law: Float[jax.Array, " M"]
     reference: Float[jax.Array, " m"]
     moved: jax.Array
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """The state given the data."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of the state."""
+        return self.gaussian.covariance
 
 
 class StochasticEventFilter(AbstractSizedFilter):
@@ -65,22 +79,20 @@ class StochasticEventFilter(AbstractSizedFilter):
     def init(self) -> StochasticBelief:
         """The prior."""
         start = at(self.plant, 0)
-        mean, covariance = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
-        return StochasticBelief(
-            mean, covariance, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False)
-        )
+        x = given(start.initial_mean, start.initial_covariance)
+        return StochasticBelief(*x, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False))
 
     @predicts
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
         """x and the modes move; both ends compute the next reference."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = predicted(plant, self.transform, Belief(state.mean, state.covariance), u)
+        moved = predicted(plant, self.transform, state.gaussian, u, start_of(at(self.plant, 0)))
         rows = jnp.asarray(at(self.channel, k).transition)
         law = jnp.where(state.moved, state.law @ rows, state.law)
         reference = state.reference
         if self.trigger.reference == "prediction":
             reference = self.reference(state.mean, u, k)
-        return StochasticBelief(moved.mean, moved.covariance, law, reference, jnp.asarray(True))
+        return StochasticBelief(*moved, law, reference, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
@@ -92,15 +104,15 @@ class StochasticEventFilter(AbstractSizedFilter):
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, down = z[:count], z[count:]
-        prior = Belief(state.mean, state.covariance)
-        signal = signal_of(plant, sensor, self.transform, prior)
+        prior = state.gaussian
+        signal = signal_of(plant, sensor, self.transform, prior, start_of(at(self.plant, 0)))
 
         # A value: each mode's update, joined.
         modes = len(state.law)
-        size = initial_size(at(self.plant, 0))
-        belief, sent = jax.tree.map(lambda leaf: jnp.stack([leaf] * modes), (prior, signal))
-        posteriors, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
-        came = join(Parts(safe_log(weight), posteriors.mean, posteriors.covariance, jnp.eye(len(weight))[:, None]))
+        sent = repeated(signal, modes)
+        posteriors, weight, innovation = receive(sent, channel, jnp.arange(modes), state.law, values)
+        spreads = jnp.asarray(posteriors.covariance)
+        came = join(Parts(safe_log(weight), posteriors.mean, spreads, jnp.eye(len(weight))[:, None]))
 
         log_silent, quiet = self._silence(prior, signal, state.reference, k)
         nothing = self._nothing(prior, _alone(log_silent, quiet, state.law), state.law, channel, down)
@@ -125,11 +137,12 @@ class StochasticEventFilter(AbstractSizedFilter):
         if len(down):
             known, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, known)
-        following = state._replace(mean=after.mean[0], covariance=after.covariance[0], law=after.label[0, 0])
+        x = given(after.mean[0], after.covariance[0])
+        following = StochasticBelief(*x, after.label[0, 0], state.reference, state.moved)
         return following, Innovation(value, covariance, total)
 
     def _nothing(
-        self, prior: Belief, silent: Parts, law: jax.Array, channel: SideInformation, down: jax.Array
+        self, prior: Gaussian, silent: Parts, law: jax.Array, channel: SideInformation, down: jax.Array
     ) -> Parts:
         """Belief where nothing came: the sender was silent, or the link was down, and the prior stays."""
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
@@ -192,18 +205,16 @@ class StochasticEventFilter(AbstractSizedFilter):
         log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
         return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
 
-    def _silence(self, prior: Belief, signal: Signal, reference: jax.Array, k: Step) -> tuple[jax.Array, Belief]:
+    def _silence(self, prior: Gaussian, signal: Signal, reference: jax.Array, k: Step) -> tuple[jax.Array, Gaussian]:
         """log P(silent) where the link is up, and the state given it."""
         if isinstance(self.trigger, Periodic):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
             return jnp.where(due, -jnp.inf, 0.0), prior
-        total = signal.covariance + self._inverse_weight()
         value = reference - signal.mean
-        solved = psd_solve(total, signal.cross.T)
-        covariance = symmetrize(prior.covariance - signal.cross @ solved)
-        density = log_density(value, total, jnp.abs(reference) + jnp.abs(signal.mean))
-        log_silent = density + self._log_height()
-        return log_silent, Belief(prior.mean + value @ solved, covariance)
+        noise = joined(signal.noise, eliminated(self._inverse_weight()))
+        after, innovations = observe(prior, signal.slopes, value, noise)
+        size = jnp.abs(reference) + jnp.abs(signal.mean)
+        return innovations.log_density(jnp.ones(len(value), bool), size) + self._log_height(), after
 
     @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
@@ -215,6 +226,6 @@ class StochasticEventFilter(AbstractSizedFilter):
         return moments_around(self, step)
 
 
-def _alone(log_weight: jax.Array, belief: Belief, law: jax.Array) -> Parts:
+def _alone(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> Parts:
     mean, covariance, law = (jnp.asarray(moment)[None] for moment in (belief.mean, belief.covariance, law))
     return Parts(log_weight[None], mean, covariance, law[None])

@@ -1,11 +1,12 @@
 """A filter that learns the variances of its sensor's noise on line, by variational Bayes with forgetting."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.gaussian import Gaussian, given
 from heliograph.filters.base import (
     AbstractFilter,
     AbstractSizedFilter,
@@ -15,7 +16,7 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.robust import RobustFilter, expected_of, signal_without_noise
 from heliograph.filters.gaussian.scores import (
@@ -45,12 +46,26 @@ PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: as much as six n
 
 
 class AdaptiveBelief(NamedTuple):
-    """Mean (n,), covariance (n, n) of the state, and of each noise variance the inverse gamma law: R = b / a (m,)."""
+    """Mean and factors of the state, and of each noise variance the inverse gamma law: R = b / a (m,).
+
+    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), shape a, scale b (m,).
+    """
 
     mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " n"]
     shape: Float[jax.Array, " m"]
     scale: Float[jax.Array, " m"]
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """The state given the data."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of the state."""
+        return self.gaussian.covariance
 
 
 class AdaptiveFilter(AbstractSizedFilter):
@@ -85,20 +100,21 @@ class AdaptiveFilter(AbstractSizedFilter):
     def init(self) -> AdaptiveBelief:
         """The filter's prior, and the variances' with as much weight as forgetting leaves them."""
         shape = jnp.full(self.received, PRIOR_SHAPE)
-        return AdaptiveBelief(*self.base.init(), shape, shape * diagonal_of(jnp.asarray(at(self.noise, 0).covariance)))
+        variance = diagonal_of(jnp.asarray(at(self.noise, 0).covariance))
+        return AdaptiveBelief(*self.base.init(), shape, shape * variance)
 
     @predicts
     def predict(self, state: AdaptiveBelief, u: ArrayLike = (), k: Step = 0) -> AdaptiveBelief:
         """The state as the filter does; what is known of the variances stays until something arrives."""
-        return AdaptiveBelief(*self.base.predict(Belief(state.mean, state.covariance), u, k), state.shape, state.scale)
+        return AdaptiveBelief(*self.base.predict(state.gaussian, u, k), state.shape, state.scale)
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
         """Use what arrived of z for the state and for the variances."""
         # Moments of what arrives without its noise, and the noise's law.
-        base, belief, noise = self.base, Belief(state.mean, state.covariance), at(self.noise, k)
+        base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
-        signal = signal_without_noise(plant.angles, sensor, base.transform, belief)
+        signal = signal_without_noise(plant, sensor, base.transform, belief, start_of(base))
         before = expected_of(belief, signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
         z = nearest(jnp.asarray(z), before.signal, angles)
@@ -106,7 +122,7 @@ class AdaptiveFilter(AbstractSizedFilter):
         law = noise.law(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _learn(
             before,
-            state,
+            (state.shape, state.scale),
             z,
             noise.center,
             diagonal_of(jnp.asarray(noise.covariance)),
@@ -119,12 +135,13 @@ class AdaptiveFilter(AbstractSizedFilter):
         both = present[:, None] & present[None]
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(before.signal))
         innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
-        return learned.after, innovation
+        after = given(learned.mean, learned.spread)
+        return AdaptiveBelief(*after, learned.shape, learned.scale), innovation
 
     @estimates
     def estimate(self, state: AdaptiveBelief) -> Estimate:
         """The filter's own."""
-        posterior = self.base.estimate(Belief(state.mean, state.covariance))
+        posterior = self.base.estimate(state.gaussian)
         return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
@@ -134,12 +151,16 @@ class AdaptiveFilter(AbstractSizedFilter):
 
 
 class Learned(NamedTuple):
-    """State after the update, innovation covariance (m, m) with the variances before it, weight of each component.
+    """Mean, covariance and law of the variances after the update, and the innovation's covariance (m, m) with those
+    before it; weight of each component.
 
     By those that were learned from a value itself no value would be far from what was expected.
     """
 
-    after: AdaptiveBelief
+    mean: jax.Array
+    spread: jax.Array
+    shape: jax.Array
+    scale: jax.Array
     covariance: jax.Array
     weight: jax.Array
 
@@ -147,7 +168,7 @@ class Learned(NamedTuple):
 @runs_last
 def _learn(
     before: Expected,
-    state: AdaptiveBelief,
+    state: tuple[jax.Array, jax.Array],
     z: jax.Array,
     center: jax.Array,
     variance: jax.Array,
@@ -159,7 +180,7 @@ def _learn(
     center, variance = (x.reshape(x.shape + (1,) * (z.ndim - x.ndim)) for x in (center, variance))
     # Forget towards the prior, and count the new value.
     first = PRIOR_SHAPE * (1 - memory)
-    shape, scale = memory * state.shape + first, memory * state.scale + first * variance
+    shape, scale = memory * state[0] + first, memory * state[1] + first * variance
     after_shape = shape + 0.5
     e = jnp.where(arrived, z - before.signal - center, 0.0)
     noise, weight, shown, received = scale / shape, jnp.ones_like(e), jnp.ones_like(e), arrived
@@ -182,9 +203,8 @@ def _learn(
         x, p = corrected.mean, corrected.covariance
     else:
         x, p = joint_update(before, e, received, used)
-    a, b = jnp.where(received, after_shape, state.shape), jnp.where(received, noise * after_shape, state.scale)
-    after = AdaptiveBelief(x, p, a, b)
-    return Learned(after, before.spread + diagonal(scale / shape), jnp.where(arrived, shown, jnp.nan))
+    a, b = jnp.where(received, after_shape, state[0]), jnp.where(received, noise * after_shape, state[1])
+    return Learned(x, p, a, b, before.spread + diagonal(scale / shape), jnp.where(arrived, shown, jnp.nan))
 
 
 def _scaled(law: Law, ratio: jax.Array) -> Law:

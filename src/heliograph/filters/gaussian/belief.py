@@ -1,11 +1,14 @@
 """Filters whose state is a mean and a covariance: their prior, prediction and estimate, and the one without data."""
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 
+from heliograph.factors.columns import Columns, columns_of, joined, rounding_of, triangular
+from heliograph.factors.gaussian import Gaussian, Image, given, move
+from heliograph.factors.gaussian import transform as transformed
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -15,7 +18,7 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Transformed, linear_transform
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import MomentsSmootherStep, moments_smoother_step
@@ -27,17 +30,11 @@ from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-
-
-class Belief(NamedTuple):
-    """Mean (n,) and covariance (n, n) of the state given the data so far."""
-
-    mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
+from heliograph.random_affine.noise import AbstractNoise
 
 
 class AbstractBeliefFilter(AbstractSizedFilter):
-    """A filter whose state is a `Belief`, predicted by a transform, or exactly where the plant is linear.
+    """A filter whose state is a Gaussian, predicted by a transform, or exactly where the plant is linear.
 
     Shapes: initial_mean (n,), initial_covariance (n, n).
     """
@@ -52,17 +49,17 @@ class AbstractBeliefFilter(AbstractSizedFilter):
         return FilterAngles(first(self.plant).angles, ())
 
     @in_float64
-    def init(self) -> Belief:
+    def init(self) -> Gaussian:
         """Return the belief before any data."""
-        return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
+        return given(self.initial_mean, self.initial_covariance)
 
     @predicts
-    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+    def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """Mean and covariance of f(x, u) + w."""
-        return Belief(*predicted(at(self.plant, k), self.transform, state, jnp.asarray(u))[:2])
+        return predicted(at(self.plant, k), self.transform, state, jnp.asarray(u), start_of(self))
 
     @estimates
-    def estimate(self, state: Belief) -> Estimate:
+    def estimate(self, state: Gaussian) -> Estimate:
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
@@ -71,13 +68,41 @@ class AbstractBeliefFilter(AbstractSizedFilter):
         return moments_around(self, step)
 
 
-def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Transformed:
-    """Mean and covariance of f(x, u) + w, and Cov(x, f(x, u))."""
+class HasStart(Protocol):
+    """A plant, or a filter that starts from another law."""
+
+    initial_mean: Array
+    initial_covariance: Array
+
+
+def start_of(start: HasStart) -> Float[jax.Array, " n"]:
+    """E[x_i^2] before the first step, (n,): how large numbers are, of which the rounding stays unknown."""
+    mean = jnp.asarray(start.initial_mean)
+    return jnp.asarray(mean * mean + jnp.diagonal(jnp.asarray(start.initial_covariance)))
+
+
+def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> Columns:
+    """Factors of Cov w, and of the rounding of a state that had the second moments `start`, (n,)."""
+    own = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
+    return triangular(joined(own, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
+
+
+def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
+    """f(x, u), exactly where it is linear."""
     if isinstance(plant, LinearPlant):
-        moved = linear_transform(plant.transition_matrix(u), plant.transition(state.mean, u), state.covariance)
-    else:
-        moved = transform.apply(plant.moves(u, state.mean), *state)
-    return Transformed(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u), moved.cross)
+        return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
+    return transform.image(plant.moves(u, x.mean), x)
+
+
+def predicted(
+    plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, start: jax.Array
+) -> Gaussian:
+    """f(x, u) + w."""
+    noise = process_noise(plant, u, start)
+    if isinstance(plant, LinearPlant):
+        return move(x, plant.transition_matrix(u), plant.shift(u), noise)
+    image = transform.image(plant.moves(u, x.mean), x)
+    return transformed(x, image._replace(mean=image.mean + plant.noise_mean()), noise)
 
 
 class PredictsByTransform(Protocol):
@@ -91,12 +116,13 @@ class PredictsByTransform(Protocol):
 def moments_around(
     filter: PredictsByTransform,
     step: StepTrace,
-    whole: Callable[[PyTree], Belief] | None = None,
+    whole: Callable[[PyTree], Gaussian] | None = None,
 ) -> MomentsSmootherStep:
     """Smoother step by the moments around an update; `whole` reads them off a state that has others than its own."""
-    plant, read = at(filter.plant, step.k), whole or (lambda state: Belief(state.mean, state.covariance))
-    before, prior, after = map(read, step[:3])
-    cross = predicted(plant, filter.transform, before, jnp.asarray(step.u)).cross
+    plant = at(filter.plant, step.k)
+    before, prior, after = step[:3] if whole is None else map(whole, step[:3])
+    slopes = image_of(plant, filter.transform, before, jnp.asarray(step.u)).slopes
+    cross = (before.root * before.variances) @ slopes.T
     return moments_smoother_step(after, prior, cross, filter.claim, plant.angles)
 
 
@@ -116,7 +142,7 @@ class OpenLoop(AbstractBeliefFilter):
     """Prediction without measurements: the baseline for any use of them."""
 
     @corrects
-    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Return the state as it is, whatever the length of z."""
         return state, no_innovation()
 

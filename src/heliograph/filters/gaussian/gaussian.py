@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
     FilterAngles,
@@ -11,18 +12,11 @@ from heliograph.filters.base import (
     corrects,
     sized,
 )
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
-from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.precise import (
-    above_rounding,
-    initial_size,
-    noise_rounding,
-    output_rounding,
-    state_rounding,
-)
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
+from heliograph.filters.gaussian.precise import state_rounding
+from heliograph.filters.gaussian.signal import Signal, innovation_covariance, observe_received, signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
-from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step, observed_through
@@ -30,13 +24,11 @@ from heliograph.model.channel import Channel, check_link, mean_gain, perfect, re
 from heliograph.model.estimate import Innovation, given_bounds
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
-from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
+from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premise import Premise, believing
-from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
-from heliograph.numerics.angle import Angles, continued, nearest
+from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
+from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.linalg import times_vector
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
 
@@ -64,13 +56,12 @@ class GaussianFilter(AbstractBeliefFilter):
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @corrects
-    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
-        signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
+        sensor, channel = at(self.sensor, k), at(self.channel, k)
+        signal = signal_of(at(self.plant, k), sensor, self.transform, state, start_of(self))
         unknown = signal.about_mean() if self.linear else signal
-        size = initial_size(self)
-        link, z = at(self.channel, k), jnp.asarray(z)
-        return corrected(state, signal, link, self.rule, z, size, self.observed_angles, unknown)
+        return corrected(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
 
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update itself where it is linear, else the moments around it."""
@@ -80,65 +71,34 @@ class GaussianFilter(AbstractBeliefFilter):
         u = jnp.asarray(step.u)
         output = observed_through(channel.mean_gain, sensor.matrix)
         model = plant.transition_matrix(u), plant.noise_covariance(u), output
-        return linear_smoother_step(step, model, state_rounding(initial_size(self)), self.claim)
+        return linear_smoother_step(step, model, state_rounding(start_of(self)), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
         return plan(self, inputs) if self.linear else self
 
 
-def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
-    """Moments of the sensor's signal y = h(x) + v under the belief of x."""
-    if isinstance(sensor, LinearSensor):
-        measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
-    else:
-        measured = transform.apply(continued(sensor.measure, state.mean, plant.angles, sensor.angles), *state)
-    mean = measured.mean + sensor.noise.mean
-    spread = measured.covariance + sensor.noise.covariance
-    signal = Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
-    return with_known(signal, sensor) if isinstance(sensor, LinearSensor) else signal
-
-
-def with_known(signal: Signal, sensor: LinearSensor) -> Signal:
-    """Signal of a linear sensor with its matrix, its noise, and the rounding of that."""
-    matrix, mean, noise = map(jnp.asarray, (sensor.matrix, sensor.noise.mean, sensor.noise.covariance))
-    return signal._replace(matrix=matrix, noise=noise, rounding=noise_rounding(mean, noise))
-
-
 def corrected(
-    prior: Belief,
     signal: Signal,
     channel: SecondOrder,
-    update: AbstractUpdate,
+    rule: AbstractUpdate,
     z: jax.Array,
-    size: jax.Array,
     angles: Angles = (),
     unknown: Signal | None = None,
-) -> tuple[Belief, Innovation]:
-    """Correct a belief with the components of z that arrived; without any, it stays as it is.
+) -> tuple[Gaussian, Innovation]:
+    """Correct the prior of a signal with the components of z that arrived; without any, it stays as it is.
 
-    `size`: E[x_i^2] at the start, (n,), of which the rounding stays unknown.
-    `unknown`: what of the signal decides gain and covariance, where that is less than all.
+    `unknown`: what of the signal decides gain and covariance, where that is less than all. The innovation has the
+    covariance and the density of the nominal law, whatever the rule bounds.
     """
     unknown = signal if unknown is None else unknown
-    if unknown.matrix is not None and unknown.rounding is not None:
-        unknown = unknown._replace(rounding=unknown.rounding + output_rounding(unknown.matrix, size))
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
-    gain, bound = update.correct(prior.covariance, unknown, channel, ~jnp.isnan(z))
-    bound = above_rounding(bound, prior.covariance, size)
-    after = _use(prior, gain, bound, signal.mean, channel, z)
-    return after, gaussian_innovation(z, expected, innovation_covariance(unknown, channel))
-
-
-@runs_last
-def _use(
-    prior: Belief, gain: jax.Array, bound: jax.Array, expected: jax.Array, channel: SecondOrder, z: jax.Array
-) -> Belief:
-    present = ~jnp.isnan(z)
-    innovation = jnp.where(present, z - times_vector(channel.mean_gain, expected) - channel.offset, 0.0)
-    covariance_after = jnp.where(jnp.any(present, axis=0), bound, prior.covariance)
-    return Belief(prior.mean + times_vector(gain, innovation), covariance_after)
+    value, present = z - expected, ~jnp.isnan(z)
+    after = rule.update(unknown, channel, value)
+    _, nominal = observe_received(unknown, channel, value)
+    covariance = jnp.where(present[:, None] & present, innovation_covariance(unknown, channel), jnp.nan)
+    return after, Innovation(value, covariance, nominal.log_density(present, jnp.abs(z) + jnp.abs(expected)))
 
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:

@@ -5,14 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import decorrelated, nothing
+from heliograph.factors.gaussian import Gaussian, given
 from heliograph.filters.base import (
     FilterAngles,
     Step,
     corrects,
 )
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
-from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.precise import above_rounding, initial_size
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
+from heliograph.filters.gaussian.precise import above_rounding
 from heliograph.filters.gaussian.scores import (
     AbstractWeights,
     Corrected,
@@ -22,20 +23,20 @@ from heliograph.filters.gaussian.scores import (
     squared_residuals,
     weighted_update,
 )
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_transform
-from heliograph.filters.innovation import innovation_covariance, log_density
+from heliograph.filters.gaussian.signal import Signal, innovation_covariance, received_noise, signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
 from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.premise import believes
-from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
-from heliograph.numerics.angle import Angles, continued, nearest
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
-from heliograph.numerics.linalg import congruence, diagonal, diagonal_of, times
-from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.linalg import diagonal, diagonal_of
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -169,7 +170,7 @@ class RobustFilter(AbstractBeliefFilter):
         return FilterAngles(first(self.plant).angles, self.received_angles)
 
     @corrects
-    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Use what arrived of the measurement, component after component or with weights."""
         before, sensed = self.expected(state, k)
         z = nearest(jnp.asarray(z), before.signal, self.received_angles)
@@ -182,45 +183,30 @@ class RobustFilter(AbstractBeliefFilter):
         else:
             after = weighted_update(before, z, noise.center, noise.covariance, self.rule)
             innovation = _innovation(before, z, noise.center, noise.covariance, after)
-        size = initial_size(self)
-        return Belief(after.mean, above_rounding(after.covariance, state.covariance, size)), innovation
+        covariance = above_rounding(after.covariance, state.covariance, start_of(self))
+        return given(after.mean, covariance), innovation
 
-    def expected(self, state: Belief, k: Step) -> tuple[Expected, jax.Array]:
+    def expected(self, state: Gaussian, k: Step) -> tuple[Expected, jax.Array]:
         """Moments of what would arrive without the noise that may hold outliers, and the sensor's mean signal."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        signal = signal_without_noise(at(self.plant, k).angles, sensor, self.transform, state)
+        signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start_of(self))
         return expected_of(state, signal, channel), signal.mean
 
 
-def signal_without_noise(angles: Angles, sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
+def signal_without_noise(
+    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Gaussian, start: jax.Array
+) -> Signal:
     """Moments of h(x) and the mean of its noise, without the noise's spread."""
-    if isinstance(sensor, LinearSensor):
-        measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
-    else:
-        measured = transform.apply(continued(sensor.measure, state.mean, angles, sensor.angles), *state)
-    mean = measured.mean + sensor.noise.mean
-    matrix = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else None
-    second = measured.covariance + jnp.outer(mean, mean)
-    return Signal(mean, measured.covariance, measured.cross, second, matrix)
+    return signal_of(plant, sensor, transform, state, start, nothing(len(sensor.outputs)))
 
 
-def expected_of(state: Belief, signal: Signal, channel: SecondOrder) -> Expected:
+def expected_of(state: Gaussian, signal: Signal, channel: SecondOrder) -> Expected:
     """Through the channel: t with mean M y + b, Cov(x, t) = Cov(x, y) M', and the spread of gain and plain noise."""
     gain = jnp.asarray(channel.mean_gain)
-    spread, cross, matrix, rest = _received(
-        signal.covariance, signal.cross, gain, jnp.asarray(innovation_covariance(signal, channel)), signal.matrix
-    )
-    return Expected(*state, gain @ signal.mean + channel.offset, cross, spread, matrix, rest)
-
-
-@runs_last
-def _received(
-    known: jax.Array, cross: jax.Array, gain: jax.Array, spread: jax.Array, matrix: jax.Array | None
-) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array | None]:
-    through = times(cross, gain.swapaxes(0, 1))
-    if matrix is None:
-        return spread, through, None, None
-    return spread, through, times(gain, matrix), spread - congruence(gain, known)
+    spread, rest = innovation_covariance(signal, channel), received_noise(signal, channel).covariance
+    matrix = gain @ decorrelated(state.root.T[::-1, ::-1], signal.slopes.T[::-1])[::-1].T
+    mean = gain @ signal.mean + channel.offset
+    return Expected(state.mean, state.covariance, mean, signal.cross @ gain.T, spread, matrix, rest)
 
 
 def _innovation(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -17,7 +18,7 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.belief import Belief, moments_around
+from heliograph.filters.gaussian.belief import moments_around
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.agreement import joined
@@ -48,17 +49,17 @@ class SequentialFilter(AbstractSizedFilter):
         return FilterAngles(parts[0].states, tuple(received))
 
     @in_float64
-    def init(self) -> Belief:
+    def init(self) -> Gaussian:
         """Return the first node's prior."""
         return self.filters[0].init()
 
     @predicts
-    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+    def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """Predict with the first node's filter."""
         return self.filters[0].predict(state, u, k)
 
     @corrects
-    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with each node's measurement in turn."""
         z = jnp.asarray(z)
         if all(
@@ -66,7 +67,7 @@ class SequentialFilter(AbstractSizedFilter):
         ):  # one correction compiled, run over the nodes
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
-            def correct(belief: Belief, node: tuple[PyTree, jax.Array]) -> tuple[Belief, Innovation]:
+            def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
                 single: GaussianFilter = eqx.combine(node[0], rest)
                 return single.correct(belief, node[1], k)
 
@@ -80,7 +81,7 @@ class SequentialFilter(AbstractSizedFilter):
         return state, _joined(parts)
 
     @estimates
-    def estimate(self, state: Belief) -> Estimate:
+    def estimate(self, state: Gaussian) -> Estimate:
         """Mean and covariance of the belief, by the first node's filter."""
         posterior = self.filters[0].estimate(state)
         return Estimate(posterior.mean, posterior.covariance, self.claim)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import Columns, decorrelated, eliminated, nothing, reciprocal, square_root
+from heliograph.factors.gaussian import Gaussian, Image, given
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.linalg import above_products, add, cholesky, symmetric, times, transpose
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array
 
 POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number
@@ -31,67 +31,74 @@ class Transformed(NamedTuple):
 
 @readable
 class AbstractTransform(Module):
-    """Rule that propagates a mean and a covariance through a function; every rule is exact for affine functions."""
+    """Rule that propagates a mean and a covariance through a function; every rule is exact for affine functions.
+
+    A rule of your own gives `apply`; those of the library give `image`, from which `apply` follows.
+    """
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Moments of function(x) for x with mean (n,) and covariance (n, n)."""
-        raise unwritten(self, "apply")
+        if type(self).image is AbstractTransform.image:
+            raise unwritten(self, "apply")
+        x = given(mean, covariance)
+        image = self.image(function, x)
+        cross = (x.root * x.variances) @ image.slopes.T
+        return Transformed(image.mean, image.columns_from(x).covariance, cross)
+
+    def image(self, function: Function, x: Gaussian) -> Image:
+        """The same as slopes in xi of x = m + L xi and the rest, uncorrelated with it; by default from `apply`."""
+        return image_of_moments(self.apply(function, x.mean, jnp.asarray(x.covariance)), x)
+
+
+def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
+    """Slopes (D^-1 L^-1 Cov(x, f))' and as curvature what Cov f has more than slopes D slopes'."""
+    slopes = decorrelated(x.root, moments.cross).T * reciprocal(x.variances)
+    rest = moments.covariance - (slopes * x.variances) @ slopes.T
+    return Image(moments.mean, slopes, eliminated(rest))
 
 
 class Cubature(AbstractTransform):
     """Third-degree spherical-radial cubature: 2 n points mean +- sqrt(n) L e_j with equal weights.
 
     The unscented transform with kappa = 0. The mean is exact for polynomials of degree 3 of a Gaussian x, the
-    covariance for degree 1.
+    covariance for degree 1. What is odd in xi at the points +- sqrt(n d_j) e_j is a slope, what is even is curvature:
+    one more noise.
 
     Source: Arasaratnam and Haykin, Cubature Kalman filters (2009), equations (30) to (36).
     """
 
-    def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
+    def image(self, function: Function, x: Gaussian) -> Image:
         """Propagate the points and take their sample moments."""
-        offsets, points = _cubature_points(mean, cholesky(covariance))
-        values = jax.vmap(function, in_axes=1, out_axes=1)(points)
-        return _about(offsets, values, _center(values))
+        n = len(x.mean)
+        steps = square_root(n * x.variances)
+        ahead, behind = at_points(function, x, steps)
+        even = (ahead + behind) / 2
+        mean = jnp.sum(even, axis=1) * (1 / n)
+        slopes = (ahead - behind) / 2 * reciprocal(steps)
+        return Image(mean, slopes, Columns(even - mean[:, None], jnp.full(n, 1 / n)))
 
 
-@runs_last
-def _cubature_points(mean: jax.Array, factor: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Offsets sqrt(n) L (n, n), and the points mean + offsets, mean - offsets as columns (n, 2 n)."""
-    offsets = mean.shape[0] ** 0.5 * factor
-    return offsets, jnp.concatenate([mean[:, None] + offsets, mean[:, None] - offsets], axis=1)
-
-
-@runs_last
-def _center(values: jax.Array) -> jax.Array:
-    return add([values[:, j] for j in range(values.shape[1])]) * (1 / values.shape[1])
-
-
-@runs_last
-def _about(offsets: jax.Array, values: jax.Array, center: jax.Array) -> Transformed:
-    n = offsets.shape[0]
-    weight, spread = 1 / (2 * n), values - center[:, None]
-    cross = times(weight * offsets, transpose(values[:, :n] - values[:, n:]))
-    return Transformed(center, weight * times(spread, transpose(spread)), cross)
+def at_points(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each."""
+    offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
+    points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)
+    values = jax.vmap(function, in_axes=1, out_axes=1)(points)
+    ahead, behind = jnp.split(values, 2, axis=1)
+    return ahead, behind
 
 
 class Linearization(AbstractTransform):
     """First-order expansion at the mean: f(m), J P J', P J' with the Jacobian by automatic differentiation."""
 
-    def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
+    def image(self, function: Function, x: Gaussian) -> Image:
         """Evaluate f and its Jacobian at the mean."""
-        return Transformed(function(mean), *_linear_moments(covariance, jax.jacfwd(function)(mean)))
+        mean = function(x.mean)
+        return Image(mean, jax.jacfwd(function)(x.mean) @ x.root, nothing(len(mean)))
 
 
-@runs_last
-def _linear_moments(covariance: jax.Array, jacobian: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """J P J' and P J'."""
-    cross = times(covariance, transpose(jacobian))
-    return above_products(symmetric(times(jacobian, cross)), jacobian, covariance), cross
-
-
-def linear_transform(matrix: Array, center: jax.Array, covariance: jax.Array) -> Transformed:
-    """Moments of a linear function with this matrix and this value at the mean, which every transform reproduces."""
-    return Transformed(center, *_linear_moments(covariance, jnp.asarray(matrix)))
+def linear_image(matrix: Array, mean: jax.Array, x: Gaussian) -> Image:
+    """Image of a linear function with this matrix and this value at the mean, which every transform reproduces."""
+    return Image(mean, jnp.asarray(matrix @ x.root), nothing(len(mean)))
 
 
 class PolynomialMoments(AbstractTransform):
@@ -115,46 +122,36 @@ class PolynomialMoments(AbstractTransform):
     def __init__(self, degree: int):
         self.degree = check_count("degree of the polynomial", degree)
 
-    def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
+    def image(self, function: Function, x: Gaussian) -> Image:
         """Compute the coefficients, or evaluate at the quadrature points and sum with their weights."""
+        deviations = square_root(x.variances)
+        factor = x.root @ jnp.diag(deviations)
         if self.degree == 2:
-            factor = cholesky(covariance)
-            return _quadratic_moments(
-                factor, jax.vmap(function, in_axes=1, out_axes=1)(_quadratic_points(mean, factor))
-            )
-        points, weights = map(jnp.asarray, _hermite_grid(mean.shape[0], self.degree + 1))
-        deviations = points @ cholesky(covariance).T
-        values = jax.vmap(function)(mean + deviations)
-        center = weights @ values
-        spread = values - center
-        weighted = weights[:, None] * spread
-        return Transformed(center, spread.T @ weighted, deviations.T @ weighted)
+            return _quadratic_image(function, x.mean, factor, deviations)
+        points, weights = map(jnp.asarray, _hermite_grid(x.mean.shape[0], self.degree + 1))
+        values = jax.vmap(function)(x.mean + points @ factor.T).T
+        center = values @ weights
+        slopes = (values * weights) @ points  # in units of each deviation
+        rest = values - center[:, None] - slopes @ points.T
+        return Image(center, slopes * reciprocal(deviations), eliminated(Columns(rest, weights).covariance))
 
 
-@runs_last
-def _quadratic_points(mean: jax.Array, factor: jax.Array) -> jax.Array:
-    """m, m + L_i, m - L_i and m + L_i + L_j for i < j, as columns."""
-    n, center = mean.shape[0], mean[:, None]
-    rows, columns = np.triu_indices(n, 1)
-    both = factor[:, rows] + factor[:, columns]
-    return jnp.concatenate([center, center + factor, center - factor, center + both], axis=1)
-
-
-@runs_last
-def _quadratic_moments(factor: jax.Array, values: jax.Array) -> Transformed:
+def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:
     """f(m + L xi) = c + sum a_i xi_i + sum b_i xi_i^2 + sum_i<j b_ij xi_i xi_j, xi standard normal.
 
-    Mean c + sum b_i, covariance sum a_i a_i' + 2 sum b_i b_i' + sum b_ij b_ij', cross covariance L a'.
+    Mean c + sum b_i, slopes a_i, and uncorrelated with xi: 2 sum b_i b_i' + sum b_ij b_ij'. From the values at m,
+    m + L_i, m - L_i and m + L_i + L_j for i < j.
     """
-    n = factor.shape[0]
+    n, center = mean.shape[0], mean[:, None]
     rows, columns = np.triu_indices(n, 1)
+    points = [center, center + factor, center - factor, center + factor[:, rows] + factor[:, columns]]
+    values = jax.vmap(function, in_axes=1, out_axes=1)(jnp.concatenate(points, axis=1))
     start, ahead, behind, both = jnp.split(values, [1, n + 1, 2 * n + 1], axis=1)
     slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start
     mixed = both - ahead[:, rows] - ahead[:, columns] + start
-    terms = jnp.concatenate([slopes, 2**0.5 * squares, mixed], axis=1)
-    covariance = add([terms[:, None, i] * terms[None, :, i] for i in range(terms.shape[1])])
-    center = add([start[:, 0], *(squares[:, i] for i in range(n))])
-    return Transformed(center, covariance, times(factor, transpose(slopes)))
+    weights = np.concatenate([np.full(n, 2.0), np.ones(len(rows))])
+    curvature = Columns(jnp.concatenate([squares, mixed], axis=1), weights)
+    return Image(start[:, 0] + jnp.sum(squares, axis=1), slopes * reciprocal(deviations), curvature)
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,17 +1,17 @@
 """Unscented transform and the filter that it makes: sigma points of Merwe and of Julier."""
 
-import jax
 import jax.numpy as jnp
 
+from heliograph.factors.columns import Columns, reciprocal, square_root
+from heliograph.factors.gaussian import Gaussian, Image
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
-from heliograph.filters.gaussian.transform import AbstractTransform, Function, Transformed
+from heliograph.filters.gaussian.transform import AbstractTransform, Function, at_points
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import TINY, fail, scalar
-from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike, Float, Scalar
 
@@ -64,20 +64,24 @@ class Unscented(AbstractTransform):
             least = 0.0 - beta * n / alpha**2
             raise fail("kappa", f"at least {least:g} for {n} states, so that no covariance is indefinite", kappa)
 
-    def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
-        """Propagate the points and take their weighted moments."""
-        n = mean.shape[0]
+    def image(self, function: Function, x: Gaussian) -> Image:
+        """Propagate the points and take their weighted moments.
+
+        With a_j and b_j what is odd and even in xi_j at m +- sqrt(c d_j) L_j, b the mean of all b_j: slopes a_j, and
+        sum_j (b_j - b)(b_j - b)' / c + (alpha^2 kappa / n + beta) d d', d = n b / c, which is a sum of squares.
+        """
+        n = x.mean.shape[0]
         self.check(n)
-        scale = jnp.asarray(self.alpha) ** 2 * (n + jnp.asarray(self.kappa))
-        # Points m + sqrt(c) L e_j and m - sqrt(c) L e_j, as rows, and f at them and at m.
-        offsets = jnp.sqrt(scale) * cholesky(covariance).T
-        values = jax.vmap(function)(jnp.concatenate([mean[None], mean + offsets, mean - offsets]))
-        # Moments about f(m).
-        change = values[1:] - values[0]
-        shift = jnp.sum(change, axis=0) / (2 * scale)
-        bend = (jnp.asarray(self.beta) - jnp.asarray(self.alpha) ** 2) * jnp.outer(shift, shift)
-        cross = offsets.T @ (change[:n] - change[n:]) / (2 * scale)
-        return Transformed(values[0] + shift, change.T @ change / (2 * scale) + bend, cross)
+        alpha, beta, kappa = (jnp.asarray(number) for number in (self.alpha, self.beta, self.kappa))
+        scale = alpha**2 * (n + kappa)
+        steps, here = square_root(scale * x.variances), function(x.mean)
+        ahead, behind = (values - here[:, None] for values in at_points(function, x, steps))
+        even = (ahead + behind) / 2
+        middle = jnp.sum(even, axis=1) * (1 / n)
+        shift = middle * (n / scale)
+        weights = jnp.append(jnp.full(n, 1.0) / scale, alpha**2 * kappa / n + beta)
+        curvature = Columns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), weights)
+        return Image(here + shift, (ahead - behind) / 2 * reciprocal(steps), curvature)
 
 
 def unscented_filter(

@@ -8,16 +8,19 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian.correction import (
+from heliograph.factors.gaussian import Gaussian, given
+from heliograph.filters.gaussian.bounds import (
     Scalars,
-    Signal,
     as_array,
     as_scalars,
-    young_correction,
-    zero_mean_correction,
+    keep_unless,
+    observe_by_young,
+    observe_by_zero_mean,
 )
+from heliograph.filters.gaussian.signal import Signal
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten
@@ -27,6 +30,7 @@ from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,
     SecondOrder,
+    described_by,
     nominal_spread,
     second_order,
     symmetric_product,
@@ -52,8 +56,32 @@ class AbstractUpdate(Module):
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero."""
-        raise unwritten(self, "correct")
+        """Gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero.
+
+        A rule of your own gives this; those of the library give `update`, from which it follows.
+
+        Args:
+            prior: covariance (n, n) of the state before the update, `signal.prior`.
+            signal: moments of the sensor's signal y: `mean`, `covariance`, `cross` = Cov(x, y), `second` = E[y y'].
+            channel: what `describe` returned.
+            present: which components of z arrived (m,).
+        """
+        if type(self).update is AbstractUpdate.update:
+            raise unwritten(self, "correct")
+
+        def moved(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
+            after = self.update(signal, channel, jnp.where(present, innovation, jnp.nan))
+            return jnp.asarray(after.mean), after
+
+        gain, after = jax.jacfwd(moved, has_aux=True)(jnp.zeros(len(present)))
+        return gain, jnp.asarray(after.covariance)
+
+    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+        """Condition `signal.prior` on z - E z (m,), NaN where a component did not arrive; by default from `correct`."""
+        prior, present = signal.prior, ~jnp.isnan(innovation)
+        gain, bound = self.correct(prior.covariance, signal, channel, present)
+        after = given(prior.mean + gain @ jnp.where(present, innovation, 0.0), bound)
+        return keep_unless(jnp.any(present), after, prior)
 
     def claim(self, uncertain: bool) -> Claim:
         """Claim of the bound behind a channel of this kind, of a filter for which all else is exact.
@@ -86,11 +114,9 @@ class Polytope(AbstractUpdate):
     def __init__(self, scalars: Scalars | None = None):
         self.scalars = as_array(scalars)
 
-    def correct(
-        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return young_correction(prior, signal, channel, present, self.scalars)
+        return observe_by_young(signal, channel, innovation, self.scalars)
 
     def claim(self, uncertain: bool) -> Claim:
         """ "upper" where the law is uncertain."""
@@ -122,11 +148,9 @@ class ZeroMean(AbstractUpdate):
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
 
-    def correct(
-        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Minimise the trace over K, and over beta unless it is fixed."""
-        return zero_mean_correction(prior, signal, channel, present, self.scalar)
+        return observe_by_zero_mean(signal, channel, innovation, self.scalar)
 
     def claim(self, uncertain: bool) -> Claim:
         """ "nominal" where the law is uncertain: behind a law that is off, E[e | data] is not 0 after a correction."""
@@ -162,11 +186,9 @@ class Interval(AbstractUpdate):
         """Young's bound, as for a polytope."""
         return Polytope(as_scalars(self.scalars))
 
-    def correct(
-        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return young_correction(prior, signal, channel, present, self.scalars)
+        return observe_by_young(signal, channel, innovation, self.scalars)
 
     def claim(self, uncertain: bool) -> Claim:
         """ "upper" where the law is uncertain."""
@@ -224,4 +246,5 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
 
     zero = np.zeros_like(noise)
     parts = scaled(spread + shift**2, noise), scaled(shift**2, zero), scaled(power, zero)
-    return SecondOrder(gain, np.zeros(len(noise)), *parts, nominal_spread(channel), shift > 0)
+    mean = np.concatenate([gain, np.zeros((len(noise), 1))], axis=1)
+    return described_by(mean, *parts, nominal_spread(channel), shift > 0)

@@ -2,19 +2,19 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
-from heliograph.filters.gaussian.belief import Belief
-from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
-from heliograph.filters.gaussian.gaussian import corrected, describe, with_known
-from heliograph.filters.gaussian.precise import initial_size, state_rounding
+from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.bounds import bounded_covariance
+from heliograph.filters.gaussian.gaussian import corrected, describe
+from heliograph.filters.gaussian.precise import state_rounding
+from heliograph.filters.gaussian.signal import Signal, size_of
 from heliograph.filters.gaussian.update import Polytope
+from heliograph.filters.linear.belief import LinearBelief, move_of, predicted, prior_belief
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
@@ -26,31 +26,16 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.plant import AnyPlant
 from heliograph.model.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import above_products, congruence, times, times_vector, transpose
-from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outliers import is_bounded
-
-Move = tuple[jax.Array, jax.Array, jax.Array]  # A (n, n), b (n,) and Cov w (n, n) of a step x+ = A x + b + w
-
-
-class LinearBelief(NamedTuple):
-    """Posterior mean and error covariance, and the state's mean and covariance before any data.
-
-    Shapes: mean, state_mean (n,); covariance, state_covariance (n, n).
-    """
-
-    mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
-    state_mean: Float[jax.Array, " n"]
-    state_covariance: Float[jax.Array, "n n"]
 
 
 class LinearFilter(AbstractSizedFilter):
@@ -87,14 +72,13 @@ class LinearFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
-        plant, u = at(self.plant, k), jnp.asarray(u)
-        return predicted(state, (plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)))
+        return predicted(state, move_of(at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0))))
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Correct with the components of z that arrived."""
-        plant, sensor, channel = at(self.plant, 0), at(self.sensor, k), at(self.channel, k)
-        return corrected_linear(state, sensor, channel, self.rule, jnp.asarray(z), initial_size(plant))
+        sensor, channel, start = at(self.sensor, k), at(self.channel, k), start_of(at(self.plant, 0))
+        return corrected_linear(state, sensor, channel, self.rule, jnp.asarray(z), start)
 
     @estimates
     def estimate(self, state: LinearBelief) -> Estimate:
@@ -107,13 +91,13 @@ class LinearFilter(AbstractSizedFilter):
         transition = plant.transition_matrix(u)
         if not self.mean_known:
             return moments_smoother_step(step.after, step.prior, step.before.covariance @ transition.T, "nominal")
+        rounded = state_rounding(start_of(at(self.plant, 0)))
         if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
-            y = signal(step.prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-            total = known_gain_covariance(y, channel, ~jnp.isnan(jnp.asarray(step.z)))
+            y = signal_before_data(step.prior, sensor, rounded)
+            total = bounded_covariance(y, channel, ~jnp.isnan(jnp.asarray(step.z)))
             step = step._replace(innovation=replace(step.innovation, covariance=total))
         # F = A, process noise Q, H = M C.
         output = observed_through(channel.mean_gain, sensor.matrix)
-        rounded = state_rounding(initial_size(at(self.plant, 0)))
         return linear_smoother_step(step, (transition, plant.noise_covariance(u), output), rounded, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -121,64 +105,27 @@ class LinearFilter(AbstractSizedFilter):
         return plan(self, inputs)
 
 
-def prior_belief(start: AbstractPlant) -> LinearBelief:
-    """Return the prior, both as estimate and as the state's moments before data."""
-    mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
-    return LinearBelief(mean, spread, mean, spread)
-
-
-def predicted(belief: LinearBelief, move: Move) -> LinearBelief:
-    """Both pairs of moments after x+ = A x + b + w, with the move (A, b, Cov w)."""
-    error, state = moved(*belief[:2], *move), moved(*belief[2:], *move)
-    return LinearBelief(*error, *_within_range(*state))
-
-
-@runs_last
-def moved(
-    mean: jax.Array, spread: jax.Array, matrix: jax.Array, shift: jax.Array, noise: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """A m + b and A P A' + Q."""
-    return times_vector(matrix, mean) + shift, above_products(congruence(matrix, spread), matrix, spread) + noise
-
-
-def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Moments that stay finite numbers: those before any data of an unstable plant, which only its inputs hold, do not.
-
-    Behind a known gain nothing depends on them.
-    """
-    largest = float(np.finfo(covariance.dtype).max) ** 0.5
-    return _clipped(mean, largest**0.5), _clipped(covariance, largest)
-
-
-def _clipped(a: jax.Array, largest: float) -> jax.Array:
-    return jnp.maximum(jnp.minimum(a, largest), -largest)
-
-
-@runs_last
-def signal(
-    known: tuple[jax.Array, jax.Array, jax.Array], c: jax.Array, noise_mean: jax.Array, noise: jax.Array
-) -> Signal:
-    """Moments of y = C x + v: mean before any data, covariance C P C' + R, and E[y y'].
+def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Array) -> Signal:
+    """y = C x + v with its mean before any data and E[y y'], and slopes of the estimate.
 
     They depend only on the error covariance and on the state's moments before data, not on the estimate: derivatives
     with respect to the estimate do not involve them.
     """
-    covariance, state_mean, state_covariance = known
-    cross = times(covariance, transpose(c))
-    mean = times_vector(c, state_mean) + noise_mean
-    second = above_products(congruence(c, state_covariance), c, state_covariance) + noise + mean[:, None] * mean[None]
-    return Signal(mean, above_products(times(c, cross), c, covariance) + noise, cross, second)
+    matrix, law = jnp.asarray(sensor.matrix), sensor.noise
+    mean = matrix @ state.state_mean + law.mean
+    second = matrix @ state.state_covariance @ matrix.T + law.covariance + jnp.outer(mean, mean)
+    slopes = matrix @ state.estimate.root
+    return Signal(state.estimate, mean, slopes, law.columns, symmetric(second), size_of(sensor, start))
 
 
 def corrected_linear(
-    state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, size: jax.Array
+    state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, start: jax.Array
 ) -> tuple[LinearBelief, Innovation]:
     """Correct with the components of z that arrived: the signal's mean by the estimate, all else before any data."""
-    matrix, mean, noise = map(jnp.asarray, (sensor.matrix, sensor.noise.mean, sensor.noise.covariance))
-    before = with_known(signal(state[1:], matrix, mean, noise), sensor)
-    now = before._replace(mean=matrix @ state.mean + mean)
-    after, innovation = corrected(Belief(*state[:2]), now, channel, rule, z, size, unknown=before)
-    return state._replace(mean=after.mean, covariance=after.covariance), innovation
+    before = signal_before_data(state, sensor, start)
+    now = before._replace(mean=jnp.asarray(sensor.matrix @ state.mean + sensor.noise.mean))
+    after, innovation = corrected(now, channel, rule, z, unknown=before)
+    return LinearBelief(*after, state.state_mean, state.state_covariance), innovation
 
 
 @believes

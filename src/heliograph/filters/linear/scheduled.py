@@ -1,6 +1,6 @@
 """Filters with gains computed before any data, and the same recursion on-line for data with gaps."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
+from heliograph.factors.columns import Columns, joined, root_of, rounding_of, triangular
+from heliograph.factors.gaussian import Gaussian, given, move, observe
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.gaussian.belief import Belief
-from heliograph.filters.gaussian.correction import covariance_after
-from heliograph.filters.gaussian.precise import above_rounding, state_rounding
+from heliograph.filters.gaussian.precise import state_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -143,49 +143,44 @@ class LinearSystemFilter(AbstractSizedFilter):
     """
 
     steps: OverTime
+    noises: OverTime
     mean: np.ndarray
     covariance: np.ndarray
     projection: np.ndarray
 
     def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
         instance("system", system, LinearSystem, "a LinearSystem")
-        self.steps = OverTime(system.steps)
+        self.steps, self.noises = OverTime(system.steps), OverTime(_factored(system))
         self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
         self.claim, self.inputs = claim, ()
         self.states = names("state names", states, len(system.projection), "x")
         self.received, self.kept = system.steps.offset.shape[-1], system.kept
 
     @in_float64
-    def init(self) -> Belief:
+    def init(self) -> Gaussian:
         """Return the system's initial belief."""
-        return Belief(jnp.asarray(self.mean), jnp.asarray(self.covariance))
+        return given(self.mean, self.covariance)
 
     @predicts
-    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+    def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """A y + a and A P A' + Cov(w)."""
         s: Steps = at(self.steps, k)
-        return Belief(s.transition @ state.mean + s.drift, s.transition @ state.covariance @ s.transition.T + s.process)
+        return move(state, s.transition, s.drift, at(self.noises, k).process)
 
     @corrects
-    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with the components of z that arrived."""
         s: Steps = at(self.steps, k)
-        z, (mean, spread) = jnp.asarray(z), state
+        z, noise = jnp.asarray(z), at(self.noises, k).measurement
+        expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
+        after, innovations = observe(state, slopes, z - expected, noise)
+        total = joined(Columns(slopes, state.variances), noise).covariance
         present = ~jnp.isnan(z)
-        # Innovation covariance S = C P C' + R, zero rows for absent components.
-        expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
-        cross = jnp.where(present[:, None], s.output @ spread, 0.0)
-        observed, both = jnp.where(present[:, None], s.output, 0.0), present[:, None] & present
-        used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
-        # K' = S^+ C P, since S may be singular; the covariance in Joseph form.
-        solved = pseudo_solve(used, cross)
-        left = covariance_after(spread, cross, used, solved, observed, noise)
-        left = above_rounding(left, spread, self._size())
-        after = Belief(mean + solved.T @ jnp.where(present, z - expected, 0.0), left)
-        return after, gaussian_innovation(z, expected, total)
+        density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
+        return after, Innovation(z - expected, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
     @estimates
-    def estimate(self, state: Belief) -> Estimate:
+    def estimate(self, state: Gaussian) -> Estimate:
         """Mean and covariance of the plant's states, by the projection."""
         projection = jnp.asarray(self.projection)
         return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
@@ -207,3 +202,32 @@ class LinearSystemFilter(AbstractSizedFilter):
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
         return plan(self, inputs, self.projection)
+
+
+class SystemNoises(NamedTuple):
+    """Factors of both noises of a step, with the rounding of the state and of the measurement."""
+
+    process: Columns
+    measurement: Columns
+
+
+@in_float64
+def _factored(system: LinearSystem) -> SystemNoises:
+    """Factors of both noises at each step; rounding is of numbers as large as at the start."""
+    s, start = system.steps, system.mean**2 + np.diagonal(system.covariance)
+    sizes = (np.abs(s.output) @ np.sqrt(start) + np.abs(s.offset)) ** 2
+
+    def columns(covariances: np.ndarray, seconds: np.ndarray) -> Columns:
+        n = covariances.shape[-1]
+        roots = [root_of(covariance) for covariance in covariances]
+        padded = np.stack([np.pad(root, ((0, 0), (0, n - root.shape[1]))) for root in roots])
+        rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
+
+        def of_step(root: jax.Array, seconds: jax.Array) -> Columns:
+            return triangular(joined(Columns(root, np.ones(n)), rounding_of(seconds)))
+
+        with_rounding: Callable[..., Columns] = jax.vmap(of_step)
+        factors = with_rounding(padded, rounding)
+        return Columns(np.asarray(factors.matrix), np.asarray(factors.weights))
+
+    return SystemNoises(columns(np.asarray(s.process), start), columns(np.asarray(s.noise), sizes))

@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.codegen.engine import compiled
+from heliograph.factors.columns import Columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
-from heliograph.filters.gaussian.precise import initial_size
+from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.linear import LinearBelief, Move, corrected_linear, predicted, prior_belief
+from heliograph.filters.linear.belief import LinearBelief, Move, move_of, predicted, prior_belief
+from heliograph.filters.linear.linear import corrected_linear
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.side_information import append_flag
 from heliograph.model.channel import Channel, check_link
@@ -27,13 +29,13 @@ from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, given, memories
 from heliograph.random_affine.combine import Mixture
 from heliograph.random_affine.modes import degree_in
-from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, nominal_spread
+from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, described_by, nominal_spread
 
 
 class ModeObservedBelief(NamedTuple):
     """Posterior, the prior of the last correction, the measurement used then, and the plant's motion since.
 
-    Shapes: z (m,), move ((n, n), (n,), (n, n)).
+    Shapes: z (m,).
     """
 
     belief: LinearBelief
@@ -68,14 +70,15 @@ class ModeObservedFilter(AbstractSizedFilter):
         """Return the belief before any data."""
         belief = prior_belief(at(self.plant, 0))
         nothing = jnp.full(first(self.channel).outputs, jnp.nan)
-        still = jnp.eye(len(belief.mean)), jnp.zeros(len(belief.mean)), jnp.zeros_like(belief.covariance)
+        n = len(belief.mean)
+        none = jnp.zeros((n, n))
+        still = Move(jnp.eye(n), jnp.zeros(n), none, Columns(none, jnp.zeros(n)))
         return ModeObservedBelief(belief, belief, nothing, still, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
         """Predict both pairs of moments over step k."""
-        plant, u = at(self.plant, k), jnp.asarray(u)
-        move = plant.transition_matrix(u), plant.shift(u), jnp.asarray(plant.noise_covariance(u))
+        move = move_of(at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0)))
         return state._replace(belief=predicted(state.belief, move), move=move)
 
     @corrects
@@ -87,11 +90,11 @@ class ModeObservedFilter(AbstractSizedFilter):
         z, published = observed[:m], observed[m:]
         known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         certain = jnp.nan_to_num(published)
-        size, rule = initial_size(at(self.plant, 0)), Polytope()
+        start, rule = start_of(at(self.plant, 0)), Polytope()
         if self.late:
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
             then = _given(at(self.channel, last), certain)
-            redone, _ = corrected_linear(state.before, at(self.sensor, last), then, rule, state.z, size)
+            redone, _ = corrected_linear(state.before, at(self.sensor, last), then, rule, state.z, start)
             redone = predicted(redone, state.move)
             prior = jax.tree.map(lambda a, b: jnp.where(known & state.begun, a, b), redone, state.belief)
             then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
@@ -100,7 +103,7 @@ class ModeObservedFilter(AbstractSizedFilter):
             prior, described = state.belief, _given(channel, certain)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(known, z, jnp.nan)
-        after, innovation = corrected_linear(prior, sensor, described, rule, z, size)
+        after, innovation = corrected_linear(prior, sensor, described, rule, z, start)
         after = jax.tree.map(lambda a, b: jnp.where(known, a, b), after, prior)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         # The flags belong to the innovation; they add nothing to the likelihood.
@@ -137,7 +140,7 @@ def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
     none = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
-    return SecondOrder(mean[:, :-1], mean[:, -1], spread, none, none, spread, False)
+    return described_by(mean, spread, none, none, spread, False)
 
 
 def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:

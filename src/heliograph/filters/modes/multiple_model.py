@@ -4,7 +4,7 @@ Each uses the Markov chain, updates through each mode's map with a Gaussian upda
 They differ in when Gaussians are merged; all reduce a mixture to two moments, so that no claim is exact.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
+from heliograph.factors.gaussian import Gaussian, given, merge
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -21,10 +22,9 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
-from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.gaussian import corrected, signal_of
-from heliograph.filters.gaussian.precise import initial_size
+from heliograph.filters.gaussian.belief import moments_around, predicted, start_of
+from heliograph.filters.gaussian.gaussian import corrected
+from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
@@ -38,27 +38,24 @@ from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.module import Module, unwritten
-from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder
+from heliograph.random_affine.moments.second_moments import QuadraticMap, described_by
+
+T = TypeVar("T", bound=PyTree)
 
 
 def receive(
-    belief: Belief,
     signal: Signal,
     channel: SideInformation,
     mode: jax.Array,
     weight: jax.Array,
     z: jax.Array,
-    size: jax.Array,
     angles: Angles = (),
-) -> tuple[Belief, jax.Array, Innovation]:
-    """Correct each belief in its mode; return the beliefs, their posterior weights, and the mixture's innovation.
+) -> tuple[Gaussian, jax.Array, Innovation]:
+    """Correct the prior of each signal in its mode; return them, their weights, and the mixture's innovation.
 
-    `size`: E[x_i^2] at the start, (n,).
     weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
     """
     # Channel moments by mode, given which components arrived.
@@ -69,20 +66,17 @@ def receive(
     total = jnp.sum(chance)
     prior = jnp.where(total > 0, chance / jnp.where(total > 0, total, 1.0), weight)
 
-    def single(separate: Belief, sent: Signal, mean: jax.Array, spread: jax.Array) -> tuple[Belief, Innovation]:
+    def single(sent: Signal, mean: jax.Array, spread: jax.Array) -> tuple[Gaussian, Innovation]:
         law = QuadraticMap(spread, jnp.zeros_like(spread))
         none = QuadraticMap(jnp.zeros_like(spread), jnp.zeros_like(spread))
-        link = SecondOrder(mean[:, :-1], mean[:, -1], law, none, none, law, False)
-        return corrected(separate, sent, link, Polytope(), z, size, angles)
+        link = described_by(mean, law, none, none, law, False)
+        return corrected(sent, link, Polytope(), z, angles)
 
-    posteriors, received = jax.vmap(single)(belief, signal, mean, spread)
+    posteriors, received = jax.vmap(single)(signal, mean, spread)
     # Posterior weights; beliefs stay as they are where no mode, or not this one, can produce such a value.
     weights, density, excluded = posterior_weights(prior, jnp.where(chance > 0, received.log_likelihood, -jnp.inf))
     possible = (chance > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
-    after = Belief(
-        jnp.where(possible[:, None], posteriors.mean, belief.mean),
-        jnp.where(possible[:, None, None], posteriors.covariance, belief.covariance),
-    )
+    after = jax.tree.map(lambda a, b: jnp.where(possible[:, None], a, b), posteriors, signal.prior)
     value = nearest(jnp.asarray(received.value), received.value[jnp.argmax(prior)], angles)
     return after, weights, mixed_innovation(prior, value, received.covariance, density)
 
@@ -109,13 +103,25 @@ def _check_random(channel: SideInformation) -> None:
 class ModalBeliefs(NamedTuple):
     """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
 
-    Shapes: mean (M, n), covariance (M, n, n), weight (M, M). `moved` is true from the first prediction on.
+    Shapes: mean, variances (M, n), lower (M, n (n - 1) / 2), weight (M, M). `moved` is true from the first prediction
+    on.
     """
 
     mean: Float[jax.Array, "M n"]
-    covariance: Float[jax.Array, "M n n"]
+    lower: Float[jax.Array, "M entries"]
+    variances: Float[jax.Array, "M n"]
     weight: Float[jax.Array, "M M"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def parts(self) -> Gaussian:
+        """The components."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of each component."""
+        return self.parts.covariance
 
 
 class AbstractMerging(Module):
@@ -137,9 +143,9 @@ class MergeAll(AbstractMerging):
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
         """Replace every component by the whole mixture."""
         law = jnp.sum(state.weight @ rows, axis=0)
-        whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-        every = [jnp.repeat(moment, len(rows), axis=0) for moment in whole]
-        return state._replace(mean=every[0], covariance=every[1], weight=jnp.diag(law))
+        whole, _ = merged(state.parts, jnp.sum(state.weight, axis=1, keepdims=True))
+        every: Gaussian = jax.tree.map(lambda moment: jnp.repeat(moment, len(rows), axis=0), whole)
+        return ModalBeliefs(*every, jnp.diag(law), state.moved)
 
 
 class MergeByNextMode(AbstractMerging):
@@ -147,8 +153,8 @@ class MergeByNextMode(AbstractMerging):
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
         """Component j becomes the mixture of all components that lead to mode j."""
-        (mean, covariance), law = merged(state.mean, state.covariance, state.weight @ rows)
-        return state._replace(mean=mean, covariance=covariance, weight=jnp.diag(law))
+        parts, law = merged(state.parts, state.weight @ rows)
+        return ModalBeliefs(*parts, jnp.diag(law), state.moved)
 
 
 class MergeByMode(AbstractMerging):
@@ -156,27 +162,20 @@ class MergeByMode(AbstractMerging):
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
         """Components keep the mode of their last update."""
-        (mean, covariance), law = merged(state.mean, state.covariance, state.weight)
-        return state._replace(mean=mean, covariance=covariance, weight=law[:, None] * rows)
+        parts, law = merged(state.parts, state.weight)
+        return ModalBeliefs(*parts, law[:, None] * rows, state.moved)
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Pair every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
 
-@runs_last
-def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
-    """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
+def merged(parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
+    """Gaussians with the moments of mixtures with weight (components, mixtures), and each mixture's weight."""
     law = jnp.sum(weight, axis=0)
     some = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
     share = jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
-    # About the first: of means so large that all are equal nothing is left, and no rounding to be squared.
-    from_first = (mean - mean[0])[:, None]
-    shift = jnp.sum(share[:, :, None] * from_first, axis=0)
-    center, apart = mean[0] + shift, from_first - shift
-    inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]
-    spread = jnp.sum(share[:, :, None, None] * inside, axis=0)
-    return Belief(center, jnp.moveaxis(symmetric(jnp.moveaxis(spread, 0, 2)), 2, 0)), law
+    return jax.vmap(lambda weights: merge(parts, weights), in_axes=1)(share), law
 
 
 NODES = 3  # modes that stand for a gain that drifts
@@ -203,10 +202,9 @@ class MultipleModelFilter(AbstractSizedFilter):
     @compiled
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes."""
-        start, modes = at(self.plant, 0), len(self.initial)
-        mean = jnp.tile(jnp.asarray(start.initial_mean), (modes, 1))
-        spread = jnp.tile(jnp.asarray(start.initial_covariance), (modes, 1, 1))
-        return ModalBeliefs(mean, spread, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
+        start = at(self.plant, 0)
+        parts = repeated(given(start.initial_mean, start.initial_covariance), len(self.initial))
+        return ModalBeliefs(*parts, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
@@ -214,24 +212,23 @@ class MultipleModelFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         state = self.merging.moved(state, rows)
-        mean, spread, _ = jax.vmap(lambda *moments: predicted(plant, self.transform, Belief(*moments), u))(*state[:2])
-        mean = together(plant, mean, jnp.sum(state.weight, axis=1))
-        return ModalBeliefs(mean, spread, state.weight, jnp.asarray(True))
+        start = start_of(at(self.plant, 0))
+        parts = jax.vmap(lambda x: predicted(plant, self.transform, x, u, start))(state.parts)
+        parts = parts._replace(mean=together(plant, parts.mean, jnp.sum(state.weight, axis=1)))
+        return ModalBeliefs(*parts, state.weight, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
         """Correct each component in each mode with z, and weight them by their likelihood."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         i, j = self.merging.pairs(len(self.initial))
-        signals = jax.vmap(lambda *moments: signal_of(plant, sensor, self.transform, Belief(*moments)))(*state[:2])
-
-        belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
-        chance = state.weight[i, j]
-        size = initial_size(at(self.plant, 0))
-        after, weight, mixed = receive(belief, signal, channel, jnp.asarray(j), chance, z, size, self.observed_angles)
+        start = start_of(at(self.plant, 0))
+        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
+        signal = jax.tree.map(lambda leaf: leaf[i], signals)
+        after, weight, mixed = receive(signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles)
         posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
-        (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
-        return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed
+        parts, law = merged(after._replace(mean=together(plant, after.mean, weight)), posterior)
+        return ModalBeliefs(*parts, jnp.diag(law), state.moved), mixed
 
     @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
@@ -244,10 +241,15 @@ class MultipleModelFilter(AbstractSizedFilter):
         return moments_around(self, step, _whole)
 
 
-def _whole(state: ModalBeliefs) -> Belief:
+def _whole(state: ModalBeliefs) -> Gaussian:
     """Mean and covariance of the whole mixture."""
-    whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-    return Belief(whole.mean[0], whole.covariance[0])
+    return merge(state.parts, jnp.sum(state.weight, axis=1))
+
+
+def repeated(x: T, count: int) -> T:
+    """The same so many times, along a new first axis."""
+    every: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
+    return every
 
 
 def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:

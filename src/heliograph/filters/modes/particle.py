@@ -1,12 +1,13 @@
 """Rao-Blackwellised particle filter: particles for the modes of links with memory, each with a Gaussian state."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.gaussian import Gaussian, given, merge
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -15,11 +16,10 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import Belief, predicted
-from heliograph.filters.gaussian.gaussian import signal_of
-from heliograph.filters.gaussian.precise import initial_size
+from heliograph.filters.gaussian.belief import predicted, start_of
+from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.multiple_model import by_mode, merged, receive, together
+from heliograph.filters.modes.multiple_model import by_mode, receive, repeated, together
 from heliograph.filters.modes.side_information import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
@@ -38,16 +38,27 @@ NODES = 9  # modes that stand for a gain that drifts: they cost no more than few
 class Particles(NamedTuple):
     """Gaussian, present mode and weight of each particle, and the key of the next random numbers.
 
-    Shapes: mean (N, n), covariance (N, n, n), mode (N,), weight (N,), key (2,). `moved` is true from the first
-    prediction on.
+    Shapes: mean, variances (N, n), lower (N, n (n - 1) / 2), mode (N,), weight (N,), key (2,). `moved` is true from the
+    first prediction on.
     """
 
     mean: Float[jax.Array, "N n"]
-    covariance: Float[jax.Array, "N n n"]
+    lower: Float[jax.Array, "N entries"]
+    variances: Float[jax.Array, "N n"]
     mode: Int[jax.Array, " N"]
     weight: Float[jax.Array, " N"]
     key: Int[jax.Array, " 2"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def parts(self) -> Gaussian:
+        """The Gaussian of each particle."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of each particle."""
+        return self.parts.covariance
 
 
 class ParticleFilter(AbstractSizedFilter):
@@ -74,10 +85,9 @@ class ParticleFilter(AbstractSizedFilter):
     def init(self) -> Particles:
         """Return the prior in every particle, with modes in proportion to their initial law."""
         start, n = at(self.plant, 0), self.particles
-        mean = jnp.tile(jnp.asarray(start.initial_mean), (n, 1))
-        spread = jnp.tile(jnp.asarray(start.initial_covariance), (n, 1, 1))
+        parts = repeated(given(start.initial_mean, start.initial_covariance), n)
         mode = _chosen(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
-        return Particles(mean, spread, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
+        return Particles(*parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
 
     @predicts
     def predict(self, state: Particles, u: ArrayLike = (), k: Step = 0) -> Particles:
@@ -86,22 +96,19 @@ class ParticleFilter(AbstractSizedFilter):
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
         drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
-        mean, spread, _ = jax.vmap(lambda *moments: predicted(plant, self.transform, Belief(*moments), u))(*state[:2])
+        start = start_of(at(self.plant, 0))
+        parts = jax.vmap(lambda x: predicted(plant, self.transform, x, u, start))(state.parts)
         mode = jnp.where(state.moved, drawn, state.mode)
-        mean = together(plant, mean, state.weight)
-        return Particles(mean, spread, mode, state.weight, key, jnp.asarray(True))
+        parts = parts._replace(mean=together(plant, parts.mean, state.weight))
+        return Particles(*parts, mode, state.weight, key, jnp.asarray(True))
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
-        belief = Belief(state.mean, state.covariance)
-        size = initial_size(at(self.plant, 0))
-        signals = jax.vmap(lambda *moments: signal_of(plant, sensor, self.transform, Belief(*moments)))(*belief)
-
-        after, weight, mixed = receive(
-            belief, signals, channel, state.mode, state.weight, z, size, self.observed_angles
-        )
+        start = start_of(at(self.plant, 0))
+        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
+        after, weight, mixed = receive(signals, channel, state.mode, state.weight, z, self.observed_angles)
         after = after._replace(mean=together(plant, after.mean, weight))
         # Systematic resampling.
         key = _folded(state.key, z)
@@ -109,13 +116,14 @@ class ParticleFilter(AbstractSizedFilter):
         poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
         which = jnp.where(poor, chosen, jnp.arange(self.particles))
         weight = jnp.where(poor, 1 / self.particles, weight)
-        return Particles(after.mean[which], after.covariance[which], state.mode[which], weight, key, state.moved), mixed
+        kept: Gaussian = jax.tree.map(lambda leaf: leaf[which], after)
+        return Particles(*kept, state.mode[which], weight, key, state.moved), mixed
 
     @estimates
     def estimate(self, state: Particles) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
-        whole, _ = merged(state.mean, state.covariance, state.weight[:, None])
-        return Estimate(wrapped(whole.mean[0], first(self.plant).angles), whole.covariance[0], self.claim)
+        whole = merge(state.parts, state.weight)
+        return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
 
 
 def _chosen(law: jax.Array, uniform: jax.Array) -> jax.Array:

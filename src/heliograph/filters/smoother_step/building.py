@@ -95,7 +95,7 @@ class HasMoments(Protocol):
         """Mean of the state."""
 
     @property
-    def covariance(self) -> Float[jax.Array, "N N"]:
+    def covariance(self) -> Float[Array, "N N"]:
         """Covariance of the state."""
 
 

@@ -1,12 +1,14 @@
 """Filter of a plant and its nodes' clocks that estimates a clock only while the data make it observable."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from heliograph.factors.columns import Columns, joined
+from heliograph.factors.gaussian import Gaussian, of_columns
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -16,12 +18,12 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.belief import Belief
-from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter, signal_of
+from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
+from heliograph.filters.gaussian.signal import Signal, innovation_covariance, received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
+from heliograph.filters.innovation import gaussian_innovation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first
@@ -32,7 +34,6 @@ from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import eigh
-from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -43,17 +44,28 @@ RANK = 1e-12  # of the largest eigenvalue: directions below are unobservable
 
 
 class ClockBelief(NamedTuple):
-    """Joint mean and covariance of plant and clocks, the last input, and which clocks the last data made observable.
+    """Joint mean and factors of plant and clocks, the last input, and which clocks the last data made observable.
 
-    Shapes: mean (n,), covariance (n, n), inputs (inputs,), silence (received,), observed (clocks,).
+    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), inputs (inputs,), silence (received,), observed (clocks,).
     `silence` counts the steps since each component of z last arrived.
     """
 
     mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " n"]
     inputs: Float[jax.Array, " inputs"]
     silence: Int[jax.Array, " received"]
     observed: Bool[jax.Array, " clocks"]
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """Plant and clocks given the data."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of plant and clocks."""
+        return self.gaussian.covariance
 
 
 class ClockFilter(AbstractSizedFilter):
@@ -85,17 +97,16 @@ class ClockFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> ClockBelief:
         """Return the belief before any data."""
-        mean, covariance = map(jnp.asarray, self.base.init())
+        start = self.base.init()
         silence = jnp.full(self.received, len(self.states))
         none = jnp.zeros(len(self.offsets), dtype=bool)
-        return ClockBelief(mean, covariance, jnp.zeros(len(self.inputs)), silence, none)
+        return ClockBelief(*start, jnp.zeros(len(self.inputs)), silence, none)
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
         """Predict plant and clocks over step k."""
-        moved = self.base.predict(Belief(state.mean, state.covariance), u, k)
-        inputs, silence = jnp.asarray(u, dtype=float), state.silence + 1
-        return state._replace(mean=moved.mean, covariance=moved.covariance, inputs=inputs, silence=silence)
+        moved = self.base.predict(state.gaussian, u, k)
+        return ClockBelief(*moved, jnp.asarray(u, dtype=float), state.silence + 1, state.observed)
 
     @corrects
     def correct(self, state: ClockBelief, z: ArrayLike, k: Step = 0) -> tuple[ClockBelief, Innovation]:
@@ -103,8 +114,8 @@ class ClockFilter(AbstractSizedFilter):
         base = self.base
         # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
-        sensor, prior = at(base.sensor, k), Belief(state.mean, state.covariance)
-        signal = signal_of(at(base.plant, k), sensor, base.transform, prior)
+        sensor, prior = at(base.sensor, k), state.gaussian
+        signal = signal_of(at(base.plant, k), sensor, base.transform, prior, start_of(base))
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
         z = nearest(jnp.asarray(z), expected, base.observed_angles)
         # Innovation covariance S, for all components.
@@ -116,9 +127,8 @@ class ClockFilter(AbstractSizedFilter):
         # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
         gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
         gain = gain * self._estimated(observed)[:, None]
-        mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
-        after = _considered(prior.covariance, gain, signal, channel, total)
-        belief = ClockBelief(mean, after, state.inputs, silence, observed)
+        after = _considered(signal, channel, gain, jnp.where(present, z - expected, 0.0))
+        belief = ClockBelief(*after, state.inputs, silence, observed)
         return belief, gaussian_innovation(z, expected, total)
 
     def _estimated(self, observed: jax.Array) -> jax.Array:
@@ -172,10 +182,11 @@ def _share(square: jax.Array, column: int) -> jax.Array:
     return jnp.where(size[column] > 0, 1 - known, 0.0)
 
 
-def _considered(prior: jax.Array, gain: jax.Array, signal: Signal, channel: SecondOrder, total: jax.Array) -> jax.Array:
-    """P - K C - C' K' + K S K', valid for any gain."""
-    used = gain @ jnp.asarray(channel.mean_gain) @ signal.cross.T
-    return symmetrize(prior - used - used.T + gain @ total @ gain.T)
+def _considered(signal: Signal, channel: SecondOrder, gain: jax.Array, innovation: jax.Array) -> Gaussian:
+    """x after m + K e with any gain: the error is (L - K slopes) xi - K v."""
+    prior, slopes = signal.prior, jnp.asarray(channel.mean_gain) @ signal.slopes
+    left = Columns(prior.root - gain @ slopes, prior.variances)
+    return of_columns(prior.mean + gain @ innovation, joined(left, received_noise(signal, channel).through(gain)))
 
 
 @believes

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import Columns
 from heliograph.filters.base import (
     AbstractFilter,
     AbstractSizedFilter,
@@ -20,7 +21,8 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.correction import homogeneous
+from heliograph.filters.gaussian.signal import link_noise
+from heliograph.filters.linear.belief import LinearBelief, Move, predicted
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import append_flag
 from heliograph.model.bias import driven_by
@@ -33,7 +35,6 @@ from heliograph.model.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series, known
@@ -147,23 +148,19 @@ class HeldFilter(AbstractPartFilter):
         return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, position: int) -> PyTree:
+def _received_by(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
     """Moments after r = G l + n stands at `position`, l the line of `length` from `start` on."""
-    # x+ = move x + shift: the received signal replaces what stands at its place.
+    # x+ = matrix x + shift: the received signal replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.mean), len(offset)
     here, there = slice(start, start + length), slice(position, position + m)
-    move, shift = jnp.eye(total).at[there, :].set(0.0).at[there, here].set(gain), jnp.zeros(total).at[there].set(offset)
+    matrix = jnp.eye(total).at[there, :].set(0.0).at[there, here].set(gain)
+    shift = jnp.zeros(total).at[there].set(offset)
     # Cov(r | l) at the unconditional moments of l.
     mean, covariance = state.state_mean[here], state.state_covariance[here, here]
-    second = homogeneous(covariance + jnp.outer(mean, mean), mean, 1.0)
-    fresh = jnp.zeros((total, total)).at[there, there].set(link.spread.middle(second, jnp.ones(m, dtype=bool)))
-    return state._replace(
-        mean=move @ state.mean + shift,
-        covariance=symmetrize(move @ state.covariance @ move.T + fresh),
-        state_mean=move @ state.state_mean + shift,
-        state_covariance=symmetrize(move @ state.state_covariance @ move.T + fresh),
-    )
+    spread = link_noise(link, covariance + jnp.outer(mean, mean), mean)
+    noise = Columns(jnp.zeros((total, spread.matrix.shape[1])).at[there].set(spread.matrix), spread.weights)
+    return predicted(state, Move(matrix, shift, noise.covariance, noise))
 
 
 def with_relays(

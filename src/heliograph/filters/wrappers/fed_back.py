@@ -1,10 +1,11 @@
 """Filters whose prediction is used: as the estimate, or fed back to the sensor, which subtracts it to save power."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
     AbstractSizedFilter,
@@ -14,9 +15,9 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import Belief
-from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter, signal_of
-from heliograph.filters.gaussian.precise import initial_size
+from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter
+from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.centred import predicted_signal
@@ -35,8 +36,8 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 class Ahead(NamedTuple):
     """Corrected belief, and the prediction before the correction."""
 
-    belief: Belief
-    prior: Belief
+    belief: Gaussian
+    prior: Gaussian
 
 
 class PredictionFilter(AbstractSizedFilter):
@@ -97,11 +98,25 @@ def prediction_of(filter: AbstractFilter) -> PredictionFilter:
 
 
 class FedBackBelief(NamedTuple):
-    """Mean (n,) and covariance (n, n) of the state, and the reference (m,) that the sensor subtracts from y."""
+    """Mean (n,) and factors of the state, and the reference (m,) that the sensor subtracts from y.
+
+    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), reference (m,).
+    """
 
     mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " n"]
     reference: Float[jax.Array, " m"]
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """The state given the data."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of the state."""
+        return self.gaussian.covariance
 
 
 class FedBackFilter(AbstractSizedFilter):
@@ -127,24 +142,22 @@ class FedBackFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> FedBackBelief:
         """Return the belief before any data."""
-        mean, covariance = map(jnp.asarray, self.base.init())
-        return FedBackBelief(mean, covariance, jnp.zeros(len(first(self.base.sensor).outputs)))
+        return FedBackBelief(*self.base.init(), jnp.zeros(len(first(self.base.sensor).outputs)))
 
     @predicts
     def predict(self, state: FedBackBelief, u: ArrayLike = (), k: Step = 0) -> FedBackBelief:
         """Mean and covariance of f(x, u) + w, and the reference that the sensor will subtract."""
-        moved = self.base.predict(Belief(state.mean, state.covariance), u, k)
+        moved = self.base.predict(state.gaussian, u, k)
         return FedBackBelief(*moved, self.reference(state.mean, jnp.asarray(u), k))
 
     @corrects
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
         """Correct with the measurement of y - r."""
-        base, prior = self.base, Belief(state.mean, state.covariance)
-        y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, prior)
+        base = self.base
+        y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, state.gaussian, start_of(base))
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
-        size = initial_size(base)
-        after, innovation = corrected(prior, sent, at(base.channel, k), base.rule, jnp.asarray(z), size)
+        after, innovation = corrected(sent, at(base.channel, k), base.rule, jnp.asarray(z))
         return FedBackBelief(*after, state.reference), innovation
 
     @estimates

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import Columns, columns_of
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import contract, diagonal, diagonal_of, summed
@@ -132,9 +133,11 @@ class SecondOrder(Module):
     mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)'];
     shift: ((M_v - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored).
 
-    nominal: the spread under the nominal law itself.
+    nominal: the spread under the nominal law itself, which is gain_spread : W + Cov n with the columns `noise` of the
+    latter: apart from the gain, so that a combination of outputs that is free of noise stays free of it. Where gain and
+    noise are correlated, gain_spread is all and noise zero.
 
-    Shapes: mean_gain (m, p), offset (m,).
+    Shapes: mean_gain (m, p), offset (m,), gain_spread (m, m, p + 1, p + 1), noise (m, m).
     """
 
     mean_gain: Matrix
@@ -143,7 +146,29 @@ class SecondOrder(Module):
     shift: QuadraticMap
     power: QuadraticMap
     nominal: QuadraticMap
+    gain_spread: Tensor
+    noise: Columns
     uncertain: bool = eqx.field(static=True)
+
+
+def described_by(
+    mean: Matrix, spread: QuadraticMap, shift: QuadraticMap, power: QuadraticMap, nominal: QuadraticMap, uncertain: bool
+) -> SecondOrder:
+    """Second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise."""
+    gain, noise = divided(nominal.center)
+    return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
+
+
+def divided(spread: Tensor) -> tuple[Tensor, Columns]:
+    """Spread of the gain alone, and m columns of Cov n, from the spread of both; of none where they are correlated."""
+    xp, covariance = library(spread), spread[..., -1, -1]
+    apart = xp.all(spread[..., :-1, -1] == 0)
+    corner = np.zeros(spread.shape[-2:])
+    corner[-1, -1] = 1.0
+    noise = columns_of(xp.where(apart, covariance, 0.0))
+    lacking = len(covariance) - noise.matrix.shape[1]
+    padded = Columns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
+    return spread - xp.where(apart, covariance, 0.0)[..., None, None] * corner, padded
 
 
 def _or_one(value: jax.Array) -> jax.Array:
@@ -213,7 +238,7 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     else:
         parts = _from_intervals(channel, nominal, mean)
     center = parts[0] if known else nominal_spread(channel)
-    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], center, not known)
+    return described_by(mean, parts[0], parts[1], parts[2], center, not known)
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.signal import homogeneous
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import Linearised, Plan, is_linear_filter, linear_step
 from heliograph.fusion.all_reports import Knowledge, begin, fused_estimate, moved, receive_reports

@@ -1,20 +1,21 @@
 """Innovation of a fused estimate: what arrives at the nodes, less what the predicted fused estimate expects of it."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.gaussian import Gaussian, given
 from heliograph.filters.gaussian.adaptive import AdaptiveBelief
-from heliograph.filters.gaussian.belief import Belief
-from heliograph.filters.linear.linear import LinearBelief
+from heliograph.filters.linear.belief import LinearBelief
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.gathering import gathering
@@ -22,7 +23,7 @@ from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.side_by_side import Alike
 
 UNROLLED = 16  # nodes of a kind whose corrections are written out: more are a loop
-WHOLE = Belief, LinearBelief, AdaptiveBelief  # states whose mean and covariance are all that is known of x
+WHOLE = Gaussian, LinearBelief, AdaptiveBelief  # states whose mean and covariance are all that is known of x
 
 
 class FusedDistance(NamedTuple):
@@ -47,18 +48,18 @@ class FusedInnovation(Module):
         sources: kind and filter of the estimates that are fused.
     """
 
-    start: Belief
+    start: Gaussian
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     def step(
-        self, before: Belief, alike: Sequence[Alike], states: Sequence[PyTree], z: Sequence[jax.Array], u: jax.Array,
+        self, before: Gaussian, alike: Sequence[Alike], states: Sequence[PyTree], z: Sequence[jax.Array], u: jax.Array,
         k: jax.Array, skip: Sequence[jax.Array | None],
     ) -> FusedDistance:  # fmt: skip
         """Test the prediction from the fused estimate `before`, with the filters' states before step k.
 
         `skip`: reasons not to use a node's measurement, by kind.
         """
-        carry: tuple[jax.Array, ...] | None = None
+        carry: tuple[Gaussian, jax.Array, jax.Array] | None = None
         for kind, f in self.sources:
             # Numbers of each node's filter, its state and what it receives.
             stacked, why = alike[kind], skip[kind]
@@ -71,32 +72,36 @@ class FusedInnovation(Module):
             # Prediction from the fused estimate, by the first node's model of the plant.
             if carry is None:
                 head, state = jax.tree.map(lambda a: a[0], (numbers, beliefs))
-                start = eqx.combine(head, static).predict(_with(state, *before), u, k)
-                carry = start.mean, start.covariance, jnp.zeros(()), jnp.zeros(())
+                start = eqx.combine(head, static).predict(_with(state, before), u, k)
+                carry = _gaussian(start), jnp.zeros(()), jnp.zeros(())
 
             def correct(carry: PyTree, row: PyTree, static: PyTree = static) -> tuple[PyTree, None]:
-                mean, covariance, distance, arrived = carry
+                x, distance, arrived = carry
                 numbers, prior, z_i = row
-                after, innovation = eqx.combine(numbers, static).correct(_with(prior, mean, covariance), z_i, k)
+                after, innovation = eqx.combine(numbers, static).correct(_with(prior, x), z_i, k)
                 more, count = innovation_distance(innovation)
-                return (after.mean, after.covariance, distance + more, arrived + count), None
+                return (_gaussian(after), distance + more, arrived + count), None
 
             # What else a filter's state holds, predicted; then correction by node after node.
             predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
             rows = numbers, predict(filters, beliefs), received
             carry, _ = jax.lax.scan(correct, carry, rows, unroll=min(stacked.nodes, UNROLLED))
         assert carry is not None  # there is at least one node
-        _, _, distance, arrived = carry
+        _, distance, arrived = carry
         return FusedDistance(jnp.where(arrived > 0, distance, jnp.nan), arrived)
 
 
-def _with(state: PyTree, mean: jax.Array, covariance: jax.Array) -> PyTree:
-    return state._replace(mean=mean, covariance=covariance)
+def _with(state: PyTree, x: Gaussian) -> PyTree:
+    return state._replace(**x._asdict())
 
 
-def following_prior(estimate: Estimate) -> Belief:
+def _gaussian(state: PyTree) -> Gaussian:
+    return Gaussian(state.mean, state.lower, state.variances)
+
+
+def following_prior(estimate: Estimate) -> Gaussian:
     """Return the fused estimate as what the next step is predicted from."""
-    return Belief(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
+    return given(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
 
 
 def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, FusedInnovation]:
@@ -110,8 +115,8 @@ def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, Fus
     if network.common is not None or network.relays is not None or network.shared:
         return tests
     places, plant = network.places(), at(network.plant, 0)
-    moments: Any = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)  # on no device: no program
-    start = Belief(*moments)
+    start = in_float64(given)(np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance))
+    start = jax.tree.map(np.asarray, start)  # on no device: no program
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":

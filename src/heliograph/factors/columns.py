@@ -1,0 +1,229 @@
+"""Covariances as sums of squares W diag(w) W', and the two ways to their factors L diag(d) L'.
+
+L is unit lower triangular and d is never negative, so that a variance is a sum of positive terms in any precision. Rows
+are made orthogonal (`triangular`) where digits matter: a row is known to eps, so its square to eps^2. The sum is formed
+and eliminated (`eliminated`) where products matter: two thirds of them, and a pivot is known to eps of its variance.
+
+A known zero of a matrix stays a known zero through a matrix product, not through a product of numbers, which might be
+NaN: so products of rows and columns are written as matrix products here.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.linalg import symmetric
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import Array
+
+UNITS = 4  # of rounding of a number, which are noise of it
+WRITTEN = 16  # rows that are written out one after another; more are a loop
+RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
+
+
+class Columns(NamedTuple):
+    """A covariance W diag(w) W'.  Shapes: matrix W (n, columns), weights w (columns,)."""
+
+    matrix: Any  # Float[Array, "n columns"], NumPy's or JAX's
+    weights: Any
+
+    @property
+    def covariance(self) -> jax.Array:
+        """W diag(w) W' (n, n)."""
+        matrix = jnp.asarray(self.matrix)
+        return symmetric((matrix * self.weights) @ matrix.T)
+
+    def through(self, matrix: Array) -> "Columns":
+        """Return the covariance of A v for a v with this one."""
+        return Columns(matrix @ self.matrix, self.weights)
+
+    def times(self, factor: Array) -> "Columns":
+        """Return the covariance times a number."""
+        return Columns(self.matrix, self.weights * factor)
+
+
+def joined(*parts: Columns) -> Columns:
+    """Sum of covariances: their columns side by side."""
+    matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
+    return Columns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
+
+
+def nothing(n: int) -> Columns:
+    """A covariance of zero of n components: no columns."""
+    return Columns(np.zeros((n, 0)), np.zeros(0))
+
+
+def unit_lower(entries: Array) -> Any:
+    """L (..., n, n) of its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
+    xp, count = library(entries), entries.shape[-1]
+    n = (1 + int(np.sqrt(1 + 8 * count))) // 2
+    place = np.full((n, n), count)
+    place[np.tril_indices(n, -1)] = np.arange(count)
+    np.fill_diagonal(place, count + 1)
+    ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
+    return xp.concatenate([entries, ends], axis=-1)[..., place]
+
+
+def below_diagonal(lower: jax.Array) -> jax.Array:
+    """Entries of L below its diagonal, row by row: the inverse of `unit_lower`."""
+    return lower[np.tril_indices(lower.shape[-1], -1)]
+
+
+def inverse(x: jax.Array) -> jax.Array:
+    """1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
+    return 1 / jnp.where(x > 0, x, 1.0)
+
+
+def reciprocal(x: jax.Array) -> jax.Array:
+    """1 / x of a positive number, and 0 of 0."""
+    some = x > 0
+    return jnp.where(some, 1 / jnp.where(some, x, 1.0), 0.0)
+
+
+def square_root(x: jax.Array) -> jax.Array:
+    """Root of x, of slope 0 at 0: what is even in it has one there, and 0 times infinity would be none."""
+    some = x > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, x, 1.0)), 0.0)
+
+
+def triangular(columns: Columns) -> Columns:
+    """L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
+
+    d_j = |row j|^2 in the weights, L_ij = (row i, row j) / d_j, and row i loses L_ij row j. c n (n + 1) products for c
+    columns, n reciprocals. A row that depends on those above it has d = 0 and adds nothing to those below.
+
+    Source: Thornton, Triangular covariance factorizations for Kalman filtering (1976), modified weighted Gram-Schmidt.
+    """
+    rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
+    if len(rows) > WRITTEN:
+        return _long_triangular(rows, weights)
+    n, lower, variances = len(rows), [], []
+    for j in range(n):
+        first, rows = rows[0], rows[1:]
+        weighted = weights * first
+        variances.append(first @ weighted)
+        share = outer(rows @ weighted, inverse(variances[j])[None])[:, 0]
+        rows = rows - outer(share, first)
+        lower.append(_column(share, n))
+    return Columns(_matrix(lower), _vector(variances))
+
+
+def eliminated(covariance: jax.Array, least: float = 0.0) -> Columns:
+    """L and d with L diag(d) L' = P, by elimination: n^3 / 6 products, n reciprocals.
+
+    A pivot is known to eps of its own variance, of which rounding may leave less than nothing: it is at least `least`
+    times it.
+    """
+    if len(covariance) > WRITTEN:
+        return _long_eliminated(covariance, least)
+    n, whole, rest, lower, variances = len(covariance), jnp.diagonal(covariance), covariance, [], []
+    for j in range(n):
+        variances.append(_at_least(rest[0, 0], least * whole[j]))
+        share = outer(rest[1:, 0], reciprocal(variances[j])[None])[:, 0]
+        rest = symmetric(rest[1:, 1:] - outer(share, rest[0, 1:]))
+        lower.append(_column(share, n))
+    return Columns(_matrix(lower), _vector(variances))
+
+
+def decorrelated(lower: jax.Array, rows: jax.Array) -> jax.Array:
+    """L^-1 times rows (m, ...): of z = rows x + n with Cov n = L diag(d) L', rows whose noises are uncorrelated."""
+    solved: list[jax.Array] = []
+    for i in range(len(rows)):
+        known = jnp.stack(solved) if solved else jnp.zeros((0, rows.shape[1]))
+        solved.append(rows[i] - lower[i, :i] @ known)
+    return jnp.stack(solved) if solved else rows
+
+
+def root_of(covariance: np.ndarray) -> np.ndarray:
+    """W (n, rank) with W W' = P of a known covariance: Cholesky's, with pivots, in units of each component's deviation.
+
+    Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
+    """
+    deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    scale = np.where(deviation > 0, deviation, 1.0)
+    rest, columns = covariance / np.outer(scale, scale), []
+    for _ in range(len(covariance)):
+        j = int(np.argmax(np.diagonal(rest)))
+        if rest[j, j] <= RANK:
+            break
+        columns.append(rest[:, j] / np.sqrt(rest[j, j]))
+        rest = rest - np.outer(columns[-1], columns[-1])
+        rest[j] = rest[:, j] = 0.0
+    root = np.array(columns).T.reshape(len(covariance), -1)
+    return scale[:, None] * np.where(np.abs(root) > RANK, root, 0.0)
+
+
+def columns_of(covariance: Array) -> Columns:
+    """Columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
+    if isinstance(covariance, np.ndarray):
+        root = root_of(covariance)
+        return Columns(root, np.ones(root.shape[1]))
+    return eliminated(jnp.asarray(covariance))
+
+
+def rounding_of(seconds: Array) -> Columns:
+    """Rounding of numbers with second moments E[s_i^2], (n,): noise of variance (UNITS eps)^2 E[s_i^2] in each.
+
+    It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
+    variance it would be lost.
+    """
+    unit = UNITS * float(np.finfo(np.dtype(seconds.dtype)).eps)
+    return Columns(np.eye(len(seconds)), unit**2 * seconds)
+
+
+def outer(a: jax.Array, b: jax.Array) -> jax.Array:
+    """a b' as a matrix product."""
+    return a[:, None] @ b[None, :]
+
+
+def _at_least(pivot: jax.Array, floor: jax.Array) -> jax.Array:
+    """The larger of both; not by a maximum, which halves the derivative where both are zero."""
+    return jnp.where(pivot >= floor, pivot, floor)
+
+
+def _column(share: jax.Array, n: int) -> jax.Array:
+    """Column of L of its entries below the diagonal."""
+    ends = np.zeros(n - len(share))
+    ends[-1] = 1.0
+    return jnp.concatenate([jnp.asarray(ends, share.dtype), share])
+
+
+def _matrix(columns: list[jax.Array]) -> jax.Array:
+    return jnp.stack(columns, axis=1) if columns else jnp.zeros((0, 0))
+
+
+def _vector(entries: list[jax.Array]) -> jax.Array:
+    return jnp.stack(entries) if entries else jnp.zeros(0)
+
+
+def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
+    """`triangular` as a loop over the rows."""
+    n = len(rows)
+
+    def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        rows, lower, variances = carry
+        weighted = weights * rows[j]
+        d = rows[j] @ weighted
+        share = jnp.where(np.arange(n) > j, rows @ weighted * inverse(d), 0.0)
+        return rows - jnp.outer(share, rows[j]), lower.at[:, j].add(share), variances.at[j].set(d)
+
+    start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
+    _, lower, variances = jax.lax.fori_loop(0, n, body, start)
+    return Columns(lower, variances)
+
+
+def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
+    """`eliminated` as a loop over the columns."""
+    n, whole = len(covariance), jnp.diagonal(covariance)
+
+    def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        rest, lower, variances = carry
+        d = _at_least(rest[j, j], least * whole[j])
+        share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal(d), 0.0)
+        return rest - jnp.outer(share, rest[j]), lower.at[:, j].add(share), variances.at[j].set(d)
+
+    start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
+    _, lower, variances = jax.lax.fori_loop(0, n, body, start)
+    return Columns(lower, variances)

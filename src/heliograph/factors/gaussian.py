@@ -1,0 +1,234 @@
+"""A Gaussian by its mean and the factors L diag(d) L' of its covariance, and the operations that filters are made of.
+
+With x = m + L xi, xi uncorrelated with variances d, everything is said by slopes in xi: of F x they are F L, of a
+measurement H x they are H L. Sums of independent terms are columns side by side (`columns.py`). No operation takes the
+difference of two variances, and none has a branch: a component of variance zero has a reciprocal of zero.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import (
+    Columns,
+    below_diagonal,
+    columns_of,
+    decorrelated,
+    eliminated,
+    inverse,
+    joined,
+    triangular,
+    unit_lower,
+)
+from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import Array, Float
+
+LOG_TURN = float(np.log(2 * np.pi))
+
+
+class Gaussian(NamedTuple):
+    """Mean m and covariance L diag(d) L'.
+
+    Shapes: mean (n,), lower (n (n - 1) / 2,) the entries of L below its diagonal row by row, variances d (n,); leading
+    axes for several.
+    """
+
+    mean: Float[jax.Array, "... n"]
+    lower: Float[jax.Array, "... entries"]
+    variances: Float[jax.Array, "... n"]
+
+    @property
+    def root(self) -> Any:
+        """L (..., n, n), NumPy's or JAX's as the entries are."""
+        return unit_lower(self.lower)
+
+    @property
+    def columns(self) -> Columns:
+        """Covariance as the columns of L with weights d."""
+        return Columns(self.root, self.variances)
+
+    @property
+    def covariance(self) -> Any:
+        """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are."""
+        root, xp = self.root, library(self)
+        product = (root * self.variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
+        upper = np.triu(np.ones(product.shape[-2:], bool))
+        return xp.where(upper, product, xp.swapaxes(product, -1, -2))
+
+
+def of_columns(mean: jax.Array, columns: Columns) -> Gaussian:
+    """Gaussian whose covariance is a sum of squares: by orthogonal rows, to eps^2 of each variance."""
+    factors = triangular(columns)
+    return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
+
+
+def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
+    """Gaussian of the same by the sum's matrix: 2/3 of the products, each variance to n eps of itself."""
+    total = parts[0].covariance
+    for part in parts[1:]:
+        total = total + part.covariance
+    factors = eliminated(total, len(total) * float(np.finfo(total.dtype).eps))
+    return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
+
+
+def given(mean: Array, covariance: Array) -> Gaussian:
+    """Gaussian of a covariance matrix: the border to all that has one."""
+    columns = columns_of(covariance)
+    if isinstance(covariance, np.ndarray):
+        return of_columns(jnp.asarray(mean), columns)
+    return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
+
+
+def move(x: Gaussian, matrix: Array, shift: Array, noise: Columns) -> Gaussian:
+    """F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
+    return of_columns(jnp.asarray(matrix @ x.mean + shift), joined(Columns(matrix @ x.root, x.variances), noise))
+
+
+class Image(NamedTuple):
+    """f(x) of x = m + L xi, to second moments: mean + slopes xi + what is uncorrelated with xi.
+
+    Shapes: mean (p,), slopes (p, n), curvature (p, columns), the last a sum of squares.
+    """
+
+    mean: Float[jax.Array, " p"]
+    slopes: Float[jax.Array, "p n"]
+    curvature: Columns
+
+    def columns_from(self, x: Gaussian) -> Columns:
+        """Return the covariance of f(x)."""
+        return joined(Columns(self.slopes, x.variances), self.curvature)
+
+
+def transform(x: Gaussian, image: Image, noise: Columns) -> Gaussian:
+    """f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w."""
+    return of_sum(image.mean, Columns(image.slopes, x.variances), image.curvature, noise)
+
+
+class Innovations(NamedTuple):
+    """Innovations of a measurement's components, each given those before it: uncorrelated; 0 of what did not arrive.
+
+    value (m,), variance (m,), and whole (m,): the variance of the component by itself.
+    """
+
+    value: Float[jax.Array, " m"]
+    variance: Float[jax.Array, " m"]
+    whole: Float[jax.Array, " m"]
+
+    def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
+        """log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
+
+        A component that those before it determine, s_j = 0 to rounding, adds nothing where it agrees with them and
+        -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation.
+        """
+        known = self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
+        safe = jnp.where(known, 1.0, self.variance)
+        density = -(self.value**2 * (1 / safe) + jnp.log(safe) + LOG_TURN) / 2
+        reach = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
+        agrees = jnp.where(jnp.abs(self.value) <= reach, 0.0, -jnp.inf)
+        return jnp.sum(jnp.where(present, jnp.where(known, agrees, density), 0.0))
+
+
+def observe(x: Gaussian, slopes: jax.Array, innovation: jax.Array, noise: Columns) -> tuple[Gaussian, Innovations]:
+    """Condition x = m + L xi on z = E z + slopes xi + v, given z - E z, NaN where a component did not arrive.
+
+    Component after component of N^-1 z, where Cov v = N diag(r) N': their noises are uncorrelated. Shapes: slopes
+    (m, n), innovation (m,), noise (m, columns).
+    """
+    n, m = len(x.mean), len(innovation)
+    present = ~jnp.isnan(innovation)
+    # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
+    fresh = triangular(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
+    rows = jnp.where(present[:, None], rows, 0.0)
+    whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
+    rows, variance = decorrelated(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
+    # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
+    root, d = jnp.concatenate([x.root, rows[:, :n]]), x.variances
+    news, values, totals = jnp.concatenate([x.mean, -rows[:, n]]), [], []
+    for i in range(m):
+        root, d, gain, total = _measured(root, d, root[n + i], variance[i])
+        values.append(-news[n + i])
+        totals.append(total)
+        news = news + gain * values[i]
+    after = Gaussian(news[:n], below_diagonal(root[:n]), d)
+    return after, Innovations(_vector(values), _vector(totals), whole)
+
+
+def _measured(
+    root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Rows V, variances d, gain and s after the scalar f' xi + v, Var v = r: s = f' diag(d) f + r, K = V diag(d) f / s.
+
+    With s_j = r + sum_{k >= j} f_k^2 d_k and w_j = sum_{k >= j} d_k f_k V_k, columns V_j of V:
+    d_j+ = d_j s_{j+1} / s_j and V_j+ = V_j - (f_j / s_{j+1}) w_{j+1}. Ratios of sums of positive terms.
+
+    Source: Bierman, Factorization methods for discrete sequential estimation (1977), Section V.3, its order reversed
+    since L is lower.
+    """
+    lower = np.tril(np.ones(root.shape, bool))
+    product = d * f
+    s = jax.lax.cumsum(jnp.append(noise, (f * product)[::-1]))[::-1]  # s_0, ..., s_n = r
+    w = jax.lax.cumsum(jnp.where(lower, root * product, 0.0), axis=1, reverse=True)
+    over = inverse(s)  # where s is 0, so is what it divides
+    left = jnp.where(lower[:, 1:], w[:, 1:] * (f * over[1:])[:-1], 0.0)
+    after = root - jnp.pad(left, ((0, 0), (0, 1)))
+    kept = jnp.where(s[:-1] > 0, d * (s[1:] * over[:-1]), d)
+    return after, kept, w[:, 0] * over[0], s[0]
+
+
+def merge(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
+    """Gaussian with the moments of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)'). `parts` have a leading axis.
+
+    Means are taken about the first: of some so large that all are equal nothing is left, and no rounding to be squared.
+    """
+    count, n = parts.mean.shape
+    about = parts.mean - parts.mean[0]
+    shift = weights @ about
+    roots = jnp.moveaxis(jnp.asarray(parts.root), 0, 1).reshape(n, count * n)
+    within = Columns(roots, (weights[:, None] * parts.variances).reshape(count * n))
+    return of_sum(parts.mean[0] + shift, within, Columns((about - shift).T, weights))
+
+
+class Backwards(NamedTuple):
+    """Law of x given the next state x+: m + J (x+ - m+) + a noise that is uncorrelated with x+.
+
+    Shapes: mean m, ahead m+ = E x+ (n,), gain J (n, n), noise (n, columns).
+    """
+
+    mean: Float[jax.Array, "*time n"]
+    gain: Float[jax.Array, "*time n n"]
+    ahead: Float[jax.Array, "*time n"]
+    noise: Columns
+
+
+def backwards(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) -> Backwards:
+    """Law of x = m + L xi given x+ = ahead + slopes xi + w: factors of the joint covariance of (x+, x).
+
+    [x+; x] has the factors [[L+, 0], [K, L_s]] and (d+, d_s): J = K (L+)^-1, and L_s diag(d_s) L_s' is the covariance
+    of x given x+. Sums of squares alone. Shapes: slopes (n, n) are F L of x+ = F x + b + w.
+    """
+    n = len(x.mean)
+    top = joined(Columns(slopes, x.variances), noise)
+    low = jnp.concatenate([x.root, jnp.zeros((n, noise.matrix.shape[1]))], axis=1)
+    factors = triangular(Columns(jnp.concatenate([top.matrix, low]), top.weights))
+    # J L+ = K, columns from the last one back.
+    lower, columns = factors.matrix[:n, :n], list(factors.matrix[n:, :n].T)
+    for j in reversed(range(n - 1)):
+        columns[j] = columns[j] - lower[j + 1 :, j] @ jnp.stack(columns[j + 1 :])
+    return Backwards(x.mean, jnp.stack(columns, axis=1), ahead, Columns(factors.matrix[n:, n:], factors.weights[n:]))
+
+
+def smoothed(back: Backwards, later: Gaussian) -> Gaussian:
+    """Law of x given all data, from that of the next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+).
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
+    """
+    mean = back.mean + back.gain @ (later.mean - back.ahead)
+    return of_columns(mean, joined(Columns(back.gain @ later.root, later.variances), back.noise))
+
+
+def _vector(entries: list[jax.Array]) -> jax.Array:
+    return jnp.stack(entries) if entries else jnp.zeros(0)

@@ -1,0 +1,146 @@
+"""Bounds behind a channel whose probabilities are uncertain, as Kalman updates of an inflated prior and noise.
+
+Notation as in `update`: e the prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the
+measurement, M = E[G], H the slopes of y in the state and R the covariance of the rest of y.
+"""
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, decorrelated, eliminated, joined, reciprocal, triangular
+from heliograph.factors.gaussian import Gaussian, observe, of_sum
+from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
+from heliograph.filters.gaussian.signal import LOST, Signal, homogeneous, observe_received
+from heliograph.numerics.check import array, fail, instance
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.types import Array, PyTree
+from heliograph.random_affine.moments.second_moments import SecondOrder
+
+T = TypeVar("T", bound=PyTree)
+
+
+@readable
+class Scalars(Module):
+    """Fixed positive scalars (beta_1, beta_2) of Young's inequality, as published bounds use them.
+
+    Args:
+        first: beta_1 > 0.
+        second: beta_2 > 0.
+
+    Raises:
+        ValueError: a scalar that is not positive.
+    """
+
+    values: np.ndarray
+
+    def __init__(self, first: float, second: float):
+        self.values = array("scalars of the bound", [first, second], (2,))
+        if np.any(self.values <= 0):
+            raise fail("scalars of the bound", "two positive numbers", (first, second))
+
+
+def as_array(scalars: Scalars | None) -> np.ndarray:
+    """Scalars as two numbers, NaN where the trace is to be minimised over them."""
+    if scalars is None:
+        return np.full(2, np.nan)
+    return instance("scalars", scalars, Scalars, "Scalars").values
+
+
+def as_scalars(values: np.ndarray) -> Scalars | None:
+    """Scalars from two numbers, None for NaN: the inverse of `as_array`."""
+    return None if np.isnan(values).any() else Scalars(*values)
+
+
+def keep_unless(changes: jax.Array, after: T, before: T) -> T:
+    """`after` where something changes, else `before`."""
+    chosen: T = jax.tree.map(lambda a, b: jnp.where(changes, a, b), after, before)
+    return chosen
+
+
+def observe_by_young(signal: Signal, channel: SecondOrder, innovation: jax.Array, scalars: Array) -> Gaussian:
+    """Update of `Polytope` for any description of the channel; scalars (2,), NaN to minimise the trace over them.
+
+    (1 + b1) P - C' Omega^-1 C with Omega = base + (1/b1 + 1/b2) shift + (1 + b2) M (H P H' + R) M' is what a Kalman
+    update makes of the prior (1 + b1) P and, of z, of the noise (1 + b1)^2 [base + (1/b1 + 1/b2) shift +
+    (1 + b2) M R M'] + (1 + b1) ((1 + b1)(1 + b2) - 1) M H P H' M', positive terms; its gain is K / (1 + b1).
+    """
+    if not channel.uncertain:
+        return observe_received(signal, channel, innovation)[0]
+    prior, present = signal.prior, ~jnp.isnan(innovation)
+    slopes, of_state, of_noise = _received(signal, channel, present)
+    w = homogeneous(signal.second, signal.mean, 1.0)
+    base, shift = channel.spread(w, present), channel.shift(w, present)
+    # The scalars of least trace.
+    cross = (slopes * prior.variances) @ prior.root.T
+    whole = jnp.trace(prior.covariance)
+    parts = base + absent(present), shift, of_state + of_noise, cross @ cross.T, whole
+    beta = smallest_scalars(young_sweep, scalars, parts)
+    a, b = jnp.where(jnp.any(present), 1 + beta[0], 1.0), 1 + beta[1]
+    # The same bound as a Kalman update.
+    noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
+    wide = prior._replace(variances=a * prior.variances)
+    return observe(wide, slopes, a * innovation, _factored(noise))[0]
+
+
+def observe_by_zero_mean(signal: Signal, channel: SecondOrder, innovation: jax.Array, scalar: Array) -> Gaussian:
+    """Update of `ZeroMean`; scalar (1,), NaN to optimise it.
+
+    Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta is at least M H P H' M', so that the rest is a noise;
+    beta times what the received components explain of P, C Pyy^+ C', is added.
+    """
+    if not channel.uncertain:  # power(Pyy) = M Pyy M' + spread(Pyy): no other than Young's
+        return observe_received(signal, channel, innovation)[0]
+    prior, present = signal.prior, ~jnp.isnan(innovation)
+    slopes, of_state, _ = _received(signal, channel, present)
+    # E[y y'] divided: yhat yhat' is known, Cov y is not.
+    known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
+    unknown_part = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
+    base = channel.power(unknown_part, present) + channel.spread(known_part, present)
+    shift = channel.shift(unknown_part, present)
+    # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
+    used = received(channel, present)[:, None]
+    signals = joined(Columns(signal.slopes, prior.variances), signal.noise)
+    factors = triangular(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
+    explained = decorrelated(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
+    share = reciprocal(factors.weights)
+    # The best beta, then the update with what is left of Omega as noise.
+    cross = (slopes * prior.variances) @ prior.root.T
+    parts = base + absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
+    beta = smallest_scalars(zero_mean_sweep, scalar, parts)[0]
+    after = observe(prior, slopes, innovation, _factored(base + shift / beta - of_state))[0]
+    wider = of_sum(after.mean, after.columns, Columns(explained, beta * share))
+    return keep_unless(jnp.any(present), wider, after)
+
+
+def _received(signal: Signal, channel: SecondOrder, present: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """M H of what arrived, M H P H' M' and M R M'."""
+    gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
+    slopes = gain @ signal.slopes
+    return slopes, Columns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance
+
+
+def bounded_covariance(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Array:
+    """Omega of a channel whose mean gain is known: the bound on the covariance of z that gives the gain (m, m)."""
+    _, of_state, of_noise = _received(signal, channel, present)
+    spread = channel.spread(homogeneous(signal.second, signal.mean, 1.0), present)
+    return spread + of_state + of_noise + absent(present)
+
+
+def _factored(noise: jax.Array) -> Columns:
+    return eliminated(noise, LOST * float(np.finfo(noise.dtype).eps))
+
+
+def absent(present: jax.Array) -> jax.Array:
+    """Unit variance for components that did not arrive, so that the reduced system keeps its full size."""
+    return jnp.diag(jnp.where(present, 0.0, 1.0))
+
+
+def received(channel: SecondOrder, present: jax.Array) -> jax.Array:
+    """Mask (p,) of the components of the signal that act on what arrived; the others count as never measured."""
+    m, p = channel.mean_gain.shape[:2]
+    reached = (channel.power.center != 0) | (channel.power.radius != 0)
+    parts = [[reached[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]
+    return jnp.stack([jnp.any(jnp.stack(rows), axis=0) for rows in parts])

@@ -1,0 +1,134 @@
+"""What a sensor sends as a filter sees it, and what of it arrives: slopes in the state, and noise as a sum of squares.
+
+Notation: the prior is x = m + L xi, xi uncorrelated with variances d; the sensor's signal is y = E y + slopes xi + v, v
+its noise and what of it is not linear in xi; z = G y + n is the measurement behind a channel, M = E[G].
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, eliminated, joined, rounding_of, triangular
+from heliograph.factors.gaussian import Gaussian, Innovations, observe
+from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor, LinearSensor
+from heliograph.numerics.angle import continued
+from heliograph.numerics.linalg import contract
+from heliograph.random_affine.moments.second_moments import SecondOrder
+
+LOST = 100  # roundings of its variance, which elimination leaves of a combination free of a random gain
+
+
+class Signal(NamedTuple):
+    """Moments of the sensor's signal y = E y + slopes xi + v under the prior x = m + L xi.
+
+    Shapes: mean (p,), slopes (p, n), noise (p, columns) of v, second = E[y y'] (p, p), size (p,), the second moments of
+    what y is computed from, of which the rounding stays unknown.
+    """
+
+    prior: Gaussian
+    mean: jax.Array
+    slopes: jax.Array
+    noise: Columns
+    second: jax.Array
+    size: jax.Array
+
+    @property
+    def covariance(self) -> jax.Array:
+        """Cov y (p, p), with the sensor's noise."""
+        return joined(Columns(self.slopes, self.prior.variances), self.noise).covariance
+
+    @property
+    def cross(self) -> jax.Array:
+        """Cov(x, y) (n, p)."""
+        return jnp.asarray((self.prior.root * self.prior.variances) @ self.slopes.T)
+
+    def about_mean(self) -> "Signal":
+        """Return the moments of y - E y: all that the update behind a known gain depends on, whatever was estimated."""
+        return self._replace(mean=jnp.zeros_like(self.mean), second=self.covariance)
+
+
+def signal_of(
+    plant: AbstractPlant,
+    sensor: AbstractSensor,
+    transform: AbstractTransform,
+    prior: Gaussian,
+    start: jax.Array,
+    noise: Columns | None = None,
+) -> Signal:
+    """Moments of the sensor's signal y = h(x) + v under the prior of x.
+
+    Args:
+        plant: whose states may be angles.
+        sensor: h and the law of v.
+        transform: for an h that is not linear.
+        prior: the law of x.
+        start: E[x_i^2] before any data, (n,).
+        noise: of v, in place of the sensor's.
+    """
+    law = sensor.noise
+    if isinstance(sensor, LinearSensor):
+        image = linear_image(sensor.matrix, sensor.measure(prior.mean), prior)
+    else:
+        image = transform.image(continued(sensor.measure, prior.mean, plant.angles, sensor.angles), prior)
+    mean, noise = image.mean + law.mean, joined(law.columns if noise is None else noise, image.curvature)
+    second = joined(Columns(image.slopes, prior.variances), noise).covariance + jnp.outer(mean, mean)
+    size = size_of(sensor, start) if isinstance(sensor, LinearSensor) else jnp.diagonal(second)
+    return Signal(prior, mean, image.slopes, noise, second, size)
+
+
+def size_of(sensor: LinearSensor, start: jax.Array) -> jax.Array:
+    """(|H| root E[x x'] + |E v|)^2 + Cov v of the state at the start, (p,): how large what y is summed of may be.
+
+    Not of the prior: on data no covariance of a linear filter depends, and before them moments grow without end where
+    only inputs hold a plant.
+    """
+    law = sensor.noise
+    reach = jnp.abs(jnp.asarray(sensor.matrix)) @ jnp.sqrt(start) + jnp.abs(jnp.asarray(law.mean))
+    variances: jax.Array = jnp.diagonal(jnp.asarray(law.covariance))
+    return reach**2 + variances
+
+
+def received_noise(signal: Signal, channel: SecondOrder) -> Columns:
+    """Noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
+
+    A combination of outputs free of v and n is known to eps of it: these are made triangular, of known numbers once.
+    What the random gain adds, E[(G - M) y y' (G - M)'], is formed and eliminated: of a combination free of it, that
+    leaves a hundred eps.
+    """
+    gain = jnp.asarray(channel.mean_gain)
+    rounding = rounding_of((jnp.abs(gain) @ jnp.sqrt(signal.size)) ** 2)
+    known = triangular(joined(signal.noise.through(gain), channel.noise, rounding))
+    return joined(known, gain_noise(channel, signal.second, signal.mean))
+
+
+def gain_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
+    """Factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
+    spread = contract(channel.gain_spread, homogeneous(second, mean, 1.0))
+    return eliminated(spread, LOST * float(np.finfo(spread.dtype).eps))
+
+
+def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
+    """Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
+    return joined(channel.noise, gain_noise(channel, second, mean))
+
+
+def observe_received(signal: Signal, channel: SecondOrder, innovation: jax.Array) -> tuple[Gaussian, Innovations]:
+    """Condition the prior on z - E z, NaN where a component did not arrive, behind the nominal law of the channel."""
+    slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
+    return observe(signal.prior, slopes, innovation, received_noise(signal, channel))
+
+
+def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
+    """Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m)."""
+    slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
+    return joined(Columns(slopes, signal.prior.variances), received_noise(signal, channel)).covariance
+
+
+def homogeneous(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
+    """E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
+    top = jnp.concatenate([second, mean[:, None]], axis=1)
+    return jnp.concatenate([top, jnp.append(mean, last)[None]])

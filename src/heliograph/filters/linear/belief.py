@@ -1,0 +1,83 @@
+"""What a linear filter knows: the estimate, and the state's moments before any data, both moved with the plant."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian, given, move
+from heliograph.filters.gaussian.belief import process_noise
+from heliograph.model.plant import AbstractPlant, LinearPlant
+from heliograph.numerics.linalg import symmetric
+from heliograph.numerics.types import Float
+
+
+class Move(NamedTuple):
+    """A step x+ = A x + b + w.
+
+    Shapes: matrix A (n, n), shift b (n,), covariance Cov w (n, n), noise (n, columns) its factors with the rounding
+    of x.
+    """
+
+    matrix: jax.Array
+    shift: jax.Array
+    covariance: jax.Array
+    noise: Columns
+
+
+def move_of(plant: LinearPlant, u: jax.Array, start: jax.Array) -> Move:
+    """The plant's move under the input u; `start` are E[x_i^2] before the first step, (n,)."""
+    return Move(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u), process_noise(plant, u, start))
+
+
+class LinearBelief(NamedTuple):
+    """The estimate's mean and factors, and the state's mean and covariance before any data.
+
+    The latter is never diminished by a measurement, and so needs no factors. Shapes: mean, variances, state_mean (n,),
+    lower (n (n - 1) / 2,), state_covariance (n, n).
+    """
+
+    mean: Float[jax.Array, " n"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " n"]
+    state_mean: Float[jax.Array, " n"]
+    state_covariance: Float[jax.Array, "n n"]
+
+    @property
+    def estimate(self) -> Gaussian:
+        """The state given the data."""
+        return Gaussian(self.mean, self.lower, self.variances)
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of the estimate's error."""
+        return self.estimate.covariance
+
+
+def prior_belief(start: AbstractPlant) -> LinearBelief:
+    """Return the prior, both as estimate and as the state's moments before data."""
+    mean, covariance = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
+    return LinearBelief(*given(start.initial_mean, start.initial_covariance), mean, covariance)
+
+
+def predicted(belief: LinearBelief, step: Move) -> LinearBelief:
+    """Estimate and state before data after x+ = A x + b + w."""
+    estimate = move(belief.estimate, step.matrix, step.shift, step.noise)
+    mean = step.matrix @ belief.state_mean + step.shift
+    covariance = step.matrix @ belief.state_covariance @ step.matrix.T + step.covariance
+    return LinearBelief(*estimate, *_within_range(mean, symmetric(covariance)))
+
+
+def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Moments that stay finite numbers: those before any data of an unstable plant, which only its inputs hold, do not.
+
+    Behind a known gain nothing depends on them.
+    """
+    largest = float(np.finfo(covariance.dtype).max) ** 0.5
+    return _clipped(mean, largest**0.5), _clipped(covariance, largest)
+
+
+def _clipped(a: jax.Array, largest: float) -> jax.Array:
+    return jnp.maximum(jnp.minimum(a, largest), -largest)

@@ -1,0 +1,209 @@
+"""A Gaussian by mean and factors: its operations against textbook formulas and exact fractions."""
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from heliograph.factors.columns import Columns, columns_of, nothing, rounding_of
+from heliograph.factors.gaussian import (
+    Gaussian,
+    Image,
+    backwards,
+    given,
+    merge,
+    move,
+    observe,
+    of_sum,
+    smoothed,
+    transform,
+)
+from tests.factors.exact import after, congruence, exactly, total
+
+EXACT = {"rtol": 1e-11, "atol": 1e-12}  # some twenty products of numbers of order 1, and a solution
+SIZES = [(1, 1), (3, 2), (5, 3), (18, 4)]
+
+
+@pytest.fixture(autouse=True)
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+def covariance(rng, n):
+    root = rng.normal(size=(n, n))
+    return root @ root.T + 0.1 * np.eye(n)
+
+
+def problem(n, m):
+    rng = np.random.default_rng(n)
+    return rng.normal(size=n), covariance(rng, n), rng.normal(size=(m, n)), covariance(rng, m), rng.normal(size=m)
+
+
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_moving_adds_the_noise(n, m):
+    mean, p, _, _, _ = problem(n, m)
+    rng = np.random.default_rng(0)
+    f, b, q = rng.normal(size=(n, n)), rng.normal(size=n), covariance(rng, n)
+    x = given(mean, p)
+    np.testing.assert_allclose(x.covariance, p, **EXACT)
+    by_rows = move(x, f, b, columns_of(q))
+    by_sum = transform(x, Image(f @ x.mean + b, f @ x.root, nothing(n)), columns_of(q))
+    for moved in (by_rows, by_sum):
+        np.testing.assert_allclose(moved.mean, f @ mean + b, **EXACT)
+        np.testing.assert_allclose(moved.covariance, f @ p @ f.T + q, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("missing", [False, True])
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_observing_is_kalman_s_update(n, m, missing):
+    """With correlated noises, whether the first component arrives or not; its density is the joint Gaussian's."""
+    mean, p, h, r, z = problem(n, m)
+    used = np.arange(m) >= (1 if missing else 0)
+    innovation = np.where(used, z, np.nan)
+    x = given(mean, p)
+    known, seen = observe(x, h @ x.root, jnp.asarray(innovation), columns_of(r))
+    h, r, z = h[used], r[np.ix_(used, used)], z[used]
+    s = h @ p @ h.T + r
+    gain = np.linalg.solve(s, h @ p).T
+    np.testing.assert_allclose(known.mean, mean + gain @ z, **EXACT)
+    np.testing.assert_allclose(known.covariance, p - gain @ s @ gain.T, **EXACT)
+    density = multivariate_normal(np.zeros(len(z)), s).logpdf(z) if len(z) else 0.0
+    np.testing.assert_allclose(seen.log_density(used, jnp.abs(innovation)), density, **EXACT)
+
+
+def test_nothing_that_arrives_changes_nothing():
+    mean, p, h, r, _ = problem(3, 2)
+    x = given(mean, p)
+    known, seen = observe(x, h @ x.root, jnp.full(2, jnp.nan), columns_of(r))
+    for a, b in zip(known, x, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert seen.log_density(np.zeros(2, bool), jnp.zeros(2)) == 0
+
+
+def test_nothing_known_and_nothing_said_changes_nothing():
+    x = Gaussian(jnp.ones(2), jnp.zeros(1), jnp.zeros(2))
+    known, _ = observe(x, jnp.eye(2), jnp.ones(2), nothing(2))
+    assert np.all(known.mean == 1) and np.all(known.variances == 0)
+
+
+def test_an_output_that_others_determine_is_judged_by_them():
+    """The same noise-free output twice: the density is that of one where they agree, and 0 where they do not."""
+    x, rows = given(np.zeros(1), np.eye(1)), jnp.ones((2, 1))
+    both = np.ones(2, bool)
+    alone = -0.5 * (0.3**2 + np.log(2 * np.pi))
+    agrees = observe(x, rows, jnp.asarray([0.3, 0.3]), nothing(2))[1].log_density(both, jnp.ones(2))
+    differs = observe(x, rows, jnp.asarray([0.3, 0.4]), nothing(2))[1].log_density(both, jnp.ones(2))
+    assert agrees == pytest.approx(alone) and differs == -np.inf
+
+
+@pytest.mark.parametrize("precise", [1e-14, 1e-10, 1e-4, 1.0])
+@pytest.mark.parametrize("wide", [1.0, 1e6, 1e10, 1e14])
+def test_a_wide_prior_and_a_precise_sensor_keep_their_digits(wide, precise):
+    """Four steps of position and velocity in fractions: every variance within 2 % of the exact one."""
+    a, q, h = np.array([[1.0, 1.0], [0.0, 1.0]]), 1e-9 * np.eye(2), np.array([[1.0, 0.0]])
+    x, p = given(np.zeros(2), wide * np.eye(2)), exactly(wide * np.eye(2))
+    process = columns_of(q)
+    for _ in range(4):
+        x = move(x, a, np.zeros(2), process)
+        x, _ = observe(x, h @ x.root, jnp.zeros(1), columns_of(np.array([[precise]])))
+        p = total(congruence(exactly(a), p), exactly(q))
+        p, _ = after(p, exactly(h), [[Fraction(precise)]])
+        np.testing.assert_allclose(np.diagonal(x.covariance), [float(p[0][0]), float(p[1][1])], rtol=0.02)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])
+def test_units_do_not_matter(unit):
+    mean, p, h, r, z = problem(3, 2)
+    x = given(unit * mean, unit**2 * p)
+    known, _ = observe(x, h @ x.root, jnp.asarray(unit * z), columns_of(unit**2 * r))
+    alone = given(mean, p)
+    expected, _ = observe(alone, h @ alone.root, jnp.asarray(z), columns_of(r))
+    np.testing.assert_allclose(known.mean / unit, expected.mean, rtol=1e-11)
+    np.testing.assert_allclose(known.covariance / unit**2, expected.covariance, rtol=1e-11)
+
+
+def test_gains_of_two_precise_outputs_that_say_nearly_the_same():
+    """The condition of S is 1e9; one after another the outputs keep their digits. In fractions."""
+    h, noise = np.array([[1.0, 1.0], [1.0, 1.0001]]), 1e-12 * np.array([[1.0, 0.9], [0.9, 1.0]])
+    _, gain = after(exactly(np.eye(2)), exactly(h), exactly(noise))
+    x = given(np.zeros(2), np.eye(2))
+    found = [observe(x, jnp.asarray(h) @ x.root, jnp.asarray(z), columns_of(noise))[0].mean for z in np.eye(2)]
+    np.testing.assert_allclose(np.transpose(found), np.array(gain, dtype=float), rtol=1e-10)
+
+
+@pytest.mark.parametrize("state_noise", [0.0, 1.0])
+def test_smoothing_is_rauch_s(state_noise):
+    """Of x given x+ known better: m + J (m_s - m+), P + J (P_s - P+) J' with J = P F' (P+)^-1."""
+    mean, p, _, _, _ = problem(4, 1)
+    rng = np.random.default_rng(3)
+    f, q = rng.normal(size=(4, 4)), state_noise * covariance(rng, 4)
+    x = given(mean, p)
+    ahead = move(x, f, np.zeros(4), columns_of(q))
+    back = backwards(x, f @ x.root, ahead.mean, columns_of(q))
+    later = given(np.asarray(ahead.mean) + 0.3, 0.4 * np.asarray(ahead.covariance))
+    known = smoothed(back, later)
+    prior = f @ p @ f.T + q
+    gain = np.linalg.solve(prior, f @ p).T
+    np.testing.assert_allclose(known.mean, mean + gain @ np.full(4, 0.3), rtol=1e-9)
+    np.testing.assert_allclose(known.covariance, p + gain @ (0.4 * prior - prior) @ gain.T, rtol=1e-8, atol=1e-9)
+
+
+def test_a_mixture_has_its_moments():
+    rng = np.random.default_rng(0)
+    means, spreads = rng.normal(size=(3, 2)), np.stack([covariance(rng, 2) for _ in range(3)])
+    weights = np.array([0.2, 0.5, 0.3])
+    whole = merge(jax.vmap(given)(means, spreads), weights)
+    middle = weights @ means
+    apart = means - middle
+    np.testing.assert_allclose(whole.mean, middle, **EXACT)
+    expected = np.einsum("i,ijk->jk", weights, spreads) + np.einsum("i,ij,ik->jk", weights, apart, apart)
+    np.testing.assert_allclose(whole.covariance, expected, **EXACT)
+
+
+def test_rounding_keeps_a_noise_free_filter_from_knowing_more_than_it_can():
+    """A state that moves and is seen without noise: its variance stays above the square of its rounding."""
+    x, rounding = given(np.zeros(1), 1.034 * np.eye(1)), rounding_of(np.array([1.034]))
+    for _ in range(20):
+        x = move(x, np.array([[0.9]]), np.zeros(1), rounding)
+        x, _ = observe(x, 0.349 * x.root, jnp.zeros(1), rounding_of(np.array([0.349**2 * 1.034])))
+    assert 1e-33 < float(x.variances[0]) < 1e-30
+
+
+def test_derivatives_pass_a_known_state_and_a_noise_free_output():
+    """d P+ / d P_0 and / dr at 0, with q the process noise: P+ = P- r / (P- + r), P- = P_0 + q."""
+    q = 0.7
+
+    def variance(start, noise):
+        x = Gaussian(jnp.zeros(1), jnp.zeros(0), start[None])
+        x = move(x, jnp.eye(1), jnp.zeros(1), Columns(jnp.eye(1), jnp.full(1, q)))
+        return observe(x, x.root, jnp.zeros(1), Columns(jnp.eye(1), noise[None]))[0].variances[0]
+
+    of_noise = jax.grad(variance, 1)(jnp.asarray(0.0), jnp.asarray(0.0))
+    of_start = jax.grad(variance, 0)(jnp.asarray(0.0), jnp.asarray(0.3))
+    assert of_noise == pytest.approx(1.0) and of_start == pytest.approx((0.3 / (q + 0.3)) ** 2)
+
+
+def test_of_correlated_noises_at_zero_the_scale_has_a_derivative():
+    """R = r C at r = 0: given as factors of C and r times their weights, the derivative is that at a small r."""
+    x = given(np.zeros(2), np.array([[2.0, 0.3], [0.3, 1.0]]))
+    correlated = columns_of(np.array([[1.0, 0.5], [0.5, 1.0]]))
+
+    def variance(r):
+        return jnp.trace(observe(x, x.root, jnp.zeros(2), correlated.times(r))[0].covariance)
+
+    slope, near = float(jax.grad(variance)(0.0)), float(variance(1e-7) - variance(0.0)) / 1e-7
+    assert slope == pytest.approx(near, rel=1e-5)
+
+
+def test_several_at_once_are_each_alone():
+    """Under vmap and with leading axes, bit for bit as alone."""
+    rng = np.random.default_rng(1)
+    spreads = np.stack([covariance(rng, 3) for _ in range(4)])
+    many = jax.vmap(given)(np.zeros((4, 3)), spreads)
+    for i in range(4):
+        np.testing.assert_allclose(many.covariance[i], spreads[i], **EXACT)
+    assert of_sum(jnp.zeros(3), columns_of(spreads[0])).root.shape == (3, 3)
