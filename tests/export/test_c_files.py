@@ -217,8 +217,8 @@ def test_the_files_say_what_they_are(readme, tmp_path):
     header, source = written.header.read_text(), written.source.read_text()
     for text in ("z[0]: left", "u[1]: dt", "mean[1]: velocity", "Claim: nominal", f"heliograph {hg.__version__}"):
         assert text in header
-    assert "typedef struct {\n    double mean[2];\n    double covariance[4];\n} cart_state;" in header
-    assert written.state_bytes == 48 and written.operations["mul"] < 200
+    assert "typedef struct {\n    double mean[2];\n    double lower[1];\n    double variances[2];\n} cart_state;" in header
+    assert written.state_bytes == 40 and written.operations["mul"] < 200
     again = hg.export_c(readme.nodes["cart"].filters["relay_aware"], tmp_path / "cart.c")
     assert (again.header.read_text(), again.source.read_text()) == (header, source)
     exact = hg.export_c(hg.linear_filter(LINE, RANGE, FADING), tmp_path / "line.c")
@@ -241,7 +241,6 @@ def with_transition(function):
 SHIFTED = with_transition(lambda x, u: jax.lax.conv(x[None, None], jnp.ones((1, 1, 1)), (1,), "SAME")[0, 0])
 BEYOND = with_transition(lambda x, u: jax.scipy.special.erfinv(x / 9))
 HIDDEN = hg.gilbert_elliott(FADING, hg.hop(0.2, 0.05), 0.2, 0.3)
-UNKNOWN = hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5], 0.1), 0.1)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +254,6 @@ UNKNOWN = hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5], 0.1), 0.1)
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "while.c", "double", "a name that C takes"),
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "no/a.c", "double", "an existing folder"),
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "a.c", "half", "expected double or float, got 'half'"),
-        (lambda: hg.linear_filter(LINE, RANGE, UNKNOWN), "a.c", "float", "probabilities are known"),
         (lambda: hg.linear_filter(LINE, RANGE, HIDDEN), "a.c", "float", "or a schedule of gains, got ModalFilter"),
         (lambda: "relay_aware", "a.c", "double", "export: expected a filter"),
     ],

@@ -178,6 +178,13 @@ class CSource:
         """Return the variable or literal of a number."""
         return literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
+    def _end(self, node: Node) -> str:
+        """Return a number as the end of a range: the largest of the precision in place of one beyond it."""
+        if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
+            return self.name(node)
+        largest = float(np.finfo(np.float32).max)
+        return literal(min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real)
+
     def statements(self, block: Block, indent: str = "    ") -> list[str]:
         """Return a block's statements, in order."""
         lines: list[str] = []
@@ -219,7 +226,8 @@ class CSource:
         if node.op == "load":
             text = self._load(node)
         else:
-            text = expression(node, [self.name(a) for a in node.args], self.real)
+            named = self._end if node.op in ("min", "max") else self.name
+            text = expression(node, [named(a) for a in node.args], self.real)
             self.operations[node.op] = self.operations.get(node.op, 0) + 1
         self.names[node] = self._new()
         return [f"{indent}const {c_type(node.type, self.real)} {self.names[node]} = {text};"]

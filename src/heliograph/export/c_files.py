@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from jax.tree_util import keystr, tree_flatten_with_path
+
 from heliograph.codegen.c_source import Real
 from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import RESERVED, step_program
@@ -45,9 +47,9 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
     Args:
         filter: the filter.
         path: path of the source, which ends in .c; the header is written next to it.
-        precision: "double", which agrees with `Stream` to rounding; "float", single precision with the covariance as L
-            D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains
-            (default "double").
+        precision: "double", which agrees with `Stream` to rounding; "float", single precision, for filters that carry
+            their covariance as factors L D L', whose variances stay positive, and schedules of gains (default
+            "double").
 
     Returns:
         The two files, the number of each operation in a step, and the bytes of the state.
@@ -57,7 +59,7 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
             operations that C does not have, with the line they come from; single precision of another filter. Then
             nothing is written.
 
-    Source: Bierman, Factorization methods for discrete sequential estimation (1977), for single precision.
+    Source: Bierman, Factorization methods for discrete sequential estimation (1977).
     """
     return export_named(filter, path, precision, None)
 
@@ -93,7 +95,15 @@ def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[
     """Return the text of both files of a filter."""
     names = received_names(filter) if received is None else received
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
+    if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
+        expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
+        raise fail("single precision", expected, type(filter).__name__)
     return c_text(step_program(filter, real), Form(prefix, real, names, kind))
+
+
+def carries_factors(filter: AbstractFilter) -> bool:
+    """Return whether the state has variances of L D L', which stay positive in any precision, and no covariance."""
+    return any(keystr(path).endswith(".variances") for path, _ in tree_flatten_with_path(filter.init())[0])
 
 
 def received_names(filter: AbstractFilter) -> Sequence[str]:
