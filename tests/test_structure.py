@@ -19,6 +19,7 @@ ORDER = [
     ["numerics"],
     ["codegen"],
     ["disk"],
+    ["factors"],
     ["random_affine"],
     ["model"],
     [
@@ -33,6 +34,8 @@ ORDER = [
         "filters.gaussian.scalars",
         "filters.gaussian.precise",
         "filters.gaussian.correction",
+        "filters.gaussian.signal",
+        "filters.gaussian.bounds",
         "filters.gaussian.update",
     ],
     ["linear", "relays", "h_infinity"],
