@@ -39,7 +39,7 @@ FILTER = {
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractSizedFilter, corrects, predicts, sized
-from heliograph.filters.gaussian.belief import Belief
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.float64 import in_float64
@@ -54,13 +54,13 @@ class FixedGainFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self):
-        return Belief(jnp.asarray(self.plant.initial_mean), jnp.asarray(self.plant.initial_covariance))
+        return Gaussian(jnp.asarray(self.plant.initial_mean), jnp.asarray(self.plant.initial_covariance))
 
     @predicts
     def predict(self, state, u=(), k=0):
         a = self.plant.transition_matrix(jnp.asarray(u))
         noise = self.plant.noise_covariance(jnp.asarray(u))
-        return Belief(a @ state.mean + self.plant.shift(jnp.asarray(u)), a @ state.covariance @ a.T + noise)
+        return Gaussian(a @ state.mean + self.plant.shift(jnp.asarray(u)), a @ state.covariance @ a.T + noise)
 
     @corrects
     def correct(self, state, z, k=0):
@@ -69,7 +69,7 @@ class FixedGainFilter(AbstractSizedFilter):
         keep = jnp.eye(len(state.mean)) - gain @ c
         after = keep @ state.covariance @ keep.T + gain @ r @ gain.T
         mean = state.mean + gain @ jnp.where(jnp.isnan(z), 0.0, z - expected)
-        return Belief(mean, after), gaussian_innovation(z, expected, c @ state.covariance @ c.T + r)
+        return Gaussian(mean, after), gaussian_innovation(z, expected, c @ state.covariance @ c.T + r)
 
     def estimate(self, state):
         return Estimate(state.mean, state.covariance, self.claim)

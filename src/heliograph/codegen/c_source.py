@@ -183,7 +183,9 @@ class CSource:
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
             return self.name(node)
         largest = float(np.finfo(np.float32).max)
-        return literal(min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real)
+        return literal(
+            min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real
+        )
 
     def statements(self, block: Block, indent: str = "    ") -> list[str]:
         """Return a block's statements, in order."""

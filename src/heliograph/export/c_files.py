@@ -15,6 +15,7 @@ from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import RESERVED, step_program
 from heliograph.export.text import CText, Form, c_text
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance, shown
 

@@ -12,15 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
+from heliograph.factors.columns import Columns, decorrelated, joined, reciprocal, square_root
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.belief import Belief
-from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected
-from heliograph.filters.gaussian.precise import initial_size
+from heliograph.filters.gaussian.signal import Signal
+from heliograph.filters.gaussian.transform import at_points
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
-from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.lapack import eigh
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -65,35 +66,33 @@ class StepFourGain(AbstractReading):
 class CentralMoment(AbstractReading):
     """The one symbol P^yy of (10) and Step 4 read as the covariance of the innovation in every term."""
 
-    def correct(
-        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Take Cov(y) for E[y y']."""
-        return self.update.correct(prior, signal._replace(second=signal.covariance), channel, present)
+        return self.update.condition(signal._replace(second=signal.covariance), channel, innovation)
 
 
 class RawMoment(AbstractReading):
     """The one symbol P^yy read as E[y y'] in every term."""
 
-    def correct(
-        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Take E[y y'] for Cov(y)."""
-        return self.update.correct(prior, signal._replace(covariance=signal.second), channel, present)
-
-
-def cubature_points(mean: jax.Array, covariance: jax.Array) -> jax.Array:
-    """mean +- sqrt(n) L e_j, (2 n, n)."""
-    offsets = jnp.sqrt(float(len(mean))) * cholesky(covariance).T
-    return jnp.concatenate([mean + offsets, mean - offsets])
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+        """Take E[y y'] for Cov(y): E y (E y)' is one more column of its noise."""
+        noise = joined(signal.noise, Columns(signal.mean[:, None], jnp.ones(1)))
+        return self.update.condition(signal._replace(noise=noise), channel, innovation)
 
 
 class Propagated(NamedTuple):
-    """A belief, and the points (2 n, n) that were moved to predict it."""
+    """A belief, and half the differences and the means (n, n) of the pairs of points that were moved to predict it."""
 
     mean: jax.Array
-    covariance: jax.Array
-    points: jax.Array
+    lower: jax.Array
+    variances: jax.Array
+    ahead: jax.Array
+    behind: jax.Array
+
+    @property
+    def belief(self) -> Gaussian:
+        """The state given the data."""
+        return Gaussian(*self[:3])
 
 
 class MixedCross(AbstractFilter):
@@ -113,32 +112,38 @@ class MixedCross(AbstractFilter):
     def init(self) -> Propagated:
         """The prior."""
         start = self.base.init()
-        return Propagated(*start, jnp.zeros((2 * len(start.mean), len(start.mean))))
+        none = jnp.zeros((len(start.mean), len(start.mean)))
+        return Propagated(*start, none, none)
 
     @predicts
     def predict(self, state: Propagated, u: ArrayLike = (), k: Step = 0) -> Propagated:
         """Move the points, and keep them."""
-        plant, (mean, covariance, _) = at(self.base.plant, k), state
-        points = jax.vmap(lambda x: plant.transition(x, jnp.asarray(u)))(cubature_points(mean, covariance))
-        return Propagated(*self.base.predict(Belief(mean, covariance), u, k), points)
+        plant, x = at(self.base.plant, k), state.belief
+        moved = at_points(lambda x: plant.transition(x, jnp.asarray(u)), x, square_root(len(x.mean) * x.variances))
+        return Propagated(*self.base.predict(x, u, k), *moved)
 
     @corrects
     def correct(self, state: Propagated, z: ArrayLike, k: Step = 0) -> tuple[Propagated, Innovation]:
         """Redraw for y only, correct."""
-        sensor, channel = at(self.base.sensor, k), at(self.base.channel, k)
-        prior = Belief(state.mean, state.covariance)
-        y = jax.vmap(sensor.measure)(cubature_points(*prior))
-        mean, count = y.mean(axis=0), len(y)
-        spread = (y - mean).T @ (y - mean) / count + sensor.noise.covariance
-        cross = (state.points - prior.mean).T @ (y - mean) / count
-        signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
-        size = initial_size(self.base)
-        after, innovation = corrected(prior, signal, channel, self.base.rule, jnp.asarray(z), size)
-        return Propagated(*after, state.points), innovation
+        sensor, channel, x = at(self.base.sensor, k), at(self.base.channel, k), state.belief
+        ahead, behind = at_points(sensor.measure, x, square_root(len(x.mean) * x.variances))
+        y = jnp.concatenate([ahead, behind], axis=1)
+        points = jnp.concatenate([state.ahead, state.behind], axis=1)
+        mean, count = jnp.mean(y, axis=1), y.shape[1]
+        apart = y - mean[:, None]
+        spread = apart @ apart.T / count + sensor.noise.covariance
+        cross = (points - x.mean[:, None]) @ apart.T / count
+        # What of Cov y is not by these slopes may be less than nothing: the reading is of no joint law.
+        slopes = decorrelated(x.root, cross).T * reciprocal(x.variances)
+        weights, vectors = eigh(spread - (slopes * x.variances) @ slopes.T)
+        second = spread + jnp.outer(mean, mean)
+        signal = Signal(x, mean, slopes, Columns(vectors, weights), second, jnp.diagonal(second))
+        after, innovation = corrected(signal, channel, self.base.rule, jnp.asarray(z))
+        return Propagated(*after, state.ahead, state.behind), innovation
 
     def estimate(self, state: Propagated) -> Estimate:
         """The belief."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        return Estimate(state.mean, state.belief.covariance, self.claim)
 
 
 def variants(s: Scenario, node: int) -> dict[str, AbstractFilter]:

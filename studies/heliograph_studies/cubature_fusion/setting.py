@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.gaussian.correction import Signal, as_array, as_scalars, young_correction
+from heliograph.factors.gaussian import Gaussian
+from heliograph.filters.gaussian.bounds import as_array, as_scalars, observe_by_young
 from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.signal import Signal
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.gaussian.update import AbstractUpdate, interval_description
 from heliograph.numerics.check import check_count
@@ -44,11 +46,9 @@ class LooseInterval(AbstractUpdate):
         """Young's bound, as for a polytope."""
         return hg.filters.Polytope(as_scalars(self.scalars))
 
-    def correct(
-        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return young_correction(prior, signal, channel, present, self.scalars)
+        return observe_by_young(signal, channel, innovation, self.scalars)
 
 
 Transition = Callable[[jax.Array, object], jax.Array]

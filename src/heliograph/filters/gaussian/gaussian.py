@@ -95,7 +95,7 @@ def corrected(
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
     value, present = z - expected, ~jnp.isnan(z)
-    after = rule.update(unknown, channel, value)
+    after = rule.condition(unknown, channel, value)
     _, nominal = observe_received(unknown, channel, value)
     covariance = jnp.where(present[:, None] & present, innovation_covariance(unknown, channel), jnp.nan)
     return after, Innovation(value, covariance, nominal.log_density(present, jnp.abs(z) + jnp.abs(expected)))

@@ -58,7 +58,7 @@ class AbstractUpdate(Module):
     ) -> tuple[jax.Array, jax.Array]:
         """Gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero.
 
-        A rule of your own gives this; those of the library give `update`, from which it follows.
+        A rule of your own gives this; those of the library give `condition`, from which it follows.
 
         Args:
             prior: covariance (n, n) of the state before the update, `signal.prior`.
@@ -66,17 +66,17 @@ class AbstractUpdate(Module):
             channel: what `describe` returned.
             present: which components of z arrived (m,).
         """
-        if type(self).update is AbstractUpdate.update:
+        if type(self).condition is AbstractUpdate.condition:
             raise unwritten(self, "correct")
 
         def moved(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
-            after = self.update(signal, channel, jnp.where(present, innovation, jnp.nan))
+            after = self.condition(signal, channel, jnp.where(present, innovation, jnp.nan))
             return jnp.asarray(after.mean), after
 
         gain, after = jax.jacfwd(moved, has_aux=True)(jnp.zeros(len(present)))
         return gain, jnp.asarray(after.covariance)
 
-    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Condition `signal.prior` on z - E z (m,), NaN where a component did not arrive; by default from `correct`."""
         prior, present = signal.prior, ~jnp.isnan(innovation)
         gain, bound = self.correct(prior.covariance, signal, channel, present)
@@ -114,7 +114,7 @@ class Polytope(AbstractUpdate):
     def __init__(self, scalars: Scalars | None = None):
         self.scalars = as_array(scalars)
 
-    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
         return observe_by_young(signal, channel, innovation, self.scalars)
 
@@ -148,7 +148,7 @@ class ZeroMean(AbstractUpdate):
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
 
-    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Minimise the trace over K, and over beta unless it is fixed."""
         return observe_by_zero_mean(signal, channel, innovation, self.scalar)
 
@@ -186,7 +186,7 @@ class Interval(AbstractUpdate):
         """Young's bound, as for a polytope."""
         return Polytope(as_scalars(self.scalars))
 
-    def update(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
         return observe_by_young(signal, channel, innovation, self.scalars)
 
