@@ -38,8 +38,9 @@ FILTER = {
 
 import jax.numpy as jnp
 
+from heliograph.factors.columns import Columns, columns_of, joined
+from heliograph.factors.gaussian import given, move, of_columns
 from heliograph.filters.base import AbstractSizedFilter, corrects, predicts, sized
-from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.float64 import in_float64
@@ -54,22 +55,23 @@ class FixedGainFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self):
-        return Gaussian(jnp.asarray(self.plant.initial_mean), jnp.asarray(self.plant.initial_covariance))
+        return given(self.plant.initial_mean, self.plant.initial_covariance)
 
     @predicts
     def predict(self, state, u=(), k=0):
-        a = self.plant.transition_matrix(jnp.asarray(u))
-        noise = self.plant.noise_covariance(jnp.asarray(u))
-        return Gaussian(a @ state.mean + self.plant.shift(jnp.asarray(u)), a @ state.covariance @ a.T + noise)
+        u = jnp.asarray(u)
+        noise = columns_of(self.plant.noise_covariance(u))
+        return move(state, self.plant.transition_matrix(u), self.plant.shift(u), noise)
 
     @corrects
     def correct(self, state, z, k=0):
-        z, c, r = jnp.asarray(z), jnp.asarray(self.sensor.matrix), jnp.asarray(self.sensor.noise.covariance)
+        z, c, noise = jnp.asarray(z), jnp.asarray(self.sensor.matrix), self.sensor.noise.columns
         gain, expected = jnp.where(jnp.isnan(z), 0.0, self.gain), c @ state.mean
-        keep = jnp.eye(len(state.mean)) - gain @ c
-        after = keep @ state.covariance @ keep.T + gain @ r @ gain.T
         mean = state.mean + gain @ jnp.where(jnp.isnan(z), 0.0, z - expected)
-        return Gaussian(mean, after), gaussian_innovation(z, expected, c @ state.covariance @ c.T + r)
+        kept = Columns(state.root - gain @ c @ state.root, state.variances)
+        total = joined(Columns(c @ state.root, state.variances), noise).covariance
+        after = of_columns(mean, joined(kept, noise.through(gain)))
+        return after, gaussian_innovation(z, expected, total)
 
     def estimate(self, state):
         return Estimate(state.mean, state.covariance, self.claim)
