@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.traced import library
@@ -63,12 +64,22 @@ def unit_lower(entries: Array) -> Any:
     place[np.tril_indices(n, -1)] = np.arange(count)
     np.fill_diagonal(place, count + 1)
     ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
-    return xp.concatenate([entries, ends], axis=-1)[..., place]
+    whole = xp.concatenate([entries, ends], axis=-1)
+    return whole[..., place] if xp is np else _taken(whole, place)
 
 
 def below_diagonal(lower: jax.Array) -> jax.Array:
     """Entries of L below its diagonal, row by row: the inverse of `unit_lower`."""
-    return lower[np.tril_indices(lower.shape[-1], -1)]
+    n = lower.shape[-1]
+    return _taken(lax.reshape(lower, (n * n,)), np.flatnonzero(np.tri(n, k=-1)))
+
+
+def _taken(entries: jax.Array, places: np.ndarray) -> jax.Array:
+    """Entries of the last axis at known places."""
+    axis = entries.ndim - 1
+    numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
+    sizes = (*entries.shape[:-1], 1)
+    return lax.gather(entries, places[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
 
 
 def inverse(x: jax.Array) -> jax.Array:
@@ -101,13 +112,13 @@ def triangular(columns: Columns) -> Columns:
         return _long_triangular(rows, weights)
     n, lower, variances = len(rows), [], []
     for j in range(n):
-        first, rows = rows[0], rows[1:]
-        weighted = weights * first
-        variances.append(first @ weighted)
-        share = outer(rows @ weighted, inverse(variances[j])[None])[:, 0]
-        rows = rows - outer(share, first)
-        lower.append(_column(share, n))
-    return Columns(_matrix(lower), _vector(variances))
+        row = lax.index_in_dim(rows, j, keepdims=False)
+        weighted = weights * row
+        variances.append(lax.dot(row, weighted))
+        share = _below(j, outer(lax.dot(rows, weighted), lax.reshape(inverse(variances[j]), (1,))))
+        rows = rows - outer(share, row)
+        lower.append(share)
+    return _factors(lower, variances, rows.dtype)
 
 
 def eliminated(covariance: jax.Array, least: float = 0.0) -> Columns:
@@ -118,13 +129,14 @@ def eliminated(covariance: jax.Array, least: float = 0.0) -> Columns:
     """
     if len(covariance) > WRITTEN:
         return _long_eliminated(covariance, least)
-    n, whole, rest, lower, variances = len(covariance), jnp.diagonal(covariance), covariance, [], []
+    n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
-        variances.append(_at_least(rest[0, 0], least * whole[j]))
-        share = outer(rest[1:, 0], reciprocal(variances[j])[None])[:, 0]
-        rest = symmetric(rest[1:, 1:] - outer(share, rest[0, 1:]))
-        lower.append(_column(share, n))
-    return Columns(_matrix(lower), _vector(variances))
+        column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
+        variances.append(_at_least(column[j], least * covariance[j, j]))
+        share = _below(j, outer(column, lax.reshape(reciprocal(variances[j]), (1,))))
+        rest = symmetric(rest - outer(share, column))
+        lower.append(share)
+    return _factors(lower, variances, covariance.dtype)
 
 
 def decorrelated(lower: jax.Array, rows: jax.Array) -> jax.Array:
@@ -175,7 +187,7 @@ def rounding_of(seconds: Array) -> Columns:
 
 def outer(a: jax.Array, b: jax.Array) -> jax.Array:
     """a b' as a matrix product."""
-    return a[:, None] @ b[None, :]
+    return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
 
 
 def _at_least(pivot: jax.Array, floor: jax.Array) -> jax.Array:
@@ -183,19 +195,19 @@ def _at_least(pivot: jax.Array, floor: jax.Array) -> jax.Array:
     return jnp.where(pivot >= floor, pivot, floor)
 
 
-def _column(share: jax.Array, n: int) -> jax.Array:
-    """Column of L of its entries below the diagonal."""
-    ends = np.zeros(n - len(share))
-    ends[-1] = 1.0
-    return jnp.concatenate([jnp.asarray(ends, share.dtype), share])
+def _below(j: int, column: jax.Array) -> jax.Array:
+    """Column j of L without its diagonal: the entries below it, zeros above."""
+    n = len(column)
+    return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
 
 
-def _matrix(columns: list[jax.Array]) -> jax.Array:
-    return jnp.stack(columns, axis=1) if columns else jnp.zeros((0, 0))
-
-
-def _vector(entries: list[jax.Array]) -> jax.Array:
-    return jnp.stack(entries) if entries else jnp.zeros(0)
+def _factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> Columns:
+    """L and d of their columns below the diagonal and their entries."""
+    n = len(variances)
+    if not n:
+        return Columns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
+    below = lax.concatenate([lax.expand_dims(column, (1,)) for column in lower], 1)
+    return Columns(below + np.eye(n, dtype=dtype), lax.concatenate([lax.reshape(d, (1,)) for d in variances], 0))
 
 
 def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
@@ -210,7 +222,7 @@ def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
         return rows - jnp.outer(share, rows[j]), lower.at[:, j].add(share), variances.at[j].set(d)
 
     start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
-    _, lower, variances = jax.lax.fori_loop(0, n, body, start)
+    _, lower, variances = lax.fori_loop(0, n, body, start)
     return Columns(lower, variances)
 
 
@@ -225,5 +237,5 @@ def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
         return rest - jnp.outer(share, rest[j]), lower.at[:, j].add(share), variances.at[j].set(d)
 
     start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
-    _, lower, variances = jax.lax.fori_loop(0, n, body, start)
+    _, lower, variances = lax.fori_loop(0, n, body, start)
     return Columns(lower, variances)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from heliograph.factors.columns import (
     Columns,
@@ -168,15 +169,19 @@ def _measured(
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), Section V.3, its order reversed
     since L is lower.
     """
-    lower = np.tril(np.ones(root.shape, bool))
+    n, lower = len(d), np.tril(np.ones(root.shape, bool))
     product = d * f
-    s = jax.lax.cumsum(jnp.append(noise, (f * product)[::-1]))[::-1]  # s_0, ..., s_n = r
-    w = jax.lax.cumsum(jnp.where(lower, root * product, 0.0), axis=1, reverse=True)
+    s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(f * product, (0,))], 0)), (0,))
+    w = lax.cumsum(lax.select(lower, root * product, jnp.zeros_like(root)), axis=1, reverse=True)
     over = inverse(s)  # where s is 0, so is what it divides
-    left = jnp.where(lower[:, 1:], w[:, 1:] * (f * over[1:])[:-1], 0.0)
-    after = root - jnp.pad(left, ((0, 0), (0, 1)))
-    kept = jnp.where(s[:-1] > 0, d * (s[1:] * over[:-1]), d)
-    return after, kept, w[:, 0] * over[0], s[0]
+    here, next_ = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
+    over_here, over_next = lax.slice_in_dim(over, 0, n), lax.slice_in_dim(over, 1, n + 1)
+    # w_{j+1} in the place of w_j, of the rows below: what is above the diagonal of L stays zero.
+    later = lax.pad(lax.slice_in_dim(w, 1, n, axis=1), jnp.zeros((), w.dtype), [(0, 0, 0), (0, 1, 0)])
+    strictly = np.concatenate([lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
+    after = root - lax.select(strictly, later * (f * over_next), jnp.zeros_like(root))
+    kept = lax.select(here > 0, d * (next_ * over_here), d)
+    return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False) * over[0], s[0]
 
 
 def merge(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:

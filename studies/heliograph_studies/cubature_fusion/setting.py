@@ -46,9 +46,9 @@ class LooseInterval(AbstractUpdate):
         """Young's bound, as for a polytope."""
         return hg.filters.Polytope(as_scalars(self.scalars))
 
-    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return observe_by_young(signal, channel, innovation, self.scalars)
+        return observe_by_young(signal, channel, innovation, self.scalars) if channel.uncertain else nominal
 
 
 Transition = Callable[[jax.Array, object], jax.Array]

@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.factors.columns import Columns, decorrelated, eliminated, joined, reciprocal, triangular
 from heliograph.factors.gaussian import Gaussian, observe, of_sum
 from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
-from heliograph.filters.gaussian.signal import LOST, Signal, homogeneous, observe_received
+from heliograph.filters.gaussian.signal import LOST, Signal, homogeneous
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
@@ -67,8 +67,6 @@ def observe_by_young(signal: Signal, channel: SecondOrder, innovation: jax.Array
     update makes of the prior (1 + b1) P and, of z, of the noise (1 + b1)^2 [base + (1/b1 + 1/b2) shift +
     (1 + b2) M R M'] + (1 + b1) ((1 + b1)(1 + b2) - 1) M H P H' M', positive terms; its gain is K / (1 + b1).
     """
-    if not channel.uncertain:
-        return observe_received(signal, channel, innovation)[0]
     prior, present = signal.prior, ~jnp.isnan(innovation)
     slopes, of_state, of_noise = _received(signal, channel, present)
     w = homogeneous(signal.second, signal.mean, 1.0)
@@ -91,8 +89,6 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, innovation: jax.A
     Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta is at least M H P H' M', so that the rest is a noise;
     beta times what the received components explain of P, C Pyy^+ C', is added.
     """
-    if not channel.uncertain:  # power(Pyy) = M Pyy M' + spread(Pyy): no other than Young's
-        return observe_received(signal, channel, innovation)[0]
     prior, present = signal.prior, ~jnp.isnan(innovation)
     slopes, of_state, _ = _received(signal, channel, present)
     # E[y y'] divided: yhat yhat' is known, Cov y is not.

@@ -4,7 +4,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.columns import Columns, joined
+from heliograph.factors.gaussian import Gaussian, observe
 from heliograph.filters.base import (
     AbstractFilter,
     FilterAngles,
@@ -14,7 +15,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
 from heliograph.filters.gaussian.precise import state_rounding
-from heliograph.filters.gaussian.signal import Signal, innovation_covariance, observe_received, signal_of
+from heliograph.filters.gaussian.signal import Signal, received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan
@@ -95,10 +96,13 @@ def corrected(
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
     value, present = z - expected, ~jnp.isnan(z)
-    after = rule.condition(unknown, channel, value)
-    _, nominal = observe_received(unknown, channel, value)
-    covariance = jnp.where(present[:, None] & present, innovation_covariance(unknown, channel), jnp.nan)
-    return after, Innovation(value, covariance, nominal.log_density(present, jnp.abs(z) + jnp.abs(expected)))
+    # By the nominal law: the best update of a known one.
+    slopes, noise = jnp.asarray(channel.mean_gain) @ unknown.slopes, received_noise(unknown, channel)
+    nominal, innovations = observe(unknown.prior, slopes, value, noise)
+    total = joined(Columns(slopes, unknown.prior.variances), noise).covariance
+    density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
+    after = rule.condition(unknown, channel, value, nominal)
+    return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
