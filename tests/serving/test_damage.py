@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from heliograph.live.carrier import Carrier
 from heliograph.numerics.check import InputError
 from heliograph.serving.running import report_damage
 from heliograph.serving.service import Service
-from heliograph.serving.storage.carrier import Carrier
 from heliograph.serving.storage.store import LAYOUT, Store
 from heliograph.serving.storage.store_protocol import Damage, identity
 from tests.serving.worlds import fleet, lines, messages, stepping

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.live.carrier import Carrier
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
 from heliograph.live.plant_codec import plant_from
 from heliograph.serving.service import Service
-from heliograph.serving.storage.carrier import Carrier
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
 from tests.serving.worlds import fleet as world

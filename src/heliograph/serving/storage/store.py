@@ -25,14 +25,15 @@ from sqlalchemy import (
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
+from heliograph.live.carrier import DESCRIPTION, LISTED, Carrier, changes
 from heliograph.live.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
-from heliograph.serving.storage.carrier import DESCRIPTION, LISTED, Carrier, changes
 from heliograph.serving.storage.database import engine_at, is_away
 from heliograph.serving.storage.store_protocol import AwayError, ConflictError, Damage, Entry, StoredPlant
 
-LAYOUT = "3"  # of these tables; those of layout 1 had no checksums, of 2 no description of the network
+# Of these tables: those of layout 1 had no checksums, of 2 no description of the network, of 3 covariances in states.
+LAYOUT, CARRIED = "4", ("3", "4")  # that of now, and those whose plants can be carried over
 LAYOUT_KEY = "layout of the store"
 TABLES = MetaData()
 PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
@@ -113,7 +114,7 @@ class Store:
         try:
             with self._saying("a database that can be written"):
                 self.identity = self._stored_identity(mine)
-                self._check_layout()
+                self._check_layout(carrier is not None or mine is None)
                 # The network must be the same, unless its plants are carried over or any will do.
                 if carrier is None and mine is not None:
                     self._check_network(mine)
@@ -125,7 +126,7 @@ class Store:
             raise
         except InputError as error:
             self.close()
-            fits = carrier is None and self.identity.get(LAYOUT_KEY) == LAYOUT
+            fits = carrier is None and self.identity.get(LAYOUT_KEY) in CARRIED
             more = "; --accept-changes goes on with what fits" if fits else ""
             raise InputError(f"{error}; to begin anew, name another{more}") from None
 
@@ -181,12 +182,14 @@ class Store:
             raise self._broken("no network that it is of") from None
         return {LAYOUT_KEY: "1"} | identity
 
-    def _check_layout(self) -> None:
-        """Refuse a store of an older release, which does not say where the state of each filter stands in its rows."""
+    def _check_layout(self, carried: bool) -> None:
+        """Refuse a store of an older layout, which is carried over only if the user says so and it can be."""
         layout, release = self.identity.get(LAYOUT_KEY), self.identity.get("heliograph", "an unknown release")
-        if layout != LAYOUT:
-            raise fail(f"store {self.name}", f"layout {LAYOUT}, of heliograph {versions()['heliograph']}",
-                       f"layout {layout}, of heliograph {release}, whose plants cannot be carried over")  # fmt: skip
+        if layout == LAYOUT or (carried and layout in CARRIED):
+            return
+        why = "" if layout in CARRIED else ", whose plants cannot be carried over"
+        raise fail(f"store {self.name}", f"layout {LAYOUT}, of heliograph {versions()['heliograph']}",
+                   f"layout {layout}, of heliograph {release}{why}")  # fmt: skip
 
     def _damaged(self) -> dict[str, Damage]:
         """Return the plants with damaged rows, by name."""

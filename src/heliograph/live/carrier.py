@@ -2,12 +2,15 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import count
+from math import prod
 from typing import Any
 
 import jax
 import numpy as np
 
 from heliograph.live.fleet import Fleet
+from heliograph.live.layout import fits, moved, parts_of, placed, with_covariances
 from heliograph.live.plant_codec import PlantParts, plant_bytes, plant_from
 from heliograph.live.rows import BEFORE
 from heliograph.live.snapshot import Identity
@@ -21,18 +24,24 @@ LISTED = 4  # entries of an array that are named
 SAME = ("precision", "states", "inputs")  # what the rows of a plant mean
 
 
-def description(fleet: Fleet) -> str:
-    """Return the numbers of a network by name, and where the state of each filter stands in a row, as JSON."""
+def description(fleet: Fleet, covariances: bool = False) -> str:
+    """Return the numbers of a network by name, and where the state of each filter stands in a row, as JSON.
+
+    Args:
+        fleet: the plants of the network.
+        covariances: whether its rows are of a version before 0.3.0, in which states held covariances.
+    """
     network = fleet.network
     parts: dict[str, PyTree] = {"plant": network.plant}
     parts |= {f"node {name!r}": node for name, node in network.nodes.items()}
     parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
+    filters, size = _filter_columns(fleet, covariances)
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
         "given": fleet.lanes.given,
-        "state": fleet.pool.step_rows.state.size,
+        "state": size,
         "outputs": fleet.pool.step_rows.outputs.size,
-        "filters": _filter_columns(fleet),
+        "filters": filters,
     }
     return json.dumps({"values": {name: _values(tree) for name, tree in parts.items()}, "layout": layout})
 
@@ -47,37 +56,48 @@ def _values(tree: PyTree) -> dict[str, object]:
     return results
 
 
-def _filter_columns(fleet: Fleet) -> dict[str, dict[str, list[Any]]]:
-    """Return the columns of each filter's state by its name: of each leaf its shape, and its columns' begin and end."""
-    network, flat = fleet.network, fleet.pool.step_rows.state
-    numbered = flat.tree(np.arange(float(flat.size)))
-    by_kind, central, *rest = numbered
+def _filter_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str, list[Any]]], int]:
+    """Return the columns of each filter's state by its name, and how many there are.
+
+    Of each leaf its shape, and its columns' begin and end.
+    """
+    network, flat, free = fleet.network, fleet.pool.step_rows.state, count()
+    by_kind, central, *rest = flat.tree(np.zeros(flat.size))
     results: dict[str, dict[str, list[Any]]] = {}
 
-    def note(name: str, path: object, columns: np.ndarray) -> None:
+    def columns(state: PyTree) -> dict[str, np.ndarray]:
+        """Number the next columns, by the path of each leaf."""
+        shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in parts_of(state).items()}
+        shapes = with_covariances(shapes) if covariances else shapes
+        return {
+            path: np.array([next(free) for _ in range(prod(shape))]).reshape(shape) for path, shape in shapes.items()
+        }
+
+    def note(name: str, path: str, columns: np.ndarray) -> None:
         begin = int(columns.flat[0]) if columns.size else 0
-        results.setdefault(name, {})[jax.tree_util.keystr(path)] = [list(columns.shape), begin, begin + columns.size]  # type: ignore[arg-type]  # a path
+        results.setdefault(name, {})[path] = [list(columns.shape), begin, begin + columns.size]
 
     # Filters of nodes stand by kind, (filter x node, ...); central ones by name.
     for (group, filters), state in zip(network.kinds, by_kind, strict=True):
         names = [f"{node}/{name}" for name in filters for node in network.groups[group]]
-        for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
-            for name, columns in zip(names, np.asarray(leaf), strict=True):
-                note(name, path, np.asarray(columns))
-    for name, state in central.items():
-        for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
-            note(f"{FUSED}/{name}", path, np.asarray(leaf))
+        for path, leaf in columns(state).items():
+            for name, own in zip(names, leaf, strict=True):
+                note(name, path, np.asarray(own))
+    for name, state in sorted(central.items()):
+        for path, leaf in columns(state).items():
+            note(f"{FUSED}/{name}", path, leaf)
     # What centres and neighbours remember goes on only if the nodes are the same.
-    for path, leaf in jax.tree_util.tree_flatten_with_path(rest)[0]:
-        note(f"memory of the fusions of {', '.join(network.names)}", path, np.asarray(leaf))
-    return results
+    for path, leaf in columns(rest).items():
+        note(f"memory of the fusions of {', '.join(network.names)}", path, leaf)
+    return results, next(free)
 
 
 class Carrier:
     """State of one network's stored plants, as that of another network.
 
-    A filter goes on with its state where all parts of this have the shape that they had; others begin with the
-    network's initial law. Rows that may still change are stepped again, with the new numbers.
+    A filter goes on with its state where all parts of this have the shape that they had, or are factors of a covariance
+    that was there; others begin with the network's initial law. Rows that may still change are stepped again, with the
+    new numbers.
 
     Args:
         fleet: the plants of the network as it is now.
@@ -101,6 +121,7 @@ class Carrier:
                 raise fail(what, expected, repr(self.mine.get(name)))
         try:
             self._old = json.loads(other[DESCRIPTION])["layout"]
+            self._old["filters"] = placed(self._old["filters"])
             lines = changes(self.mine, other)
         except (KeyError, ValueError, TypeError):
             raise fail(what, "a description of the network that it is of", "none") from None
@@ -110,8 +131,10 @@ class Carrier:
             self._say(f"{what}: {line}")
 
     def _goes_on(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
-        shapes = [{path: leaf[0] for path, leaf in side.get(name, {}).items()} for side in (self._old["filters"], new)]
-        return shapes[0] == shapes[1]
+        old, here = (
+            {path: leaf[0] for path, leaf in side.get(name, {}).items()} for side in (self._old["filters"], new)
+        )
+        return fits(old, here)
 
     def carried(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
         """Return plants, by name, as this network stores them."""
@@ -142,7 +165,7 @@ class Carrier:
         ]
         rows = [rows[0], *sorted(rows[1:])]
         number = {row[-1]: i for i, row in enumerate(rows)}
-        table = np.stack([self._row(parts.table[row[-1]], new_index, names) for row in rows])
+        table = self._rows(parts.table[[row[-1] for row in rows]], new_index, names)
         assert table.shape[1] == self.fleet.pool.table.shape[1]
         # Events, in the order of their rows.
         ends = np.cumsum([self._size(names, int(node)) for _, node, _ in parts.events])
@@ -165,30 +188,32 @@ class Carrier:
     def _size(self, names: Sequence[str], node: int) -> int:
         return int(self._old["given"] if node < 0 else self._old["nodes"][names[node]])
 
-    def _row(self, row: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
-        """Return a row of the table with this network's columns."""
+    def _rows(self, table: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
+        """Return rows of the table with this network's columns."""
         old, pool, lanes = self._old, self.fleet.pool, self.fleet.lanes
         given, state = old["given"], old["state"]
-        translated = np.zeros(pool.table.shape[1])
+        translated = np.zeros((len(table), pool.table.shape[1]))
         # The state: of filters that go on their own, of others the start.
-        translated[pool.state] = pool.step_rows.start
+        translated[:, pool.state] = pool.step_rows.start
         filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
-        for name in filters:
+        for name, new in filters.items():
             if self._goes_on(name, filters):
-                for path, (_, begin, end) in filters[name].items():
-                    _, first, last = old["filters"][name][path]
-                    translated[begin:end] = row[first:last]
+                parts = {path: table[:, begin:end].reshape(len(table), *shape)
+                         for path, (shape, begin, end) in old["filters"][name].items()}  # fmt: skip
+                for path, part in moved(parts, new).items():
+                    _, begin, end = new[path]
+                    translated[:, begin:end] = part.reshape(len(table), -1) if end > begin else 0.0
         # Inputs held and step number, then measurements by node, inputs and time.
         after = state + old["outputs"]
-        translated[pool.held], translated[pool.at] = row[after : after + given], row[after + given]
-        numbers, received = translated[pool.numbers], row[after + given + 1 :]
+        translated[:, pool.held], translated[:, pool.at] = table[:, after : after + given], table[:, [after + given]]
+        numbers, received = translated[:, pool.numbers], table[:, after + given + 1 :]
         numbers[:] = np.nan
-        numbers[lanes.received :] = received[len(received) - given - 1 :]
+        numbers[:, lanes.received :] = received[:, received.shape[1] - given - 1 :]
         starts = np.cumsum([0, *old["nodes"].values()])
         here = np.cumsum([0, *(self.fleet.network.nodes[name].received for name in self.fleet.network.names)])
         for i, j in new_index.items():
             if i >= 0:
-                numbers[here[j] : here[j + 1]] = received[starts[i] : starts[i + 1]]
+                numbers[:, here[j] : here[j + 1]] = received[:, starts[i] : starts[i + 1]]
         return translated
 
 
@@ -201,14 +226,17 @@ def changes(mine: Identity, other: Identity) -> list[str]:
         and not name.startswith("numbers of ")
         and name not in (DESCRIPTION, "what is computed", "layout of the store")
     ]
-    # Numbers of the parts that are in both; of long arrays only a hash is known, and of functions the program.
+    # Numbers of the parts that are in both; of long arrays only a hash is known, and of functions the program. What
+    # only one of two versions keeps is derived from the others.
     here, there = (json.loads(identity[DESCRIPTION])["values"] for identity in (mine, other))
+    same = mine.get("heliograph") == other.get("heliograph")
     for name in here:
         if name in there:
             lines += [
                 f"{name}{path}: {line}"
                 for path in {**there[name], **here[name]}
                 if not path.endswith(".factor")  # of a covariance, which is there too
+                and (same or path in there[name].keys() & here[name].keys())
                 for line in _changed(there[name].get(path), here[name].get(path))
             ]
             if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):

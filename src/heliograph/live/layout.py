@@ -1,0 +1,120 @@
+"""Layouts of stored states: shapes by the path of each part, and covariances of older ones as the factors of now.
+
+Until version 0.3.0 a filter's state held a covariance, `.covariance` (..., n, n), where it holds `.lower` and
+`.variances` now. Nothing else has moved.
+"""
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from heliograph.factors.columns import below_diagonal, eliminated
+from heliograph.numerics.types import PyTree
+
+COVARIANCE, LOWER, VARIANCES = ".covariance", ".lower", ".variances"
+AT_ONCE = 64  # matrices that one program takes
+
+Shapes = Mapping[str, Sequence[int]]  # of a state's parts, by their paths
+Columns = Mapping[str, Mapping[str, Sequence[Any]]]  # by filter and path a part's shape, and its columns' begin and end
+
+
+def parts_of(state: PyTree) -> dict[str, np.ndarray]:
+    """Return the parts of a state by the path of their attributes, in their order."""
+    return {
+        jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]
+    }
+
+
+def fits(old: Shapes, new: Shapes) -> bool:
+    """Return whether a state of the layout `old` can be read as one of `new`: all shapes are there, or covariances."""
+    shapes = {path: list(shape) for path, shape in old.items()}
+    for stem in _factored(old, new):
+        *lead, n, _ = shapes.pop(stem + COVARIANCE)
+        shapes |= {stem + LOWER: [*lead, n * (n - 1) // 2], stem + VARIANCES: [*lead, n]}
+    return shapes == {path: list(shape) for path, shape in new.items()}
+
+
+def moved(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
+    results, new = dict(parts), list(new)
+    for stem in _factored(parts, new):
+        results[stem + LOWER], results[stem + VARIANCES] = factors(results.pop(stem + COVARIANCE))
+    return {path: results[path] for path in new}
+
+
+def with_covariances(new: Shapes) -> dict[str, list[int]]:
+    """Return the layout that a state of the layout `new` had until version 0.3.0, in its order."""
+    results: dict[str, list[int]] = {}
+    for path, shape in new.items():
+        stem = path.removesuffix(VARIANCES)
+        if path.endswith(VARIANCES) and results.pop(stem + LOWER, None) is not None:
+            results[stem + COVARIANCE] = [*shape, shape[-1]]
+        else:
+            results[path] = list(shape)
+    return results
+
+
+def placed(filters: Columns) -> dict[str, dict[str, list[Any]]]:
+    """Return the columns of a row's states with each flag in its place, for which versions before 0.3.0 noted 0 or 1.
+
+    The parts of a filter stand in their order, and the same part of filters that share a program side by side: so flags
+    stand where nothing else does, in the order of the parts before them.
+    """
+    results = {name: {path: list(part) for path, part in parts.items()} for name, parts in filters.items()}
+    lost: list[tuple[int, list[Any], list[list[Any]]]] = []  # end of the part before, the flag, and what comes after it
+    taken: set[int] = set()
+
+    def follow(parts: list[list[Any]], end: int) -> None:
+        """Take the columns of parts in their order, up to one that stands where an earlier one does, or before it."""
+        for i, part in enumerate(parts):
+            if part[2] > part[1] and (part[1] < end or (not end and part[1] in taken)):
+                end = end or sys.maxsize  # the memory of fusions, which stands behind all filters
+                lost.append((end, part, parts[i + 1 :]))
+                taken.update(*(range(*after[1:]) for after in parts[i + 1 :] if after[1] >= end))
+                return
+            taken.update(range(*part[1:]))
+            end = max(end, part[2])
+
+    for columns in results.values():
+        follow(list(columns.values()), 0)
+    while lost:
+        first = min(lost, key=lambda item: item[0])
+        lost.remove(first)
+        _, part, after = first
+        begin = next(i for i in range(len(taken) + 1) if i not in taken)
+        part[1:] = begin, begin + part[2] - part[1]
+        follow([part, *after], begin)
+    return results
+
+
+def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return lower (..., n (n - 1) / 2) and variances (..., n) of covariances (..., n, n) that a filter computed."""
+    *lead, n, _ = covariance.shape
+    flat = covariance.reshape(-1, n, n)
+    padded = np.zeros((-(-len(flat) // AT_ONCE) * AT_ONCE, n, n))
+    padded[: len(flat)] = flat
+    lower, variances = np.zeros((len(padded), n * (n - 1) // 2)), np.zeros((len(padded), n))
+    with jax.enable_x64(True):
+        for i in range(0, len(padded), AT_ONCE):
+            block = _given(padded[i : i + AT_ONCE])
+            lower[i : i + AT_ONCE], variances[i : i + AT_ONCE] = block
+    return lower[: len(flat)].reshape(*lead, lower.shape[1]), variances[: len(flat)].reshape(*lead, n)
+
+
+@jax.jit
+@jax.vmap
+def _given(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Factors of a covariance whose entries are rounded: no pivot is known to less than n eps of its variance."""
+    n = len(covariance)
+    columns = eliminated(covariance, n * float(np.finfo(covariance.dtype).eps))
+    return below_diagonal(columns.matrix), columns.weights
+
+
+def _factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
+    """Paths, without their last names, of covariances in `old` that are factors in `new` alone."""
+    before, now = set(old), set(new)
+    stems = [path.removesuffix(COVARIANCE) for path in old if path.endswith(COVARIANCE) and path not in now]
+    return [stem for stem in stems if {stem + LOWER, stem + VARIANCES} <= now - before]

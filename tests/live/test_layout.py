@@ -1,0 +1,78 @@
+"""Layouts of stored states: a covariance of an older one is read as the factors of now."""
+
+import numpy as np
+import pytest
+
+from heliograph.factors.gaussian import Gaussian
+from heliograph.live.layout import factors, fits, moved, placed, with_covariances
+
+NEW = {
+    ".mean": [2, 3],
+    ".lower": [2, 3],
+    ".variances": [2, 3],
+    ".inner.lower": [0],
+    ".inner.variances": [1],
+    ".law": [4],
+}
+OLD = {".mean": [2, 3], ".covariance": [2, 3, 3], ".inner.covariance": [1, 1], ".law": [4]}
+
+
+def test_an_older_layout_is_that_of_now_with_covariances():
+    assert with_covariances(NEW) == OLD and list(with_covariances(NEW)) == list(OLD)
+    assert fits(OLD, NEW) and fits(NEW, NEW) and fits(OLD, OLD)
+    for other in (
+        OLD | {".covariance": [2, 2, 2]},
+        OLD | {".more": []},
+        {path: shape for path, shape in OLD.items() if path != ".law"},
+        NEW | {".covariance": [2, 3, 3]},
+    ):
+        assert not fits(other, NEW)
+
+
+@pytest.mark.parametrize("count", [1, 63, 130])
+def test_factors_of_covariances_are_theirs(count):
+    """To rounding of the deviations, over sizes from 1e-6 to 1e6, of tied states too: each pivot is known to n eps."""
+    generator = np.random.default_rng(count)
+    for n in (1, 3):
+        roots = generator.normal(size=(count, n, n)) * 10.0 ** generator.uniform(-6, 6, (count, n, 1))
+        roots[0, :, 1:] = 0.0
+        covariance = roots @ np.swapaxes(roots, -1, -2)
+        lower, variances = factors(covariance.reshape(count, 1, n, n))
+        assert lower.shape == (count, 1, n * (n - 1) // 2) and variances.shape == (count, 1, n)
+        assert np.all(variances >= 0)
+        again = Gaussian(variances, lower, variances).covariance[:, 0]
+        size = np.sqrt(np.einsum("kii,kjj->kij", covariance, covariance))
+        assert np.max(np.abs(again - covariance) / size) < 4 * n * np.finfo(float).eps
+
+
+def test_parts_move_to_their_paths_of_now():
+    generator = np.random.default_rng(0)
+    parts = {path: generator.normal(size=(5, *shape)) for path, shape in OLD.items()}
+    parts[".covariance"] = parts[".covariance"] @ np.swapaxes(parts[".covariance"], -1, -2)
+    parts[".inner.covariance"] **= 2
+    results = moved(parts, NEW)
+    assert {path: list(part.shape[1:]) for path, part in results.items()} == NEW
+    np.testing.assert_array_equal(results[".law"], parts[".law"])
+    np.testing.assert_array_equal(results[".inner.variances"], parts[".inner.covariance"][..., 0])
+    whole = Gaussian(*(results[path] for path in (".mean", ".lower", ".variances"))).covariance
+    np.testing.assert_allclose(whole, parts[".covariance"], rtol=1e-12)
+
+
+def test_flags_whose_columns_were_noted_as_those_of_their_numbers_are_put_in_their_places():
+    """Two filters side by side with two flags each and an integer between, one alone with a flag last, and a memory."""
+    right = {
+        "x": {".mean": [[1], 0, 1], ".covariance": [[1, 1], 2, 3], ".on": [[], 4, 5], ".k": [[], 6, 7]},
+        "y": {".mean": [[1], 1, 2], ".covariance": [[1, 1], 3, 4], ".on": [[], 5, 6], ".k": [[], 7, 8]},
+        "z": {".mean": [[2], 12, 14], ".moved": [[], 14, 15]},
+        "memory": {"[0]": [[], 15, 16], "[1]": [[3], 16, 19]},
+    }
+    right["x"][".end"], right["y"][".end"] = [[2], 8, 10], [[2], 10, 12]
+    lost = {("x", ".on"), ("y", ".on"), ("x", ".end"), ("y", ".end"), ("z", ".moved"), ("memory", "[0]")}
+    wrong = {
+        name: {
+            path: [shape, 1, 1 + end - begin] if (name, path) in lost else [shape, begin, end]
+            for path, (shape, begin, end) in parts.items()
+        }
+        for name, parts in right.items()
+    }
+    assert placed(wrong) == right == placed(right)
