@@ -52,6 +52,8 @@ class PlantParts(NamedTuple):
                 array = np.frombuffer(data, kind, math.prod(shape), at)
                 at += array.nbytes
             arrays.append(array.reshape(shape))
+        if at != len(data):
+            raise ValueError(f"{len(data) - at} bytes more than rows of {width} numbers")
         return PlantParts(head, *arrays)
 
 

@@ -1,7 +1,7 @@
 """Snapshots: arrays in NumPy's own format under a head of JSON, and the identity of what they go on with."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from io import BytesIO
 from typing import Any
@@ -43,13 +43,21 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
     }
 
 
-def check_same(what: str, mine: Mapping[str, str], other: Mapping[str, str]) -> None:
-    """Refuse a saved state of something else, and name the difference."""
+def check_same(
+    what: str, mine: Mapping[str, str], other: Mapping[str, str], kept: Sequence[str] = (), accept: bool = False
+) -> None:
+    """Refuse a saved state of something else, and name the difference.
+
+    `kept` are the names of what must be the same where changes are accepted; where they are not, that is advised if it
+    would do.
+    """
     names = [name for name in {**mine, **other} if mine.get(name) != other.get(name)]
-    if names:
+    fits = not any(name in kept for name in names)
+    if names and not (accept and fits):
         here = "; ".join(f"{name}: {mine.get(name, 'none')}" for name in names)
         there = "; ".join(f"{name}: {other.get(name, 'none')}" for name in names)
-        raise fail(what, f"the state of what is here ({here})", f"one that differs ({there})")
+        more = "; accept_changes=True goes on with what fits" if kept and fits else ""
+        raise fail(what, f"the state of what is here ({here})", f"one that differs ({there}){more}")
 
 
 def short_name(numbers: PyTree) -> str:

@@ -12,6 +12,7 @@ from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.plausibility import in_words, why_inputs
+from heliograph.live.layout import fits, moved, parts_of, with_covariances
 from heliograph.live.program_text import text_of
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
@@ -28,6 +29,7 @@ from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.description.wide_angles import WideAngles
 
 BEYOND, RARE = 10, 1e-4  # measurements in a row, each beyond what an honest filter sees so seldom
+SAME = ("precision", "filter", "states", "inputs", "numbers received")  # what the state of a stream means
 
 
 @readable
@@ -163,6 +165,7 @@ class Stream:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""
         leaves = {f"state.{i}": leaf for i, leaf in enumerate(self._stepper.state)}
         head = {
+            "paths": list(self._placed.layout),
             "steps": self.steps,
             "dropped": self.dropped.tolist(),
             "last": self._last,
@@ -173,14 +176,40 @@ class Stream:
 
     @classmethod
     def restore(
-        cls, filter: AbstractFilter, data: bytes, limits: LimitsLike = None, invalid: ArrayLike = ()
+        cls,
+        filter: AbstractFilter,
+        data: bytes,
+        limits: LimitsLike = None,
+        invalid: ArrayLike = (),
+        accept_changes: bool = False,
     ) -> "Stream":
-        """Restore a saved stream of the same filter; `limits` and `invalid` hold from here on."""
+        """Restore a saved stream of the same filter; `limits` and `invalid` hold from here on.
+
+        Args:
+            filter: the filter of the stream.
+            data: what `save` returned.
+            limits: bounds of plausible values, as for a new stream.
+            invalid: values that mean that nothing was measured, as for a new stream.
+            accept_changes: go on with a filter of other numbers, or that another version saved, if its state has the
+                same parts; a covariance of a version before 0.3.0 becomes its factors.
+
+        Raises:
+            ValueError: no snapshot, or one of another filter or version.
+        """
         new, (head, arrays) = cls(filter, limits, invalid), unpacked(data)
-        check_same("snapshot", new._placed.identity, head.get("of", {}))
+        mine, other = new._placed.identity, head.get("of", {})
+        check_same("snapshot", mine, other, SAME, accept_changes)
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
         new._last, new._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
-        new._stepper.put([arrays[f"state.{i}"] for i in range(len(new._stepper.state))])
+        # Parts by their paths, which a version before 0.3.0 did not write.
+        layout = new._placed.layout
+        paths = head.get("paths", list(with_covariances(layout)))
+        leaves = [arrays[f"state.{i}"] for i in range(sum(name.startswith("state.") for name in arrays))]
+        old = dict(zip(paths, leaves, strict=False))
+        if len(paths) != len(leaves) or not fits({path: leaf.shape for path, leaf in old.items()}, layout):
+            expected = f"a state with the parts of {other['filter']} as it is here: {', '.join(layout)}"
+            raise fail("snapshot", expected, ", ".join(f"{path} {list(leaf.shape)}" for path, leaf in old.items()))
+        new._stepper.put(list(moved(old, layout).values()))
         return new
 
     def __getstate__(self) -> dict[str, object]:
@@ -221,6 +250,7 @@ class _Placed:
             self.numbers, self._static = cast(filter)
             self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
         self.state: PyTree = jax.tree.structure(self._start)
+        self.layout = {path: part.shape for path, part in parts_of(self._start).items()}
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
         self.estimate: PyTree = jax.tree.structure(JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, 0.0, 0))
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]

@@ -3,11 +3,13 @@
 import warnings
 from collections import deque
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from heliograph.filters.plausibility import in_words
+from heliograph.live.carrier import DESCRIPTION, SAME, Carrier, description
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import FleetAngles, Judges
@@ -250,7 +252,11 @@ class Timeline:
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
         head, arrays = self._state()
-        return packed(head | {"of": self._lanes.identity}, arrays)
+        return packed(head | {"of": self._lanes.identity, DESCRIPTION: self._description}, arrays)
+
+    @cached_property
+    def _description(self) -> str:
+        return description(self._fleet)
 
     def _state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
         """Return the whole state: options, the plant, and what is final."""
@@ -261,11 +267,43 @@ class Timeline:
         return {"options": [self.window, self.ahead, self.capacity]}, arrays
 
     @classmethod
-    def restore(cls, network: Network, data: bytes) -> "Timeline":
-        """Restore a saved timeline of the same network."""
+    def restore(cls, network: Network, data: bytes, accept_changes: bool = False) -> "Timeline":
+        """Restore a saved timeline of the same network.
+
+        Args:
+            network: the network of the timeline.
+            data: what `save` returned.
+            accept_changes: go on with the timeline of a network that has changed in numbers, nodes or filters, or that
+                another version saved, and warn of each change. A filter goes on if its state has the same parts; a
+                covariance of a version before 0.3.0 becomes its factors. Others begin with the initial law.
+
+        Raises:
+            ValueError: no snapshot, or one of another network or version.
+        """
         head, arrays = unpacked(data)
-        check_same("snapshot", shared_lanes(network).identity, head.get("of", {}))
+        mine, other = shared_lanes(network).identity, head.get("of", {})
+        if accept_changes and mine != other:
+            arrays = arrays | {"plant": cls._carried(network, head, arrays["plant"].tobytes())}
+            return cls._resumed(network, head, arrays)
+        check_same("snapshot", mine, other, SAME)
         return cls._resumed(network, head, arrays)
+
+    @classmethod
+    def _carried(cls, network: Network, head: Mapping[str, Any], plant: bytes) -> np.ndarray:
+        """Return the bytes of a plant that another network or version saved, as this one would."""
+        window, ahead, capacity = head["options"]
+        fleet = Fleet(shared_lanes(network), Options(window, ahead, capacity=capacity), alone=True)
+        mine, other = fleet.lanes.identity | {DESCRIPTION: description(fleet)}, head["of"]
+        # A version before 0.3.0 did not write where states stand: it is known for the same nodes and filters.
+        if DESCRIPTION not in head:
+            check_same("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
+        there = other | {DESCRIPTION: head.get(DESCRIPTION) or description(fleet, covariances=True)}
+        carrier = Carrier(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
+        carrier.begin("snapshot", there)
+        try:
+            return np.frombuffer(carrier.carried({"": plant})[""], np.uint8)
+        except ValueError as error:
+            raise fail("snapshot", "rows of the filters that are here", f"other ones: {error}") from None
 
     @classmethod
     def _resumed(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":

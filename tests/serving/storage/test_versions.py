@@ -1,8 +1,8 @@
 """A store that an older version wrote is named, and read where the user says so: estimates go on as there.
 
-`version_0_2/store.sql.gz` is what version 0.2.0 wrote, as SQL, and `known.jsonl` the final estimates with which that
-version itself went on (14 digits): `heliograph serve network.py --window 2 --store store.db` with `sent(0, 6)`, then
-with `sent(6, 9)`. Its states held covariances, and its description had the flags `.moved` in column 1.
+In `tests/version_0_2` is `store.sql.gz`, what version 0.2.0 wrote, as SQL, and `finals.jsonl`, the final estimates with
+which that version itself went on (14 digits): `heliograph serve network.py --window 2 --store store.db` with
+`sent(0, 6)`, then with `sent(6, 9)`. Its states held covariances, its description the flags `.moved` in column 1.
 """
 
 import gzip
@@ -25,7 +25,7 @@ from heliograph.serving.service import Service
 from heliograph.serving.storage.store import LAYOUT, Store
 from heliograph.serving.storage.store_protocol import identity
 
-WRITTEN = Path(__file__).parent / "version_0_2"
+WRITTEN = Path(__file__).parents[2] / "version_0_2"
 OPTIONS = Options(2.0, 0.1)
 
 
@@ -68,7 +68,7 @@ def finals(service: Service) -> list[dict]:
 
 def check_goes_on(known: list[dict]) -> None:
     """As version 0.2.0 went on, to 1e-9: the factors carry the same numbers to a few units of rounding."""
-    lines = (WRITTEN / "known.jsonl").read_text().splitlines()
+    lines = (WRITTEN / "finals.jsonl").read_text().splitlines()
     right = {(o["plant"], o["time"]): o["estimates"] for o in map(json.loads, lines)}
     assert {(o["plant"], o["time"]) for o in known} == set(right) and len(right) == 6
     for output in known:
