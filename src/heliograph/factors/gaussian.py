@@ -76,10 +76,10 @@ def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
 
 
 def given(mean: Array, covariance: Array) -> Gaussian:
-    """Gaussian of a covariance matrix: the border to all that has one."""
-    columns = columns_of(covariance)
+    """Gaussian of a covariance matrix, the border to all that has one; each variance to n eps of itself."""
     if isinstance(covariance, np.ndarray):
-        return of_columns(jnp.asarray(mean), columns)
+        return of_columns(jnp.asarray(mean), columns_of(covariance))
+    columns = eliminated(jnp.asarray(covariance), len(covariance) * float(np.finfo(covariance.dtype).eps))
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 
