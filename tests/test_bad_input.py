@@ -218,7 +218,7 @@ RUNS = [
     (lambda: node().filters["aware"].correct(None, [1.0]), "state", "None"),
     (lambda: node().filters["aware"].step((), [1.0]), "state", "()"),
     (lambda: h.kalman_filter(*small()).step(3, [1.0]), "state", "3"),
-    (lambda: node().filters["aware"].predict(h.kalman_filter(*small()).init()), "state", "Belief("),
+    (lambda: node().filters["aware"].predict(h.kalman_filter(*small()).init()), "state", "Gaussian("),
 ]
 
 

@@ -129,6 +129,7 @@ CALLS = [  # what is called, and arguments with which it works
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:A JAX array is being set as static")  # before it is refused
+@pytest.mark.filterwarnings("ignore:.*got a JAX array of single precision")  # which is said, and used
 @pytest.mark.parametrize(("call", "arguments"), CALLS, ids=[name_of(call) for call, _ in CALLS])
 @settings(max_examples=25, derandomize=True)
 @given(data=st.data())

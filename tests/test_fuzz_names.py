@@ -96,6 +96,7 @@ def _elsewhere(tmp_path_factory):
 
 
 @pytest.mark.filterwarnings("ignore:A JAX array is being set as static")  # before it is refused
+@pytest.mark.filterwarnings("ignore:.*got a JAX array of single precision")  # which is said, and used
 @pytest.mark.parametrize(("place", "name"), NAMES, ids=lambda part: part.removeprefix("heliograph."))
 @settings(max_examples=15, derandomize=True)
 @given(data=st.data())

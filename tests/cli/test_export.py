@@ -29,7 +29,7 @@ def test_it_writes_what_the_library_writes_and_says_what_it_costs(folder, capsys
     first, operations, cost = capsys.readouterr().out.splitlines()
     assert first == "step.h, step.c: remote/aware (nominal), double precision"
     assert operations.split(" ")[1] == "operations:" and "additions" in operations and "divisions" in operations
-    assert cost.startswith("state 48 bytes, code ") and "ns (cc -O2 on this machine)" in cost
+    assert cost.startswith("state 72 bytes, code ") and "ns (cc -O2 on this machine)" in cost
     assert sorted(set(contents(folder)) - {"net.py", "data.csv"}) == ["step.c", "step.h"]
     assert "z[0]: pos" in (folder / "step.h").read_text() and "u[0]: push" in (folder / "step.h").read_text()
     written = (folder / "step.c").read_text()

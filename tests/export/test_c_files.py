@@ -217,9 +217,9 @@ def test_the_files_say_what_they_are(readme, tmp_path):
     header, source = written.header.read_text(), written.source.read_text()
     for text in ("z[0]: left", "u[1]: dt", "mean[1]: velocity", "Claim: nominal", f"heliograph {hg.__version__}"):
         assert text in header
-    state = "double mean[2];\n    double lower[1];\n    double variances[2];"
+    state = "double mean[2];\n    double lower[1];\n    double variances[2];\n    double estimate_covariance[4];"
     assert f"typedef struct {{\n    {state}\n}} cart_state;" in header
-    assert written.state_bytes == 40 and written.operations["mul"] < 200
+    assert written.state_bytes == 72 and written.operations["mul"] < 200
     again = hg.export_c(readme.nodes["cart"].filters["relay_aware"], tmp_path / "cart.c")
     assert (again.header.read_text(), again.source.read_text()) == (header, source)
     exact = hg.export_c(hg.linear_filter(LINE, RANGE, FADING), tmp_path / "line.c")

@@ -108,7 +108,7 @@ def test_what_does_not_matter_to_a_claim_may_differ():
 
 
 def time_step(scale):
-    table = jnp.asarray([scale, 1.0])
+    table = np.asarray([scale, 1.0])
     return hg.LinearPlant(
         lambda u: jnp.array([[1.0, u[0]], [0.0, 1.0]]), lambda u: u[0] * jnp.diag(table), [0, 0], np.eye(2),
         inputs=["dt"],

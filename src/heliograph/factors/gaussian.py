@@ -132,14 +132,17 @@ class Innovations(NamedTuple):
         return jnp.sum(jnp.where(present, jnp.where(known, agrees, density), 0.0))
 
 
-def observe(x: Gaussian, slopes: jax.Array, innovation: jax.Array, noise: Columns) -> tuple[Gaussian, Innovations]:
-    """Condition x = m + L xi on z = E z + slopes xi + v, given z - E z, NaN where a component did not arrive.
+def observe(
+    x: Gaussian, slopes: jax.Array, innovation: jax.Array, noise: Columns, present: jax.Array | None = None
+) -> tuple[Gaussian, Innovations]:
+    """Condition x = m + L xi on z = E z + slopes xi + v, given z - E z.
 
     Component after component of N^-1 z, where Cov v = N diag(r) N': their noises are uncorrelated. Shapes: slopes
-    (m, n), innovation (m,), noise (m, columns).
+    (m, n), innovation (m,), noise (m, columns), present (m,): which components arrived, by default those whose
+    innovation is a number.
     """
     n, m = len(x.mean), len(innovation)
-    present = ~jnp.isnan(innovation)
+    present = ~jnp.isnan(innovation) if present is None else present
     # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
     fresh = triangular(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)

@@ -11,11 +11,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from heliograph.factors.columns import below_diagonal, eliminated
 from heliograph.numerics.types import PyTree
 
 COVARIANCE, LOWER, VARIANCES = ".covariance", ".lower", ".variances"
-AT_ONCE = 64  # matrices that one program takes
 
 Shapes = Mapping[str, Sequence[int]]  # of a state's parts, by their paths
 Columns = Mapping[str, Mapping[str, Sequence[Any]]]  # by filter and path a part's shape, and its columns' begin and end
@@ -91,26 +89,20 @@ def placed(filters: Columns) -> dict[str, dict[str, list[Any]]]:
 
 
 def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower (..., n (n - 1) / 2) and variances (..., n) of covariances (..., n, n) that a filter computed."""
-    *lead, n, _ = covariance.shape
-    flat = covariance.reshape(-1, n, n)
-    padded = np.zeros((-(-len(flat) // AT_ONCE) * AT_ONCE, n, n))
-    padded[: len(flat)] = flat
-    lower, variances = np.zeros((len(padded), n * (n - 1) // 2)), np.zeros((len(padded), n))
-    with jax.enable_x64(True):
-        for i in range(0, len(padded), AT_ONCE):
-            block = _given(padded[i : i + AT_ONCE])
-            lower[i : i + AT_ONCE], variances[i : i + AT_ONCE] = block
-    return lower[: len(flat)].reshape(*lead, lower.shape[1]), variances[: len(flat)].reshape(*lead, n)
+    """Return lower (..., n (n - 1) / 2) and variances (..., n) of covariances (..., n, n) that a filter computed.
 
-
-@jax.jit
-@jax.vmap
-def _given(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Factors of a covariance whose entries are rounded: no pivot is known to less than n eps of its variance."""
-    n = len(covariance)
-    columns = eliminated(covariance, n * float(np.finfo(covariance.dtype).eps))
-    return below_diagonal(columns.matrix), columns.weights
+    By elimination, of many at once; no pivot is known to less than n eps of its variance.
+    """
+    n = covariance.shape[-1]
+    rest, whole = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
+    lower, variances = np.zeros_like(rest), np.zeros_like(whole)
+    for j in range(n):
+        d = np.maximum(rest[..., j, j], n * np.finfo(float).eps * whole[..., j])
+        variances[..., j], below = d, rest[..., j + 1 :, j]
+        share = np.divide(below, d[..., None], out=np.zeros_like(below), where=d[..., None] > 0)
+        lower[..., j + 1 :, j] = share
+        rest[..., j + 1 :, j + 1 :] -= share[..., :, None] * below[..., None, :]
+    return lower[..., *np.tril_indices(n, -1)], variances
 
 
 def _factored(old: Iterable[str], new: Iterable[str]) -> list[str]:

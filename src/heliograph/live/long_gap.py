@@ -1,10 +1,13 @@
 """Many silent steps in bounded work: by real steps while they last, then by powers of the affine map that a step is."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.numerics.types import Float
+from heliograph.factors.columns import unit_lower
+from heliograph.live.layout import LOWER, VARIANCES, factors, parts_of
+from heliograph.numerics.types import Float, PyTree
 
 Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row state"]]
 """Silent step with a number from several states, each by itself."""
@@ -15,17 +18,57 @@ PROBES = 32  # after so many a state neither settles nor moves by an affine map
 TAIL = 4  # steps taken one by one at the end, for what a filter remembers of the step before
 SETTLED = 1e-13  # relative change over a probe: rounding
 AGREES = 1e-8  # relative: what rounding leaves of a probe's differences
+LEAST = 2.0**-40  # of an entry of the map, in units of the movements
 STEADY = 0.01  # relative: a number that moves on by as much as before
 
 
+class Factors(NamedTuple):
+    """Places of the factors of one covariance, or several, in a row: lower (..., n (n - 1) / 2), variances (..., n)."""
+
+    lower: np.ndarray
+    variances: np.ndarray
+
+
+def factors_in(places: PyTree) -> list[Factors]:
+    """Return the places of all factors in a row, from the tree of a state whose leaves are their own places."""
+    parts = {path: part.astype(int) for path, part in parts_of(places).items()}
+    stems = [path.removesuffix(VARIANCES) for path in parts if path.endswith(VARIANCES)]
+    return [Factors(parts[stem + LOWER], parts[stem + VARIANCES]) for stem in stems if stem + LOWER in parts]
+
+
+def as_covariances(rows: Float[np.ndarray, "row state"], places: Sequence[Factors]) -> Float[np.ndarray, "row state"]:
+    """Return rows with the entries of L D L' in the places of those of L below its diagonal, and of D."""
+    rows = rows.copy()
+    for lower, variances in places:
+        root, n = unit_lower(rows[:, lower]), variances.shape[-1]
+        covariance = (root * rows[:, variances][..., None, :]) @ np.swapaxes(root, -1, -2)
+        rows[:, lower] = covariance[..., *np.tril_indices(n, -1)]
+        rows[:, variances] = np.diagonal(covariance, axis1=-2, axis2=-1)
+    return rows
+
+
+def as_factors(rows: Float[np.ndarray, "row state"], places: Sequence[Factors]) -> Float[np.ndarray, "row state"]:
+    """Return what `as_covariances` was given."""
+    rows = rows.copy()
+    for lower, variances in places:
+        n = variances.shape[-1]
+        covariance = np.zeros((len(rows), *variances.shape, n))
+        below = np.tril_indices(n, -1)
+        covariance[..., *below] = covariance[..., *below[::-1]] = rows[:, lower]
+        covariance[..., np.arange(n), np.arange(n)] = rows[:, variances]
+        rows[:, lower], rows[:, variances] = factors(covariance)
+    return rows
+
+
 def states_after(step: Step, start: Float[np.ndarray, " state"], state: Float[np.ndarray, " state"], at: int,
-                 count: int) -> Float[np.ndarray, " state"]:  # fmt: skip
+                 count: int, places: Sequence[Factors] = ()) -> Float[np.ndarray, " state"]:  # fmt: skip
     """Return the state after `count` silent steps from one after step number `at`, in bounded work.
 
     A silent step s' = g(s) is affine in means and covariances where the plant is linear: P' = F P F' + Q. Numbers that
     do not move over a probe of real steps stay; for the others g(s + d) = g(s) + A d, with A by differences along each
     of them, and d' = A d + c with c = g(s) - s is raised to the power by squaring, d_2n = A^n d_n + d_n. The map is
-    used only if it predicts the probe. Otherwise real steps go on, PROBES times PROBED of them; what then moves on by
+    used only if it predicts the probe; factors L, D of a covariance are no affine map's, and are taken as L D L'.
+    Otherwise real steps go on, PROBES times PROBED of them; what then moves on by
     as much as before, as the variance of a random walk does, is taken to go on so, and all else to stay. A state of
     which a number is not finite after that begins anew with `start`, the initial law.
 
@@ -35,25 +78,41 @@ def states_after(step: Step, start: Float[np.ndarray, " state"], state: Float[np
         state: state before the gap.
         at: number of the step that led to it.
         count: number of steps, at least 0.
+        places: of the factors of covariances in a state.
     """
-    after = _states_after(step, state, at, count)
+    after = _states_after(step, state, at, count, places)
     return after if np.isfinite(after[np.isfinite(state)]).all() else start
 
 
-def _states_after(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -> Float[np.ndarray, " state"]:
+def _states_after(
+    step: Step, state: Float[np.ndarray, " state"], at: int, count: int, places: Sequence[Factors]
+) -> Float[np.ndarray, " state"]:
     passed = [state]
+
+    def seen(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
+        return list(as_covariances(np.stack(states), places))
+
+    def by_covariances(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
+        return as_covariances(step(as_factors(states, places), k), places)
+
     for i in range(min(PROBES, count // PROBED)):
         passed.append(_walked(step, passed[-1], at + i * PROBED, PROBED))
-        if not (moving := _moving(*passed[-2:])).any():
+        if not (moving := _moving(*seen(passed[-2:]))).any():
             return passed[-1]
         if i & (i + 1) == 0:  # after 1, 2, 4, ... probes
-            jumped = _jumped(step, (passed[-2], passed[-1]), moving, at + i * PROBED, count - i * PROBED)
+            jumped = _jumped(by_covariances, seen(passed[-2:]), moving, at + i * PROBED, count - i * PROBED)
             if jumped is not None:
-                return jumped
+                return _alone(jumped, places)
     done = PROBED * (len(passed) - 1)
     if count - done < PROBED:
         return _walked(step, passed[-1], at + done, count - done)
-    return _extrapolated(passed, count - done)
+    return _alone(_extrapolated(seen(passed), count - done), places)
+
+
+def _alone(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Float[np.ndarray, " state"]:
+    """Return one state by factors of one by covariances."""
+    alone: Float[np.ndarray, " state"] = as_factors(state[None], places)[0]
+    return alone
 
 
 def _extrapolated(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
@@ -85,7 +144,7 @@ def _moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " stat
     return moving
 
 
-def _jumped(step: Step, probe: tuple[Float[np.ndarray, " state"], Float[np.ndarray, " state"]], moving: np.ndarray,
+def _jumped(step: Step, probe: Sequence[Float[np.ndarray, " state"]], moving: np.ndarray,
             at: int, count: int) -> Float[np.ndarray, " state"] | None:  # fmt: skip
     """Return the state `count` steps after the begin of a probe by the affine map there; None if the step is none."""
     state, probed = probe
@@ -100,6 +159,9 @@ def _jumped(step: Step, probe: tuple[Float[np.ndarray, " state"], Float[np.ndarr
     matrix, moved = ((after[1:] - after[0]) / size[:, None]).T, after[0] - state[columns]
     if not np.isfinite(matrix).all():
         return None
+    # In units of the movements, rounding is taken off: a zero that is 1e-15 would couple what grows with what does not.
+    units = size[:, None] / size
+    matrix = np.round(matrix / units / LEAST) * LEAST * units
     # It has to predict the probe.
     with np.errstate(over="ignore", invalid="ignore"):
         expected = _power(matrix, moved, PROBED)

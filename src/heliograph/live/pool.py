@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.live.lanes import Lanes
 from heliograph.live.later import History
-from heliograph.live.long_gap import LONG, TAIL, states_after
+from heliograph.live.long_gap import LONG, TAIL, factors_in, states_after
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
 
@@ -111,7 +111,9 @@ class Pool:
             rows = np.concatenate([states, rest], axis=1)
             return self.step_rows(rows, self._alone and len(states) == 1)[:, : self.step_rows.state.size]
 
-        after = states_after(step, self.step_rows.start, row[self.state].copy(), at, to - at)
+        flat = self.step_rows.state
+        places = factors_in(flat.tree(np.arange(float(flat.size))))
+        after = states_after(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
         self.table[slot, self.state], self.table[slot, self.at.start] = after, to
 
     def history(self, slots: Sequence[int]) -> History:

@@ -19,6 +19,7 @@ PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, gi
 NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
 PRECISE = 1e-7  # of a measurement's variance: noise below it costs the short form P - K C half of the digits
 OFF_SUPPORT = 1e-6  # standard deviations, and
+KNOWN = 16  # roundings of its size: a deviation of no more says that a component is known
 OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
 
 A = TypeVar("A", jax.Array, np.ndarray)
@@ -282,8 +283,9 @@ def pivots(a: jax.Array) -> jax.Array:
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
     """x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
 
-    A component that those before it determine counts 1, what is expected of it in the limit, where x says what they
-    say, and is infinite where it does not; `size` (n,) is what x is a difference of, for its rounding.
+    A component that those before it determine, or that is known to its rounding, counts 1, what is expected of it in
+    the limit, where x says what they say, and is infinite where it does not; `size` (n,) is what x is a difference of,
+    for its rounding.
     """
     return add(list(squared_distances(a, x, size)[0]))
 
@@ -291,11 +293,12 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
 def squared_distances(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> tuple[jax.Array, jax.Array]:
     """The terms of `squared_distance`, each given those before it, and which of them these determine."""
     reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(diagonal_of(a), 0.0)) + OFF_VALUE * jnp.abs(size)
+    known = jnp.broadcast_to((KNOWN * float(np.finfo(a.dtype).eps) * jnp.asarray(size)) ** 2, reach.shape)
     squares: list[jax.Array] = []
     determined: list[jax.Array] = []
     for i, (rest, scale) in enumerate(_substituted(a, x)):
         agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
-        determined.append(scale == 0)
+        determined.append((scale == 0) | (a[i, i] <= known[i]))
         squares.append(jnp.where(determined[-1], agrees, (rest * scale) ** 2))
     return jnp.stack(squares), jnp.stack(determined)
 

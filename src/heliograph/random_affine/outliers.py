@@ -169,10 +169,8 @@ class Contaminated(AbstractNoise):
         """Draw the branch, then from it."""
         first, second = jax.random.split(key)
         branch = drawn_index(self.shares, first)
-        factors = jnp.stack([jnp.asarray(Gaussian(r).factor) for r in self.covariances])
-        return jnp.asarray(self.means)[branch] + factors[branch] @ jax.random.normal(
-            second, self.mean.shape, dtype=float
-        )
+        laws = [Gaussian(r, m) for r, m in zip(self.covariances, self.means, strict=True)]
+        return jnp.stack([law.sample(second) for law in laws])[branch]
 
     def moment(self, powers: Exponents) -> Number:
         """Return the mean of the branches' moments."""

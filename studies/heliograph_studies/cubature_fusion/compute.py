@@ -16,7 +16,7 @@ from heliograph.factors.columns import Columns, decorrelated, joined, reciprocal
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected
-from heliograph.filters.gaussian.signal import Signal, observe_received
+from heliograph.filters.gaussian.signal import Received, Signal, observe_received
 from heliograph.filters.gaussian.transform import at_points
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -66,23 +66,23 @@ class StepFourGain(AbstractReading):
 class CentralMoment(AbstractReading):
     """The one symbol P^yy of (10) and Step 4 read as the covariance of the innovation in every term."""
 
-    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
         """Take Cov(y) for E[y y']."""
-        return _condition(self.update, signal._replace(second=signal.covariance), channel, innovation)
+        return _condition(self.update, signal._replace(second=signal.covariance), channel, z)
 
 
 class RawMoment(AbstractReading):
     """The one symbol P^yy read as E[y y'] in every term."""
 
-    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
         """Take E[y y'] for Cov(y): E y (E y)' is one more column of its noise."""
         noise = joined(signal.noise, Columns(signal.mean[:, None], jnp.ones(1)))
-        return _condition(self.update, signal._replace(noise=noise), channel, innovation)
+        return _condition(self.update, signal._replace(noise=noise), channel, z)
 
 
-def _condition(update: AbstractUpdate, signal: Signal, channel: SecondOrder, innovation: jax.Array) -> Gaussian:
+def _condition(update: AbstractUpdate, signal: Signal, channel: SecondOrder, z: Received) -> Gaussian:
     """Condition on a signal that is read in another way."""
-    return update.condition(signal, channel, innovation, observe_received(signal, channel, innovation)[0])
+    return update.condition(signal, channel, z, observe_received(signal, channel, z)[0])
 
 
 class Propagated(NamedTuple):

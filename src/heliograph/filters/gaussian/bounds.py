@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.factors.columns import Columns, decorrelated, eliminated, joined, reciprocal, triangular
 from heliograph.factors.gaussian import Gaussian, observe, of_sum
 from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
-from heliograph.filters.gaussian.signal import LOST, Signal, homogeneous
+from heliograph.filters.gaussian.signal import LOST, Received, Signal, homogeneous
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
@@ -60,14 +60,14 @@ def keep_unless(changes: jax.Array, after: T, before: T) -> T:
     return chosen
 
 
-def observe_by_young(signal: Signal, channel: SecondOrder, innovation: jax.Array, scalars: Array) -> Gaussian:
+def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars: Array) -> Gaussian:
     """Update of `Polytope` for any description of the channel; scalars (2,), NaN to minimise the trace over them.
 
     (1 + b1) P - C' Omega^-1 C with Omega = base + (1/b1 + 1/b2) shift + (1 + b2) M (H P H' + R) M' is what a Kalman
     update makes of the prior (1 + b1) P and, of z, of the noise (1 + b1)^2 [base + (1/b1 + 1/b2) shift +
     (1 + b2) M R M'] + (1 + b1) ((1 + b1)(1 + b2) - 1) M H P H' M', positive terms; its gain is K / (1 + b1).
     """
-    prior, present = signal.prior, ~jnp.isnan(innovation)
+    prior, present = signal.prior, z.present
     slopes, of_state, of_noise = _received(signal, channel, present)
     w = homogeneous(signal.second, signal.mean, 1.0)
     base, shift = channel.spread(w, present), channel.shift(w, present)
@@ -80,16 +80,16 @@ def observe_by_young(signal: Signal, channel: SecondOrder, innovation: jax.Array
     # The same bound as a Kalman update.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
     wide = prior._replace(variances=a * prior.variances)
-    return observe(wide, slopes, a * innovation, _factored(noise))[0]
+    return observe(wide, slopes, a * z.innovation, _factored(noise), present)[0]
 
 
-def observe_by_zero_mean(signal: Signal, channel: SecondOrder, innovation: jax.Array, scalar: Array) -> Gaussian:
+def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scalar: Array) -> Gaussian:
     """Update of `ZeroMean`; scalar (1,), NaN to optimise it.
 
     Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta is at least M H P H' M', so that the rest is a noise;
     beta times what the received components explain of P, C Pyy^+ C', is added.
     """
-    prior, present = signal.prior, ~jnp.isnan(innovation)
+    prior, present = signal.prior, z.present
     slopes, of_state, _ = _received(signal, channel, present)
     # E[y y'] divided: yhat yhat' is known, Cov y is not.
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
@@ -106,7 +106,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, innovation: jax.A
     cross = (slopes * prior.variances) @ prior.root.T
     parts = base + absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
     beta = smallest_scalars(zero_mean_sweep, scalar, parts)[0]
-    after = observe(prior, slopes, innovation, _factored(base + shift / beta - of_state))[0]
+    after = observe(prior, slopes, z.innovation, _factored(base + shift / beta - of_state), present)[0]
     wider = of_sum(after.mean, after.columns, Columns(explained, beta * share))
     return keep_unless(jnp.any(present), wider, after)
 

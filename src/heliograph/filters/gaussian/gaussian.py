@@ -15,7 +15,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
 from heliograph.filters.gaussian.precise import state_rounding
-from heliograph.filters.gaussian.signal import Signal, received_noise, signal_of
+from heliograph.filters.gaussian.signal import Received, Signal, received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan
@@ -93,15 +93,15 @@ def corrected(
     covariance and the density of the nominal law, whatever the rule bounds.
     """
     unknown = signal if unknown is None else unknown
-    expected = channel.mean_gain @ signal.mean + channel.offset
+    expected, present = channel.mean_gain @ signal.mean + channel.offset, ~jnp.isnan(z)
     z = nearest(z, expected, angles)
-    value, present = z - expected, ~jnp.isnan(z)
+    value = z - expected
     # By the nominal law: the best update of a known one.
     slopes, noise = jnp.asarray(channel.mean_gain) @ unknown.slopes, received_noise(unknown, channel)
-    nominal, innovations = observe(unknown.prior, slopes, value, noise)
+    nominal, innovations = observe(unknown.prior, slopes, value, noise, present)
     total = joined(Columns(slopes, unknown.prior.variances), noise).covariance
     density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
-    after = rule.condition(unknown, channel, value, nominal)
+    after = rule.condition(unknown, channel, Received(value, present), nominal)
     return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
 

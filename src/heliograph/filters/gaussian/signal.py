@@ -22,6 +22,13 @@ from heliograph.random_affine.moments.second_moments import SecondOrder
 LOST = 100  # roundings of its variance, which elimination leaves of a combination free of a random gain
 
 
+class Received(NamedTuple):
+    """z - E z (m,), and which components arrived (m,): an expectation that is no number is no missing measurement."""
+
+    innovation: jax.Array
+    present: jax.Array
+
+
 class Signal(NamedTuple):
     """Moments of the sensor's signal y = E y + slopes xi + v under the prior x = m + L xi.
 
@@ -116,10 +123,10 @@ def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Colu
     return joined(channel.noise, gain_noise(channel, second, mean))
 
 
-def observe_received(signal: Signal, channel: SecondOrder, innovation: jax.Array) -> tuple[Gaussian, Innovations]:
-    """Condition the prior on z - E z, NaN where a component did not arrive, behind the nominal law of the channel."""
+def observe_received(signal: Signal, channel: SecondOrder, z: Received) -> tuple[Gaussian, Innovations]:
+    """Condition the prior on what arrived behind the nominal law of the channel."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
-    return observe(signal.prior, slopes, innovation, received_noise(signal, channel))
+    return observe(signal.prior, slopes, z.innovation, received_noise(signal, channel), z.present)
 
 
 def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:

@@ -20,7 +20,7 @@ from heliograph.filters.gaussian.bounds import (
     observe_by_young,
     observe_by_zero_mean,
 )
-from heliograph.filters.gaussian.signal import Signal, observe_received
+from heliograph.filters.gaussian.signal import Received, Signal, observe_received
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten
@@ -70,26 +70,26 @@ class AbstractUpdate(Module):
             raise unwritten(self, "correct")
 
         def moved(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
-            value = jnp.where(present, innovation, jnp.nan)
-            after = self.condition(signal, channel, value, observe_received(signal, channel, value)[0])
+            z = Received(innovation, present)
+            after = self.condition(signal, channel, z, observe_received(signal, channel, z)[0])
             return jnp.asarray(after.mean), after
 
         gain, after = jax.jacfwd(moved, has_aux=True)(jnp.zeros(len(present)))
         return gain, jnp.asarray(after.covariance)
 
-    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
         """Condition `signal.prior` on z - E z; by default from `correct`.
 
         Args:
             signal: moments of the sensor's signal.
             channel: what `describe` returned.
-            innovation: z - E z (m,), NaN where a component did not arrive.
+            z: z - E z, and what of it arrived.
             nominal: the prior conditioned behind the nominal law, the best update of a law that is known.
         """
-        prior, present = signal.prior, ~jnp.isnan(innovation)
-        gain, bound = self.correct(prior.covariance, signal, channel, present)
-        after = given(prior.mean + gain @ jnp.where(present, innovation, 0.0), bound)
-        return keep_unless(jnp.any(present), after, prior)
+        prior = signal.prior
+        gain, bound = self.correct(prior.covariance, signal, channel, z.present)
+        after = given(prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0), bound)
+        return keep_unless(jnp.any(z.present), after, prior)
 
     def claim(self, uncertain: bool) -> Claim:
         """Claim of the bound behind a channel of this kind, of a filter for which all else is exact.
@@ -122,9 +122,9 @@ class Polytope(AbstractUpdate):
     def __init__(self, scalars: Scalars | None = None):
         self.scalars = as_array(scalars)
 
-    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return observe_by_young(signal, channel, innovation, self.scalars) if channel.uncertain else nominal
+        return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
         """ "upper" where the law is uncertain."""
@@ -156,9 +156,9 @@ class ZeroMean(AbstractUpdate):
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
 
-    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over beta unless it is fixed."""
-        return observe_by_zero_mean(signal, channel, innovation, self.scalar) if channel.uncertain else nominal
+        return observe_by_zero_mean(signal, channel, z, self.scalar) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
         """ "nominal" where the law is uncertain: behind a law that is off, E[e | data] is not 0 after a correction."""
@@ -194,9 +194,9 @@ class Interval(AbstractUpdate):
         """Young's bound, as for a polytope."""
         return Polytope(as_scalars(self.scalars))
 
-    def condition(self, signal: Signal, channel: SecondOrder, innovation: jax.Array, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return observe_by_young(signal, channel, innovation, self.scalars) if channel.uncertain else nominal
+        return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
         """ "upper" where the law is uncertain."""

@@ -173,7 +173,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         s: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
         expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
-        after, innovations = observe(state, slopes, z - expected, noise)
+        after, innovations = observe(state, slopes, z - expected, noise, ~jnp.isnan(z))
         total = joined(Columns(slopes, state.variances), noise).covariance
         present = ~jnp.isnan(z)
         density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
