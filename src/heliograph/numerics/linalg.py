@@ -287,18 +287,24 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
     the limit, where x says what they say, and is infinite where it does not; `size` (n,) is what x is a difference of,
     for its rounding.
     """
-    return add(list(squared_distances(a, x, size)[0]))
+    return add(list(squared_distances(a, x, size, KNOWN)[0]))
 
 
-def squared_distances(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> tuple[jax.Array, jax.Array]:
-    """The terms of `squared_distance`, each given those before it, and which of them these determine."""
+def squared_distances(
+    a: jax.Array, x: jax.Array, size: Array | float = 0.0, roundings: float = 0.0
+) -> tuple[jax.Array, jax.Array]:
+    """The terms of `squared_distance`, each given those before it, and which of them these determine.
+
+    `roundings` of its size: a component with no larger deviation counts as determined.
+    """
     reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(diagonal_of(a), 0.0)) + OFF_VALUE * jnp.abs(size)
-    known = jnp.broadcast_to((KNOWN * float(np.finfo(a.dtype).eps) * jnp.asarray(size)) ** 2, reach.shape)
+    known = jnp.broadcast_to((roundings * float(np.finfo(a.dtype).eps) * jnp.asarray(size)) ** 2, reach.shape)
     squares: list[jax.Array] = []
     determined: list[jax.Array] = []
     for i, (rest, scale) in enumerate(_substituted(a, x)):
         agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
-        determined.append((scale == 0) | (a[i, i] <= known[i]))
+        none = scale == 0
+        determined.append(none | ((a[i, i] >= 0) & (a[i, i] <= known[i])) if roundings else none)
         squares.append(jnp.where(determined[-1], agrees, (rest * scale) ** 2))
     return jnp.stack(squares), jnp.stack(determined)
 
