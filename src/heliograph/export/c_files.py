@@ -8,12 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
 from heliograph.codegen.c_source import Real
 from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import RESERVED, step_program
 from heliograph.export.text import CText, Form, c_text
+from heliograph.factors.columns import computed_in
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
@@ -99,7 +101,9 @@ def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
-    return c_text(step_program(filter, real), Form(prefix, real, names, kind))
+    with computed_in(np.float64 if real == "double" else np.float32):
+        program = step_program(filter, real)
+    return c_text(program, Form(prefix, real, names, kind))
 
 
 def carries_factors(filter: AbstractFilter) -> bool:

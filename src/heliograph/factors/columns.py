@@ -8,6 +8,9 @@ A known zero of a matrix stays a known zero through a matrix product, not throug
 NaN: so products of rows and columns are written as matrix products here.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +24,7 @@ from heliograph.numerics.types import Array
 
 UNITS = 4  # of rounding of a number, which are noise of it
 WRITTEN = 16  # rows that are written out one after another; more are a loop
+LARGEST = 1e30  # variance by rounding: beyond it numbers are absurd, and their squares none in single precision
 RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
 
 
@@ -167,6 +171,17 @@ def root_of(covariance: np.ndarray) -> np.ndarray:
     return scale[:, None] * np.where(np.abs(root) > RANK, root, 0.0)
 
 
+def known_factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Entries of L below its diagonal and d of a known covariance, by the orthogonal rows of its root."""
+    rows = root_of(covariance)
+    n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
+    for j in range(n):
+        variances[j] = rows[j] @ rows[j]
+        lower[j + 1 :, j] = rows[j + 1 :] @ rows[j] / (variances[j] or 1.0)
+        rows[j + 1 :] -= np.outer(lower[j + 1 :, j], rows[j])
+    return lower[np.tril_indices(n, -1)], variances
+
+
 def columns_of(covariance: Array) -> Columns:
     """Columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
     if isinstance(covariance, np.ndarray):
@@ -181,8 +196,26 @@ def rounding_of(seconds: Array) -> Columns:
     It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
     variance it would be lost.
     """
-    unit = UNITS * float(np.finfo(np.dtype(seconds.dtype)).eps)
-    return Columns(np.eye(len(seconds)), unit**2 * seconds)
+    variances = (UNITS * unit_of(seconds)) ** 2 * seconds
+    return Columns(np.eye(len(seconds)), library(seconds).minimum(variances, LARGEST))
+
+
+_precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default=np.float64)
+
+
+@contextmanager
+def computed_in(precision: type[np.floating[Any]]) -> Iterator[None]:
+    """Take the rounding of a precision that is not the arrays' own: of a program that is written for a device."""
+    token = _precision.set(precision)
+    try:
+        yield
+    finally:
+        _precision.reset(token)
+
+
+def unit_of(numbers: Array) -> float:
+    """Eps of the precision in which these numbers are computed."""
+    return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(_precision.get()).eps))
 
 
 def outer(a: jax.Array, b: jax.Array) -> jax.Array:

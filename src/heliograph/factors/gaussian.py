@@ -15,16 +15,17 @@ from jax import lax
 from heliograph.factors.columns import (
     Columns,
     below_diagonal,
-    columns_of,
     decorrelated,
     eliminated,
     inverse,
     joined,
+    known_factors,
     triangular,
     unit_lower,
+    unit_of,
 )
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding
-from heliograph.numerics.traced import library
+from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 
 LOG_TURN = float(np.log(2 * np.pi))
@@ -54,8 +55,9 @@ class Gaussian(NamedTuple):
     @property
     def covariance(self) -> Any:
         """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are."""
-        root, xp = self.root, library(self)
-        product = (root * self.variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
+        xp = library(self)
+        root, variances = (xp.asarray(part) for part in (self.root, self.variances))
+        product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
         upper = np.triu(np.ones(product.shape[-2:], bool))
         return xp.where(upper, product, xp.swapaxes(product, -1, -2))
 
@@ -71,15 +73,16 @@ def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
     total = parts[0].covariance
     for part in parts[1:]:
         total = total + part.covariance
-    factors = eliminated(total, len(total) * float(np.finfo(total.dtype).eps))
+    factors = eliminated(total, len(total) * unit_of(total))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
 def given(mean: Array, covariance: Array) -> Gaussian:
     """Gaussian of a covariance matrix, the border to all that has one; each variance to n eps of itself."""
     if isinstance(covariance, np.ndarray):
-        return of_columns(jnp.asarray(mean), columns_of(covariance))
-    columns = eliminated(jnp.asarray(covariance), len(covariance) * float(np.finfo(covariance.dtype).eps))
+        known: Any = (mean if is_traced(mean) else np.asarray(mean), *known_factors(covariance))
+        return Gaussian(*known)
+    columns = eliminated(jnp.asarray(covariance), len(covariance) * unit_of(covariance))
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 

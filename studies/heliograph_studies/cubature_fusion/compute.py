@@ -95,6 +95,11 @@ class Propagated(NamedTuple):
     behind: jax.Array
 
     @property
+    def covariance(self) -> Any:
+        """Covariance of the state."""
+        return self.belief.covariance
+
+    @property
     def belief(self) -> Gaussian:
         """The state given the data."""
         return Gaussian(*self[:3])

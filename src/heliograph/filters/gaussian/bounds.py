@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelated, eliminated, joined, reciprocal, triangular
+from heliograph.factors.columns import Columns, decorrelated, eliminated, joined, reciprocal, triangular, unit_of
 from heliograph.factors.gaussian import Gaussian, observe, of_sum
 from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
 from heliograph.filters.gaussian.signal import LOST, Received, Signal, homogeneous
@@ -126,7 +126,7 @@ def bounded_covariance(signal: Signal, channel: SecondOrder, present: jax.Array)
 
 
 def _factored(noise: jax.Array) -> Columns:
-    return eliminated(noise, LOST * float(np.finfo(noise.dtype).eps))
+    return eliminated(noise, LOST * unit_of(noise))
 
 
 def absent(present: jax.Array) -> jax.Array:

@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from heliograph.factors.columns import Columns, eliminated, joined, rounding_of, triangular
+from heliograph.factors.columns import Columns, eliminated, joined, rounding_of, triangular, unit_of
 from heliograph.factors.gaussian import Gaussian, Innovations, observe
 from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
 from heliograph.model.plant import AbstractPlant
@@ -115,7 +114,7 @@ def received_noise(signal: Signal, channel: SecondOrder) -> Columns:
 def gain_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
     """Factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
     spread = contract(channel.gain_spread, homogeneous(second, mean, 1.0))
-    return eliminated(spread, LOST * float(np.finfo(spread.dtype).eps))
+    return eliminated(spread, LOST * unit_of(spread))
 
 
 def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
