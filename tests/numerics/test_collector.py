@@ -6,6 +6,12 @@ import pytest
 from heliograph.numerics.collector import no_collector
 
 
+@pytest.fixture(autouse=True)
+def on():
+    """On at the begin: a thread of an earlier test may be tracing yet."""
+    gc.enable()
+
+
 def test_the_collector_is_off_within_and_as_it_was_afterwards():
     assert gc.isenabled()
     with no_collector():

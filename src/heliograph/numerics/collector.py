@@ -13,8 +13,8 @@ def no_collector() -> Iterator[None]:
     Threads may overlap: the one that found it on switches it on again, so that it never stays off.
     """
     was_on = gc.isenabled()
-    gc.disable()
-    try:
+    try:  # an interruption may come between any two statements
+        gc.disable()
         yield
     finally:
         if was_on:
