@@ -15,10 +15,8 @@ from heliograph.numerics.linalg import (
     diagonal,
     diagonal_of,
     pivots,
-    root,
     rounding,
     solve,
-    sum_of_squares,
     symmetric,
     times,
     transpose,
@@ -67,38 +65,6 @@ def _difference(prior: jax.Array, cross: jax.Array, solved: jax.Array) -> jax.Ar
 
 
 _bound = runs_last(_difference)
-
-
-def covariance_after(
-    prior: jax.Array, cross: jax.Array, omega: jax.Array, solved: jax.Array, output: jax.Array, noise: jax.Array
-) -> jax.Array:
-    """P+ of the gain solved' = C' Omega^-1, in the form that avoids cancellation (`gain_and_covariance`).
-
-    Joseph form: (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK of the gain changes by
-    dK Omega dK' alone.
-
-    Source: Bucy and Joseph, Filtering for stochastic processes (1968).
-    """
-    return _covariance_after(prior, cross, omega, solved, output, noise)
-
-
-def _covariance(
-    pick: Pick,
-    prior: jax.Array,
-    cross: jax.Array,
-    omega: jax.Array,
-    solved: jax.Array,
-    output: jax.Array,
-    noise: jax.Array,
-) -> jax.Array:
-    return pick(
-        is_precise(omega, noise),
-        lambda: sum_of_squares(prior, root(prior), transpose(solved), output, noise),
-        lambda: _difference(prior, cross, solved),
-    )
-
-
-_covariance_after = runs_last(partial(_covariance, where_any), partial(_covariance, where_each))
 
 
 def _by_precision(

@@ -4,7 +4,7 @@ One component after another on a root of the covariance: of two precise componen
 H P H' + N resolves neither their difference nor N.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -160,20 +160,6 @@ def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     less = shared[:, None] * turned[None]
     doubt = doubt + jnp.sqrt(off / safe) * jnp.abs(less)
     return _Taken(before - less, doubt, rounded, blur, gain + column[:, None] * news[None], whole), None
-
-
-class HasStart(Protocol):
-    """A plant, or a filter that starts from another law."""
-
-    initial_mean: Array
-    initial_covariance: Array
-
-
-def initial_size(start: HasStart) -> Float[jax.Array, " n"]:
-    """E[x_i^2] before the first step, (n,)."""
-    mean = jnp.asarray(start.initial_mean)
-    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(start.initial_covariance))
-    return seconds
 
 
 def state_rounding(size: Array) -> Float[jax.Array, "n *runs"]:

@@ -20,7 +20,8 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.precise import above_rounding, initial_size
+from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.precise import above_rounding
 from heliograph.filters.innovation import log_density, mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import moments_smoother_step
@@ -249,7 +250,7 @@ class MixtureFilter(AbstractSizedFilter):
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
         innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), density)
         modes = weight @ (c.mode[:, None] == jnp.arange(len(law)))
-        after = above_rounding(symmetrize(after), spread, initial_size(at(self.plant, 0)))
+        after = above_rounding(symmetrize(after), spread, start_of(at(self.plant, 0)))
         updated = MixtureBelief(mean + shift, after, modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 

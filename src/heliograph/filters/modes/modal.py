@@ -14,10 +14,10 @@ import numpy as np
 
 from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
 from heliograph.filters.gaussian.precise import (
     above_rounding,
-    initial_size,
     noise_rounding,
     output_rounding,
     state_rounding,
@@ -93,7 +93,7 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     def rounding(self, gains: jax.Array, random: jax.Array, k: Step) -> jax.Array:
         """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
-        of_z = received_rounding(at(self.sensor, k), initial_size(at(self.plant, 0)), gains)
+        of_z = received_rounding(at(self.sensor, k), start_of(at(self.plant, 0)), gains)
         variance: jax.Array = of_z + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
         return variance
 
@@ -171,7 +171,7 @@ class ModalFilter(AbstractModalFilter):
         output = self._observe(step.prior, step.k)[0]
         transition, move, noise, _, rows = self._moves(step.before, step.u, step.k)
         process = _spread_of_moves(step.before.moments, move, noise, rows)[1]
-        size = jnp.append(initial_size(at(self.plant, 0)), 1.0)
+        size = jnp.append(start_of(at(self.plant, 0)), 1.0)
         rounded = state_rounding(jnp.kron(step.prior.moments[:, -1, -1], size))
         return linear_smoother_step(step, (transition, process, output), rounded, self.claim, self._projection())
 
@@ -235,7 +235,7 @@ def mean_rounding(
     start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array, precise: jax.Array | bool = False
 ) -> jax.Array:
     """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
-    n, size = len(start.initial_mean), initial_size(start)
+    n, size = len(start.initial_mean), start_of(start)
     projection = sum_of_modes(n, len(law))
     left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
     return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size, precise) - left))

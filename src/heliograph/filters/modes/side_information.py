@@ -11,8 +11,8 @@ import numpy as np
 
 from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.correction import absent, gain_and_bound, is_precise
-from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.modal import (
     joined,
@@ -160,7 +160,7 @@ class SideInformationFilter(AbstractSizedFilter):
         # Kalman update of zeta with the components that arrived, and the rounding of the mean.
         after, value, covariance, precise = _used(
             prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there,
-            received_rounding(sensor, initial_size(at(self.plant, 0)), jnp.asarray(known.mean)[:, kind]),
+            received_rounding(sensor, start_of(at(self.plant, 0)), jnp.asarray(known.mean)[:, kind]),
         )  # fmt: skip
         law = after.moments[:, size - 1, size - 1]
         shares = mean_rounding(at(self.plant, 0), law, after.covariance, prior.covariance, precise)
