@@ -83,7 +83,7 @@ CALLS = [  # what is called, and arguments with which it works
                                 "growth": ()}),
     (h_infinity.check_growth, {"function": lambda x: 0.5 * x, "constant": 0.5, "low": [-1.0], "high": [1.0],
                                "name": "f", "seed": 0, "differences": True}),
-    (filters.h_infinity_filter, {"plant": PLANT, "sensor": SENSOR, "system": GROWTH, "design": DESIGN,
+    (h_infinity.h_infinity_filter, {"plant": PLANT, "sensor": SENSOR, "system": GROWTH, "design": DESIGN,
                                  "initial_mean": [0.0, 0.0]}),
     (filters.as_current_filter, SINGLE),
     (filters.late_filter, {"filter": KALMAN, "delay": 2}),

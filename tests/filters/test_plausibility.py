@@ -18,7 +18,7 @@ BEND = hg.Sensor(lambda x: x + 0.1 * jax.numpy.tanh(x), 0.1)
 
 
 def h_infinity():
-    return hg.filters.HInfinityFilter(
+    return hg.h_infinity.HInfinityFilter(
         plant=PLANT, sensor=SENSOR, gains=OverTime(np.full((40, 1, 1), 0.4)),
         expected_gain=OverTime(np.ones((40, 1, 1))), initial_mean=np.ones(1), claim="none",
         states=PLANT.states, inputs=(), received=1,

@@ -38,7 +38,7 @@ def test_a_level_too_low_says_where_it_fails_and_what_would_work():
     np.testing.assert_allclose(design.smallest_level, 0.02696, rtol=5e-4)  # bisection to 1e-4
     with pytest.raises(ValueError, match=r"design: expected one that is feasible, got no gain found at step"):
         plant = hg.Plant(lambda x, u: 0.7 * x, 0.0, np.zeros(2), np.eye(2))
-        hg.filters.h_infinity_filter(plant, hg.LinearSensor([[0.15, 0.15]], 0.0), node(0), design)
+        hg.h_infinity.h_infinity_filter(plant, hg.LinearSensor([[0.15, 0.15]], 0.0), node(0), design)
 
 
 def test_the_initial_weight_alone_sets_the_smallest_level_of_the_paper():

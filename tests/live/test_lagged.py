@@ -69,7 +69,7 @@ def test_in_continuous_time_it_is_the_conditional_law(engine, monkeypatch):
 
 def test_filters_without_a_covariance_refuse_and_are_left_out():
     plant, sensor = hg.LinearPlant([[0.7]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.5)
-    gains = hg.filters.HInfinityFilter(
+    gains = hg.h_infinity.HInfinityFilter(
         plant=plant, sensor=sensor, gains=np.full((1, 1), 0.4), expected_gain=np.ones((1, 1)),
         initial_mean=np.zeros(1), claim="none", states=plant.states, inputs=(), received=1,
     )  # fmt: skip

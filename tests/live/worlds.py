@@ -45,7 +45,7 @@ def remembering() -> hg.Network:
     }
     sure = PLANT, SENSOR, hg.hop(1.0, 0.05)
     gains = {
-        "h_infinity": hg.filters.HInfinityFilter(
+        "h_infinity": hg.h_infinity.HInfinityFilter(
             plant=PLANT, sensor=SENSOR, gains=OverTime(np.full((STEPS, 1, 1), 0.4)),
             expected_gain=OverTime(np.ones((STEPS, 1, 1))), initial_mean=np.ones(1), claim="none",
             states=PLANT.states, inputs=(), received=1,

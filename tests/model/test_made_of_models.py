@@ -327,8 +327,8 @@ HELPERS = {
     "hg.planning.designed_network": designed, "hg.simulation.freeze": meshed,
 }  # fmt: skip
 HOLDERS = {  # what holds models as they are given, and what only reads them
-    "hg.Network", "hg.Node", "hg.model.RelayNetwork", "hg.filters.HInfinityFilter", "hg.filters.PolynomialFilter",
-    "hg.filters.h_infinity_filter", "hg.smoothing.smoother_steps",
+    "hg.Network", "hg.Node", "hg.model.RelayNetwork", "hg.h_infinity.HInfinityFilter", "hg.filters.PolynomialFilter",
+    "hg.h_infinity.h_infinity_filter", "hg.smoothing.smoother_steps",
 }  # fmt: skip
 
 

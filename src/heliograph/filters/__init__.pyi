@@ -26,10 +26,6 @@ from .wrappers.fed_back import (
 from .gaussian.gaussian import (
     gaussian_filter as gaussian_filter,
 )
-from .h_infinity import (
-    HInfinityFilter as HInfinityFilter,
-    h_infinity_filter as h_infinity_filter,
-)
 from .innovation import (
     gaussian_innovation as gaussian_innovation,
     mixed_innovation as mixed_innovation,

@@ -12,6 +12,10 @@ from .design import (
     horizon_design as horizon_design,
     recursive_design as recursive_design,
 )
+from .filter import (
+    HInfinityFilter as HInfinityFilter,
+    h_infinity_filter as h_infinity_filter,
+)
 from .growth_check import (
     GrowthFinding as GrowthFinding,
     check_growth as check_growth,

@@ -145,7 +145,8 @@ def filters(node: str, designs: Designs) -> dict[str, hg.filters.AbstractFilter]
     """All filters of a node but the one that knows of losses; each predicts."""
     believed, seen, growing = plant(False), sensor(node), system(node)
     results: dict[str, hg.filters.AbstractFilter] = {
-        name: hg.filters.h_infinity_filter(believed, seen, growing, element[node]) for name, element in designs.items()
+        name: hg.h_infinity.h_infinity_filter(believed, seen, growing, element[node])
+        for name, element in designs.items()
     }
     results["open_loop"] = hg.filters.open_loop_filter(believed)
     for name, hop in (("ekf_ignoring", LINKS.lossless), ("ekf_statistics", LINKS.lossy)):

@@ -107,7 +107,7 @@ def h_infinity_filters(setting: Setting, node: int, designs: Designs) -> dict[st
     """The designed filters of one node."""
     parts = setting.plant(False), setting.sensor(node, 0.0), setting.system(node)
     return {
-        name: hg.filters.h_infinity_filter(*parts, design[node], setting.guesses[node])
+        name: hg.h_infinity.h_infinity_filter(*parts, design[node], setting.guesses[node])
         for name, design in designs.items()
     }
 
@@ -226,7 +226,7 @@ def _secant(truth: np.ndarray, estimates: np.ndarray) -> np.ndarray:
 def violation(setting: Setting, node: int, design: hg.h_infinity.HInfinityDesign) -> Worst:
     """The worst disturbance found for a node's filter; where its level is above the design's, the theorem is broken."""
     believed, sensor = setting.plant(False), setting.sensor(node, 0.0)
-    item = hg.filters.h_infinity_filter(believed, sensor, setting.system(node), design)
+    item = hg.h_infinity.h_infinity_filter(believed, sensor, setting.system(node), design)
     judges = setting.draws(SEARCH_DRAWS, 1), setting.draws(JUDGE_DRAWS, 2)
     return worst_disturbance(item, world(setting, node), *judges, ENERGIES, starts=16)
 

@@ -60,7 +60,7 @@ def test_the_search_finds_the_norm_of_a_linear_system():
         return jnp.where(u[1] > 0, rotation @ x, x)
 
     plant = hg.Plant(transition, np.zeros((2, 2)), np.zeros(2), np.eye(2), inputs=discriminating.INPUTS)
-    item = hg.filters.h_infinity_filter(plant, discriminating.sensor("1"), nothing, design)
+    item = hg.h_infinity.h_infinity_filter(plant, discriminating.sensor("1"), nothing, design)
     world = worst_disturbance.World(
         lambda x, k: rotation @ x, lambda x: x[:1], discriminating.DISTURBANCE, np.zeros((1, 1)), np.eye(2), np.eye(4),
         discriminating.inputs("bias"),

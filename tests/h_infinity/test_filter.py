@@ -23,7 +23,7 @@ def model():
 def build():
     plant, sensor = model()
     design = hg.h_infinity.recursive_design(node(0), 1.8, 10 * np.eye(4))
-    return hg.filters.h_infinity_filter(plant, sensor, node(0), design), design
+    return hg.h_infinity.h_infinity_filter(plant, sensor, node(0), design), design
 
 
 def oracle(design, received, missing=()):
@@ -76,7 +76,7 @@ def test_parts_that_do_not_fit_are_refused():
     design = hg.h_infinity.recursive_design(node(0), 1.8, 10 * np.eye(4))
     two = hg.LinearSensor(np.eye(2), 0.0)
     with pytest.raises(ValueError, match=r"sensor: expected the system's 1 outputs, got 2"):
-        hg.filters.h_infinity_filter(plant, two, node(0), design)
+        hg.h_infinity.h_infinity_filter(plant, two, node(0), design)
     three = hg.Plant(lambda x, u: x, 0.0, np.zeros(3), np.eye(3))
     with pytest.raises(ValueError, match=r"system: expected 3 states"):
-        hg.filters.h_infinity_filter(three, hg.LinearSensor(np.ones((1, 3)), 0.0), node(0), design)
+        hg.h_infinity.h_infinity_filter(three, hg.LinearSensor(np.ones((1, 3)), 0.0), node(0), design)
