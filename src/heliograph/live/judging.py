@@ -10,7 +10,6 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement, Reason, why_inputs, why_values
 from heliograph.live.event import Known
 from heliograph.live.fleet import Fleet
-from heliograph.live.lanes import FilterColumns
 from heliograph.live.plant import Plant
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.model.estimate import Estimate
@@ -19,6 +18,7 @@ from heliograph.numerics.types import Float
 from heliograph.simulation.centres.blame import blamed
 from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import FUSED
+from heliograph.simulation.rows.columns import FilterColumns
 
 TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]

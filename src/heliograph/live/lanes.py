@@ -1,7 +1,6 @@
-"""Steps of many plants of one network, the network's time, and where the outputs of a step stand in a row."""
+"""A network on live data: its step as a function of rows, and its time."""
 
-from functools import cached_property, partial
-from typing import NamedTuple
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -9,18 +8,15 @@ import numpy as np
 
 from heliograph.codegen.engine import compiled
 from heliograph.live.later import Sweeper
-from heliograph.live.row_step import RowStep
 from heliograph.live.snapshot import Identity, network_identity
-from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.simulation.network import FUSED, Network
+from heliograph.numerics.types import Array, Float
+from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.results.by_name import by_name
-from heliograph.simulation.stepping import AllFilters, begun
+from heliograph.simulation.rows.row_step import RowStep
 
 CUTS = ((0.0, 1.0), (0.25, 0.75), (1.0, 0.0))  # of an interval of length one, in the plant's own unit
 TOLERANCE = 1e-9  # relative: a few products lose 1e-15
@@ -93,53 +89,10 @@ def _moved(
     return moved
 
 
-class JudgementAt(NamedTuple):
-    """Columns of the parts of a judgement."""
-
-    distance: int
-    arrived: int
-    reason: int
-    input: int
-
-
-class WeighedAt(NamedTuple):
-    """Columns of what a filter that weighs made of each of its components."""
-
-    value: tuple[int, ...]
-    variance: tuple[int, ...]
-    weight: tuple[int, ...]
-
-
-class TestedAt(NamedTuple):
-    """Columns of a fused estimate's squared innovation, and of how many numbers arrived."""
-
-    distance: int
-    arrived: int
-
-
-class FilterColumns(NamedTuple):
-    """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
-
-    `judgement` is None for a fusion rule, which receives no measurement; `tested` has its squared innovation by what
-    its nodes receive, and is None for all others. `weighed` is None of a filter that weighs nothing.
-    """
-
-    node: str
-    filter: str
-    claim: Claim
-    mean: int
-    covariance: int
-    judgement: JudgementAt | None
-    weighed: WeighedAt | None
-    tested: TestedAt | None
-
-
 class Lanes:
-    """A network's step as a function of rows: (state, received, inputs, step number) to (state, outputs).
+    """A network's step on rows, `step_rows`, one for each plant; plants come and go without compilation.
 
-    The outputs are the leaves of the estimates and each filter's judgement of what it received; `places` gives their
-    columns. A filter leaves out the measurements that it finds implausible. Plants come and go without compilation, and
-    no bit of an estimate depends on which other rows are stepped in the same call.
+    `places` gives the columns of each filter's estimate and judgement among its outputs.
 
     `uneven` explains why the plant's intervals cannot be divided, "" if they can. Rows have `received` measurements and
     `given` inputs without the time step, whose number among the inputs is `dt`; None where time counts steps.
@@ -160,14 +113,8 @@ class Lanes:
         # Sizes of a row: measurements of all nodes, and inputs other than dt.
         self.received = sum(node.received for node in network.nodes.values())
         self.given = len(network.inputs) - (self.dt is not None)
-        with jax.enable_x64(True):
-            filters = AllFilters(network, judges=True, tests=True)
-            for name, link in filters.reporting.items():
-                if link.uplinks.groups:
-                    expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
-                    raise fail(f"timeline: fusion {name!r}", expected, "links that chance has a part in")
-            self.step_rows = RowStep(network, filters, begun(filters))
-        self.places = self._places()
+        self.step_rows = RowStep(network)
+        self.places = self.step_rows.columns
 
     @cached_property
     def sweeper(self) -> Sweeper:
@@ -183,50 +130,5 @@ class Lanes:
         """Return the identity of the network and its program, which a saved timeline is compared with."""
         return network_identity(self.network, self.step_rows.program, {})
 
-    def _places(self) -> tuple[FilterColumns, ...]:
-        """Locate each filter's estimate, by reading a row that holds its own column numbers as a row of estimates."""
-        outputs = self.step_rows.outputs
-        numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
-        mean = by_name(self.network, numbered, lambda estimate: np.asarray(estimate.mean), -3)
-        covariance = by_name(self.network, numbered, lambda estimate: np.asarray(estimate.covariance), -4)
-        judged, weighed = self._judged(numbered), self._weighed(numbered)
-        tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
-        return tuple(
-            FilterColumns(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
-                  judged[node].get(name), weighed.get((node, name)), tested.get((node, name)))
-            for node, filters in self.claims.items()
-            for name, claim in filters.items()
-        )  # fmt: skip
-
-    def _weighed(self, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
-        """Return the columns of what each filter that weighs made of its components, by node and filter."""
-        parts = {
-            name: [np.asarray(field)[f, i] for field in outcome["weighed"][kind]]
-            for name, (kind, f, i) in self.network.places().items()
-            if outcome["weighed"][kind] is not None
-        }
-        central = {(FUSED, name): list(at) for name, at in outcome["weighed_centrally"].items() if at is not None}
-        return {
-            name: WeighedAt(*(tuple(map(int, field)) for field in columns))
-            for name, columns in (parts | central).items()
-        }
-
-    def _judged(self, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
-        """Return the columns of each part of a judgement, by node and filter."""
-        judged = {"estimates": outcome["judged"], "fused": {}}
-        parts = [by_name(self.network, judged, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
-        by_node = {
-            node: {name: JudgementAt(*(int(field[node][name]) for field in parts)) for name in filters}
-            for node, filters in parts[0].items()
-        }
-        central = outcome["judged_centrally"]
-        return by_node | {
-            FUSED: {name: JudgementAt(*(int(column) for column in columns)) for name, columns in central.items()}
-        }
-
 
 shared_lanes = shared(Lanes)  # of a network, made at the first call
-
-
-def _part(i: int, judged: PyTree) -> np.ndarray:
-    return np.asarray(judged[i])

@@ -13,16 +13,16 @@ from heliograph.codegen.engine import chosen, of_arrays, setting
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
-from heliograph.live.row_step import NetworkStep
-from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim, Estimate, with_sound_claim
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module
+from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.gathering import Fused
 from heliograph.simulation.judging import reasons
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.rows.row_step import NetworkStep
 from heliograph.simulation.stepping import AllFilters
 
 

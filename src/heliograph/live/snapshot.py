@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from hashlib import sha256
 from io import BytesIO
 from typing import Any
 from zipfile import BadZipFile
@@ -12,11 +11,11 @@ import numpy as np
 
 import heliograph
 from heliograph.numerics.check import fail, shown
+from heliograph.numerics.trees.program_text import short_name
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 
 Identity = dict[str, str]
-DIGITS = 16
 
 
 def versions() -> Identity:
@@ -58,18 +57,6 @@ def check_same(
         there = "; ".join(f"{name}: {other.get(name, 'none')}" for name in names)
         more = "; accept_changes=True goes on with what fits" if kept and fits else ""
         raise fail(what, f"the state of what is here ({here})", f"one that differs ({there}){more}")
-
-
-def short_name(numbers: PyTree) -> str:
-    """Hash all numbers in a tree, or a text."""
-    if isinstance(numbers, str):
-        return sha256(numbers.encode()).hexdigest()[:DIGITS]
-    digest = sha256()
-    for leaf in jax.tree.leaves(numbers):
-        if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
-            array = np.asarray(leaf)
-            digest.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
-    return digest.hexdigest()[:DIGITS]
 
 
 HEAD = "head"

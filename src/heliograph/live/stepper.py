@@ -13,8 +13,8 @@ from heliograph.codegen.engine import attempted, setting
 from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.filters.base import AbstractFilter
-from heliograph.live.static import Static
 from heliograph.numerics.float64 import understood
+from heliograph.numerics.trees.static import Static
 from heliograph.numerics.types import Float, PyTree
 
 Leaves = list[np.ndarray]

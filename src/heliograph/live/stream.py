@@ -13,10 +13,8 @@ from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.plausibility import in_words, why_inputs
 from heliograph.live.layout import fits, moved, parts_of, with_covariances
-from heliograph.live.program_text import text_of
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
-from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
-from heliograph.live.static import cast
+from heliograph.live.snapshot import Identity, check_same, packed, unpacked, versions
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import JudgedEstimate, with_sound_claim
 from heliograph.model.faults import function_fault
@@ -25,6 +23,8 @@ from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
+from heliograph.numerics.trees.program_text import short_name, text_of
+from heliograph.numerics.trees.static import cast
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.description.wide_angles import WideAngles
 

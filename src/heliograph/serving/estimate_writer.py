@@ -8,8 +8,9 @@ import numpy as np
 from pydantic_core import to_json
 
 from heliograph.filters.plausibility import in_words
-from heliograph.live.lanes import FilterColumns, Lanes, WeighedAt
+from heliograph.live.lanes import Lanes
 from heliograph.numerics.types import Float
+from heliograph.simulation.rows.columns import FilterColumns, WeighedAt
 
 HEAD = b'{"kind":"%b","plant":%b,"time":%b,"estimates":'
 FIRST = 2**52  # the number of column 0 where a row holds column numbers: no name contains it

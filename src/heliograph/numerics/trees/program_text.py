@@ -2,15 +2,29 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
-from heliograph.live.snapshot import short_name
+from heliograph.numerics.types import PyTree
 
+DIGITS = 16  # of a hash
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+
+
+def short_name(numbers: PyTree) -> str:
+    """Hash all numbers in a tree, or a text."""
+    if isinstance(numbers, str):
+        return sha256(numbers.encode()).hexdigest()[:DIGITS]
+    digest = sha256()
+    for leaf in jax.tree.leaves(numbers):
+        if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
+            array = np.asarray(leaf)
+            digest.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
+    return digest.hexdigest()[:DIGITS]
 
 
 def text_of(program: ClosedJaxpr) -> str:

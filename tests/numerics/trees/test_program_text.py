@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.live.program_text import text_of
 from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.trees.program_text import text_of
 
 
 def text(table, power: int = 2, dtype=np.float64, below: float = 1.0) -> str:

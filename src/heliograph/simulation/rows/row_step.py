@@ -10,55 +10,22 @@ import numpy as np
 
 from heliograph.codegen.engine import chosen
 from heliograph.codegen.lowering import like
-from heliograph.live.program_text import text_of
-from heliograph.live.static import Static, cast
-from heliograph.numerics.float64 import understood
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64, understood
 from heliograph.numerics.module import Module
+from heliograph.numerics.trees.flat import Flat, flat_like, row_of
+from heliograph.numerics.trees.program_text import text_of
+from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.judging import plausible_step
 from heliograph.simulation.network import Network
-from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.rows.columns import columns_of
+from heliograph.simulation.stepping import AllFilters, begun
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each
 TOGETHER, WIDTH = 16, 512  # rows of one turn of XLA's loop, which fill the vectors of a processor; rows of one call
-NUMBERS_TOGETHER, NUMBERS = (
-    2**14,
-    2**18,
-)  # of long rows no more: one costs about itself
-
-
-class Flat(NamedTuple):
-    """Layout of a tree whose leaves are concatenated in a row of doubles; integers are exact up to 2^53."""
-
-    structure: jax.tree_util.PyTreeDef
-    shapes: tuple[tuple[int, ...], ...]
-    kinds: tuple[str, ...]
-
-    @property
-    def size(self) -> int:
-        """Length of a row."""
-        return sum(int(np.prod(shape)) for shape in self.shapes)
-
-    def tree(self, rows: jax.Array | np.ndarray) -> PyTree:
-        """Restore the tree from a row, or one with leading axes from rows (..., size), with the original dtypes."""
-        parts, begin = [], 0
-        for shape, kind in zip(self.shapes, self.kinds, strict=True):
-            end = begin + int(np.prod(shape))
-            parts.append(rows[..., begin:end].reshape((*rows.shape[:-1], *shape)).astype(kind))
-            begin = end
-        return self.structure.unflatten(parts)
-
-
-def flat_like(tree: PyTree) -> Flat:
-    """Return the layout of a tree of arrays."""
-    leaves, structure = jax.tree.flatten(tree)
-    return Flat(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
-
-
-def row_of(tree: PyTree) -> jax.Array:
-    """Concatenate the leaves of a tree of arrays in a row of doubles."""
-    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(leaf).astype(np.float64) for leaf in jax.tree.leaves(tree))])
+NUMBERS_TOGETHER, NUMBERS = 2**14, 2**18  # of long rows no more: one costs about itself
 
 
 class NetworkStep(Module):
@@ -107,20 +74,35 @@ class Layout(NamedTuple):
 
 
 class RowStep:
-    """A network's step as a function of rows, (state, received, inputs, step number) to (state, outputs).
+    """A network's step as a pure function of rows, (state, received, inputs, step number) to (state, outputs).
 
-    No bit of a result depends on the other rows of a call. `state` and `outputs` are layouts of filters' states and of
-    their outputs.
+    Each row is a world of its own: no bit of a result depends on the other rows of a call. The outputs are the
+    estimates and each filter's judgement of what it received; a filter leaves out the measurements that it finds
+    implausible. `start` is the state before the first step; `state` and `outputs` say how the two are laid out, and
+    `columns` where each filter's estimate stands among the outputs.
+
+    Args:
+        network: the network; `received` are the measurements of its nodes in their order, NaN where nothing arrived.
+
+    Raises:
+        ValueError: a fusion whose reports get lost by chance on their way to the centre.
     """
 
-    def __init__(self, network: Network, filters: AllFilters, start: PyTree):
+    @in_float64
+    def __init__(self, network: Network):
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
+        # All filters, their states before the first step, and the layouts of both.
+        filters = AllFilters(network, judges=True, tests=True)
+        _check_reports(filters)
+        start = begun(filters)
         numbers, static = cast(NetworkStep(network, filters))
         self._like = tuple(like(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)
         self._layout = Layout(static, self.state, received, inputs)
         self.outputs = flat_like(_traced(self._layout, self._like).out_info[1])
+        self.columns = columns_of(network, self.outputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
+        # Native code with the network's numbers filled in, where it takes the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
         self._choice = chosen(_in_rows(self._layout), (self._numbers, row), (False, True))
@@ -162,6 +144,14 @@ class RowStep:
                 stepped = run(self._numbers, filled, np.int32(-(-count // together)))
             done[begin : begin + count] = np.asarray(stepped)[:count]
         return done
+
+
+def _check_reports(filters: AllFilters) -> None:
+    """Refuse fusions whose reports get lost by chance: a row says what a node measured, not which report arrived."""
+    for name, link in filters.reporting.items():
+        if link.uplinks.groups:
+            expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
+            raise fail(f"timeline: fusion {name!r}", expected, "links that chance has a part in")
 
 
 @lru_cache

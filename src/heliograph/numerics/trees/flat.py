@@ -1,0 +1,42 @@
+"""Trees of arrays as rows of doubles, and back."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.types import PyTree
+
+
+class Flat(NamedTuple):
+    """Layout of a tree whose leaves are concatenated in a row of doubles; integers are exact up to 2^53."""
+
+    structure: jax.tree_util.PyTreeDef
+    shapes: tuple[tuple[int, ...], ...]
+    kinds: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """Length of a row."""
+        return sum(int(np.prod(shape)) for shape in self.shapes)
+
+    def tree(self, rows: jax.Array | np.ndarray) -> PyTree:
+        """Restore the tree from a row, or one with leading axes from rows (..., size), with the original dtypes."""
+        parts, begin = [], 0
+        for shape, kind in zip(self.shapes, self.kinds, strict=True):
+            end = begin + int(np.prod(shape))
+            parts.append(rows[..., begin:end].reshape((*rows.shape[:-1], *shape)).astype(kind))
+            begin = end
+        return self.structure.unflatten(parts)
+
+
+def flat_like(tree: PyTree) -> Flat:
+    """Return the layout of a tree of arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    return Flat(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
+
+
+def row_of(tree: PyTree) -> jax.Array:
+    """Concatenate the leaves of a tree of arrays in a row of doubles."""
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(leaf).astype(np.float64) for leaf in jax.tree.leaves(tree))])

@@ -1,0 +1,1 @@
+"""A network's step as a function of rows of doubles, and what stands in which column."""

@@ -1,0 +1,100 @@
+"""Which column of a network's outputs holds what: each filter's estimate, and its judgement of what it received."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from heliograph.model.estimate import Claim
+from heliograph.numerics.trees.flat import Flat
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.results.by_name import by_name
+
+
+class JudgementAt(NamedTuple):
+    """Columns of the parts of a judgement."""
+
+    distance: int
+    arrived: int
+    reason: int
+    input: int
+
+
+class WeighedAt(NamedTuple):
+    """Columns of what a filter that weighs made of each of its components."""
+
+    value: tuple[int, ...]
+    variance: tuple[int, ...]
+    weight: tuple[int, ...]
+
+
+class TestedAt(NamedTuple):
+    """Columns of a fused estimate's squared innovation, and of how many numbers arrived."""
+
+    distance: int
+    arrived: int
+
+
+class FilterColumns(NamedTuple):
+    """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
+
+    `judgement` is None for a fusion rule, which receives no measurement; `tested` has its squared innovation by what
+    its nodes receive, and is None for all others. `weighed` is None of a filter that weighs nothing.
+    """
+
+    node: str
+    filter: str
+    claim: Claim
+    mean: int
+    covariance: int
+    judgement: JudgementAt | None
+    weighed: WeighedAt | None
+    tested: TestedAt | None
+
+
+def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
+    """Locate each filter's estimate, by reading a row that holds its own column numbers as a row of estimates."""
+    numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
+    mean = by_name(network, numbered, lambda estimate: np.asarray(estimate.mean), -3)
+    covariance = by_name(network, numbered, lambda estimate: np.asarray(estimate.covariance), -4)
+    judged, weighed = _judged(network, numbered), _weighed(network, numbered)
+    tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
+    return tuple(
+        FilterColumns(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
+              judged[node].get(name), weighed.get((node, name)), tested.get((node, name)))
+        for node, filters in network.claims().items()
+        for name, claim in filters.items()
+    )  # fmt: skip
+
+
+def _weighed(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
+    """Return the columns of what each filter that weighs made of its components, by node and filter."""
+    parts = {
+        name: [np.asarray(field)[f, i] for field in outcome["weighed"][kind]]
+        for name, (kind, f, i) in network.places().items()
+        if outcome["weighed"][kind] is not None
+    }
+    central = {(FUSED, name): list(at) for name, at in outcome["weighed_centrally"].items() if at is not None}
+    return {
+        name: WeighedAt(*(tuple(map(int, field)) for field in columns)) for name, columns in (parts | central).items()
+    }
+
+
+def _judged(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
+    """Return the columns of each part of a judgement, by node and filter."""
+    judged = {"estimates": outcome["judged"], "fused": {}}
+    parts = [by_name(network, judged, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
+    by_node = {
+        node: {name: JudgementAt(*(int(field[node][name]) for field in parts)) for name in filters}
+        for node, filters in parts[0].items()
+    }
+    central = outcome["judged_centrally"]
+    return by_node | {
+        FUSED: {name: JudgementAt(*(int(column) for column in columns)) for name, columns in central.items()}
+    }
+
+
+def _part(i: int, judged: PyTree) -> np.ndarray:
+    return np.asarray(judged[i])
