@@ -53,6 +53,48 @@ def test_without_loss_delta_is_at_most_the_smallest_jump():
     assert smallest > 0.6 and below > above + 8
 
 
+@pytest.mark.parametrize("last", [1, 4, 60, 10_000])
+def test_who_interrupts_keeps_the_best_so_far(monkeypatch, last):
+    """While the maximum is searched, or an interval; before the first point there is nothing to keep."""
+    totals = []
+
+    def stopping(filter, z, u):
+        if len(totals) == last:
+            raise KeyboardInterrupt
+        # A parabola in delta, in place of the filter: its maximum is at .5.
+        totals.append(-((float(filter.trigger.delta) - 0.5) ** 2) * 1e3)
+        return totals[-1]
+
+    def build():
+        return hg.Network(
+            PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {}, trigger=hg.SendOnDelta(hg.free(0.45, "delta")))}
+        )
+
+    monkeypatch.setattr("heliograph.learning.senders.log_likelihood", stopping)
+    fitted = hg.fit(build, {"a": np.arange(40.0)[:, None]}, starts=2)
+    (row,) = fitted.rows()
+    assert fitted.stopped == (last < 10_000) and np.isfinite(row.estimate) and "delta" in str(fitted)
+    if fitted.stopped:
+        assert fitted.sentences == ("Stopped before the end: this is the best so far.",) and np.isnan(row.low)
+        assert fitted.total == max(totals) and fitted.network.nodes["a"].trigger.delta == row.estimate
+    else:
+        assert row.estimate == pytest.approx(0.5, abs=1e-3) and row.low < 0.5 < row.high  # digits of the search
+
+
+def test_who_interrupts_before_the_first_point_has_nothing(monkeypatch):
+    def stopping(filter, z, u):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("heliograph.learning.senders.log_likelihood", stopping)
+
+    def build():
+        node = hg.Node(SENSOR, hg.perfect(), {}, trigger=hg.SendOnDelta(hg.free(0.45, "delta")))
+        return hg.Network(PLANT, {"a": node})
+
+    with pytest.raises(KeyboardInterrupt):
+        hg.fit(build, {"a": np.arange(40.0)[:, None]}, starts=1)
+
+
 def test_a_network_of_several_nodes_is_refused_in_one_line():
     def build():
         node = hg.Node(SENSOR, hg.perfect(), {}, trigger=hg.SendOnDelta(hg.free(0.6)))

@@ -40,6 +40,7 @@ class SenderFit:
         total: log-likelihood of the maximum, in nats.
         table: a row for each number.
         converged: True if the search for the maximum converged.
+        stopped: true if it was interrupted, so that this is the best so far; an interval that was not searched is NaN.
         delays: by node the law of its delays, of a recording that is a table of events.
     """
 
@@ -48,6 +49,7 @@ class SenderFit:
     total: float
     table: tuple[Row, ...]
     converged: bool
+    stopped: bool = False
     delays: DelaysByNode = field(default_factory=dict)
 
     @property
@@ -72,12 +74,15 @@ class SenderFit:
     @property
     def sentences(self) -> tuple[str, ...]:
         """Remarks on the fit; none where the search converged."""
+        if self.stopped:
+            return ("Stopped before the end: this is the best so far.",)
         return () if self.converged else ("The search did not converge: the estimates are the best points found.",)
 
     def __str__(self) -> str:
         """The table and the sentences."""
         width = max(len(row.name) for row in self.table)
-        lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})" for row in self.table]
+        lines = [f"{row.name:{width}}  {row.value:>10}" + (f"  ({row.interval})" if row.low == row.low else "")
+                 for row in self.table]  # fmt: skip
         late = [f"{node}: {delays}" for node, delays in self.delays.items()]
         return "\n".join([*lines, *late, *self.sentences])
 
@@ -98,9 +103,10 @@ def fit_sender(
 
     In delta the likelihood has steps, where a value that came would have been silent: so it is searched without
     derivatives (Nelder and Mead), from the start and from others around it. The interval of a number is where twice
-    the likelihood, largest over all others, is within 3.84 of its maximum.
+    the likelihood, largest over all others, is within 3.84 of its maximum. Who interrupts keeps the best so far.
 
     Raises:
+        KeyboardInterrupt: before there was a first point.
         ValueError: more than one node; numbers with no coordinate of their own; recordings that do not fit.
     """
     parameters = description.parameters
@@ -122,10 +128,44 @@ def fit_sender(
     # The best of several starts, and the profile of each number.
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
-    ends = [_highest(likelihood, np.asarray(point)) for point in points]
-    x, total, converged = max(ends, key=lambda end: end[1])
-    table = tuple(_row(description, likelihood, x, total, i) for i in range(len(parameters.entries)))
-    return SenderFit(description, x, total, table, converged)
+    x, total, converged, stopped = _searched(likelihood, points)
+    rows = list[Row]()
+    for i in range(len(parameters.entries)):
+        row = _row_without_ends(description, x, i)
+        try:
+            rows.append(row if stopped else _row(row, description, likelihood, x, total, i))
+        except KeyboardInterrupt:
+            stopped = True
+            rows.append(row)
+    return SenderFit(description, x, total, tuple(rows), converged, stopped)
+
+
+def _searched(
+    likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]
+) -> tuple[Float[np.ndarray, " p"], float, bool, bool]:
+    """The best point from several starts, its likelihood, whether its search converged, and whether it was stopped.
+
+    Raises:
+        KeyboardInterrupt: before there was a first point.
+    """
+    seen: tuple[Float[np.ndarray, " p"], float] | None = None
+
+    def noted(x: Float[np.ndarray, " p"]) -> float:
+        nonlocal seen
+        total = likelihood(x)
+        if seen is None or total > seen[1]:
+            seen = x.copy(), total
+        return total
+
+    ends = list[tuple[Float[np.ndarray, " p"], float, bool]]()
+    try:
+        for point in points:
+            ends.append(_highest(noted, np.asarray(point)))
+    except KeyboardInterrupt:
+        if seen is None:
+            raise
+        return *seen, False, True
+    return *max(ends, key=lambda end: end[1]), False
 
 
 def filter_at(network: Network) -> AbstractFilter:
@@ -162,8 +202,16 @@ def _highest(
     return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
 
 
-def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int) -> Row:
-    """The estimate, and how far the profile stays near its maximum to either side."""
+def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
+    """The estimate, with no interval."""
+    estimate = float(description.parameters.entries_at(x)[index])
+    return Row(description.parameters.entries[index].name, estimate, np.nan, np.nan, np.nan, "conditional", False, True)
+
+
+def _row(
+    row: Row, description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int
+) -> Row:
+    """The row of an estimate, with how far the profile stays near its maximum to either side."""
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
 
@@ -194,4 +242,4 @@ def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, 
                 break
         ends.append(number(x[coordinate] + sign * outside))
     low, high = sorted(ends)
-    return Row(entry.name, number(x[coordinate]), low, high, (high - low) / (2 * 1.96), "conditional", False, True)
+    return row._replace(low=low, high=high, standard_error=(high - low) / (2 * 1.96))
