@@ -98,14 +98,16 @@ def by_native(made: Program, columns: Sequence[np.ndarray], known: Sequence[bool
 def reference(made: Program, columns: Sequence[np.ndarray], random: np.random.Generator) -> dict[str, np.ndarray]:
     """By XLA, run by run, undisturbed and disturbed: (disturbed + 1, runs, ...).
 
-    What is rounded, x, becomes x (1 + e) + f; undisturbed e = 0 and f = -0, which changes nothing.
+    What is rounded, x, becomes x (1 + e) + f; undisturbed e = 0 and f = -0, which changes nothing. Which e follows
+    from the bits of x too: of one e for all turns of a loop, x / (1 + e) of a turn would undo that of the turn before.
     """
 
     def disturbed(disturbance: Disturbance, row: Sequence[Any]) -> dict[str, Any]:
         def rounded(x: Any, n: int) -> Any:
             if x.dtype != np.float64:
                 return x
-            places = (jnp.arange(x.size).reshape(x.shape) + 37 * n) % PLACES
+            bits = (lax.bitcast_convert_type(x, np.uint64) % PLACES).astype(np.int64)
+            places = (jnp.arange(x.size).reshape(x.shape) + 37 * n + bits) % PLACES
             return x * (1 + disturbance[0][places]) + disturbance[1][places]
 
         return function(made, rounded)(*row)
