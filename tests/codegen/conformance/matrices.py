@@ -32,6 +32,7 @@ MATRICES = np.stack(
 KNOWN = MATRICES[:-1]  # LAPACK passes over NaN when it seeks a pivot
 GENERAL = np.concatenate([KNOWN, RANDOM.normal(size=(3, 3, 3)), np.array([[[0.0, 2, 1], [0, 1, 1], [0, 3, 2]]])])
 VECTORS = RANDOM.normal(size=(len(GENERAL), 3))
+PIVOTS = np.array([(i, j, k) for i in range(4) for j in range(1, 4) for k in range(2, 4)], np.int32)
 ROUNDED = 1000.0  # units: of matrices whose condition is some hundred
 
 
@@ -71,17 +72,37 @@ def _masses() -> tuple[np.ndarray, np.ndarray]:
     return pairs[:, 0], pairs[:, 1]
 
 
+def _two(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Two matrices, or two right sides, in each run: (runs, 2, ...)."""
+    return tuple(np.stack([a, a[::-1]], axis=1) for a in arrays)
+
+
+def _by_factors(a: jax.Array, b: jax.Array) -> jax.Array:
+    return jax.scipy.linalg.lu_solve(jax.scipy.linalg.lu_factor(a), b)
+
+
 CASES: dict[str, list[Case]] = {
-    "cholesky": [Case(jnp.linalg.cholesky, (m,), ROUNDED) for m in (MATRICES, _of_one(MATRICES))],
+    "cholesky": [
+        *(Case(jnp.linalg.cholesky, (m,), ROUNDED) for m in (MATRICES, _of_one(MATRICES), *_two(MATRICES))),
+        Case(lambda a: jnp.linalg.cholesky(a[:0]), _two(MATRICES), ROUNDED, "none"),
+    ],
     "triangular_solve": _triangular(),
     "lu": [
         Case(lambda a: lax.linalg.lu(a), (GENERAL,), ROUNDED),
         Case(lambda a: lax.linalg.lu(a), (_of_one(GENERAL),)),
         Case(lambda a: jnp.linalg.det(a), (GENERAL[:-1],), ROUNDED),
+        Case(lambda a: lax.linalg.lu(a), _two(GENERAL), ROUNDED, "two"),
+    ],
+    "lu_pivots_to_permutation": [
+        Case(_by_factors, (GENERAL, VECTORS), ROUNDED),
+        Case(lambda p: lax.linalg.lu_pivots_to_permutation(p, 4), (PIVOTS,)),
+        Case(lambda p: lax.linalg.lu_pivots_to_permutation(p, 5), _two(PIVOTS)),
     ],
     "custom_linear_solve": [
         Case(jnp.linalg.solve, (GENERAL, VECTORS), ROUNDED),
         Case(jnp.linalg.inv, (GENERAL,), ROUNDED),
+        Case(jax.vmap(jnp.linalg.solve), _two(GENERAL, VECTORS), ROUNDED, "two"),
+        Case(lambda a, b: jax.vmap(lambda c: jnp.linalg.solve(a, c))(b), (GENERAL, *_two(VECTORS)), ROUNDED, "sides"),
     ],
     "eigh": [
         Case(_eigenvalues_beside_the_largest, (KNOWN[:7],), ROUNDED),

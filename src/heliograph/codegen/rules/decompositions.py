@@ -1,5 +1,6 @@
 """Rules of small matrices' decompositions: symmetric ones by Jacobi rotations until diagonal, others as L U."""
 
+import math
 from collections.abc import Callable
 from functools import cache
 from itertools import combinations
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, like
+from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of, like, result_shape
 from heliograph.codegen.nodes import Unsupported
 
 LARGEST = 20  # rows: of larger ones the straight line is long, and the library's method faster
@@ -116,10 +117,17 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     shape = avals[0].shape
     if shape[-1] > LARGEST or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    # Of several matrices one after another.
-    program, matrices = _program(shape[-1]), lowering.nodes(inputs[0]).reshape(-1, *shape[-2:])
-    solved = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in matrices]
-    return [np.stack(x).reshape(*shape[:-2], *x[0].shape) for x in zip(*solved, strict=True)]
+    return _of_each(lowering, _program(shape[-1]), equation, inputs[0])
+
+
+def _of_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
+    """Return the results of a program of one matrix for each of many, along leading axes, one after another."""
+    (one,) = program.in_avals
+    before = matrices.shape[: len(matrices.shape) - len(one.shape)]
+    flat = lowering.nodes(matrices).reshape(math.prod(before), *one.shape)
+    items = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in flat]
+    shapes = [result_shape(equation, k) for k in range(len(equation.outvars))]
+    return [array_of((x for item in items for x in item[k].ravel()), shape) for k, shape in enumerate(shapes)]
 
 
 @cache
@@ -146,9 +154,8 @@ def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         taken = j + jnp.argmax(column).astype(jnp.int32)
         pivots.append(taken)
         for i in range(j + 1, n):  # exchange rows j and i where i is taken
-            here = taken == i
-            rows[j], rows[i] = jnp.where(here, rows[i], rows[j]), jnp.where(here, rows[j], rows[i])
-            order[j], order[i] = jnp.where(here, order[i], order[j]), jnp.where(here, order[j], order[i])
+            _exchange_if(taken == i, rows, i, j)
+            _exchange_if(taken == i, order, i, j)
         # Elimination: l_ij = a_ij / a_jj, a_i <- a_i - l_ij a_j; below a pivot of zero the column is zeros, and stays.
         scale = 1 / jnp.where(rows[j][j] == 0, 1.0, rows[j][j])
         for i in range(j + 1, n):
@@ -158,18 +165,44 @@ def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     return jnp.stack(rows), jnp.stack(pivots), jnp.stack(order)
 
 
+def _exchange_if(condition: jax.Array, items: list[jax.Array], i: int, j: int) -> None:
+    """Exchange items i and j where the condition holds."""
+    a, b = items[i], items[j]
+    items[i], items[j] = jnp.where(condition, b, a), jnp.where(condition, a, b)
+
+
+def permutation(pivots: jax.Array, size: int) -> jax.Array:
+    """Return the order of `size` rows after the exchanges of row j with row pivots[j] >= j, one after another."""
+    order = list(jnp.arange(size, dtype=pivots.dtype))
+    for j in range(len(pivots)):
+        for i in range(j + 1, size):
+            _exchange_if(pivots[j] == i, order, i, j)
+    return jnp.stack(order)
+
+
 def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
-    if len(shape) != 2 or shape[0] != shape[1] or shape[0] > LARGEST:
-        raise Unsupported(f"factors of a matrix of shape {shape}")
-    return lowering.inline(_lu_program(shape[0]), inputs)
+    if shape[-2] != shape[-1] or shape[-1] > LARGEST:
+        raise Unsupported(f"factors of a matrix of shape {shape[-2:]}")
+    return _of_each(lowering, _lu_program(shape[-1]), equation, inputs[0])
 
 
 @cache
 def _lu_program(n: int) -> ClosedJaxpr:
     with jax.enable_x64(True):
         return jax.make_jaxpr(lu)(like((n, n), np.float64))
+
+
+def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    program = _permutation_program(inputs[0].shape[-1], equation.params["permutation_size"])
+    return _of_each(lowering, program, equation, inputs[0])
+
+
+@cache
+def _permutation_program(count: int, size: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(like((count,), np.int32))
 
 
 def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -181,4 +214,4 @@ def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
     return lowering.inline(programs.solve, [*fixed, *right])
 
 
-IN_MEMORY |= {"lu": _lu, "custom_linear_solve": _linear_solve}
+IN_MEMORY |= {"lu": _lu, "lu_pivots_to_permutation": _permutation, "custom_linear_solve": _linear_solve}

@@ -182,9 +182,9 @@ def _each_matrix(function: Any) -> Rule:
     """Make a rule of the last two axes: function(graph, parameters, *matrices) for each index of the others."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        flat = [x.reshape(-1, *x.shape[-2:]) for x in inputs]
+        flat = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
         items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
-        return [np.stack(items).reshape(result_shape(equation))]
+        return [array_of((x for item in items for x in item.ravel().tolist()), result_shape(equation))]
 
     return rule
 
