@@ -53,6 +53,39 @@ def test_a_rule_that_fails_lets_xla_compute_and_says_so_once(monkeypatch):
     np.testing.assert_allclose(values, [3.0, 4.0], rtol=1e-12)  # XLA's root has 14 digits
 
 
+def results_of_many_runs():
+    """One factor of its own, so that code is made anew."""
+    return hg.simulation.over_runs(lambda v: 1.25 * jnp.sin(v), np.array([0.5, 1.5]))
+
+
+def live_estimates():
+    plant = hg.LinearPlant([[0.25]], 0.5, [1.0], 0.125)
+    sensor = hg.Sensor(lambda x: jnp.sin(x) + x**3, 0.75)
+    stream = hg.Stream(hg.extended_filter(plant, sensor, hg.perfect()))
+    return np.stack([stream.push([z]).mean for z in (0.5, np.nan, 1.5)])
+
+
+def simulated_estimates():
+    plant = hg.LinearPlant([[0.25]], 0.5, [1.0], 0.125)
+    sensor, link = hg.Sensor(lambda x: jnp.sin(x) + x**5, 0.75), hg.dropout(hg.perfect(), 0.5)
+    node = hg.Node(sensor, link, {"f": hg.extended_filter(plant, sensor, link)})
+    return hg.monte_carlo(hg.Network(plant, {"a": node}), 4, 3, 1).estimates["a"]["f"].mean
+
+
+@pytest.mark.parametrize("compute", [results_of_many_runs, live_estimates, simulated_estimates])
+def test_xla_computes_where_llvm_makes_no_code_which_is_said_once(compute, monkeypatch):
+    def fails(*_):
+        raise RuntimeError(f"LLVM ERROR: out of registers in {compute.__name__}")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("heliograph.codegen.machine.Machine", fails)
+        with pytest.warns(RuntimeWarning) as said:
+            values = compute()
+    assert ["LLVM ERROR" in str(x.message) and "XLA computes" in str(x.message) for x in said] == [True]
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "xla")
+    np.testing.assert_allclose(values, compute(), rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_table_in_a_sensor_is_exported(tmp_path):
     """Interpolation searches the table by the bits of its numbers."""

@@ -14,6 +14,7 @@ import numpy as np
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import LINE, Code, written
 from heliograph.codegen.machine import LONG, WIDEST, Machine, Tiers, features, generated, narrow
+from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
 
@@ -37,6 +38,7 @@ class Compiled:
         self.code: Code = written(program, self.differs, self.width, features()[2])
         self.blocks = Tiers(self.code.blocks, (width or narrow(), self.width))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
+        self._why: str | None = None
         self._first: list[np.ndarray] = []
         self._addresses, self._tables = list[int](), addresses(self.code.tables)
 
@@ -47,17 +49,27 @@ class Compiled:
         new._addresses = addresses(new._first)
         return new
 
-    def prepare(self) -> None:
-        """Generate the code now, so that the first call does not take the time."""
-        for code in (self.blocks, self.once):
-            if code is not None:
-                code.machine(0)
+    def prepare(self, arrays: Sequence[Any] = ()) -> str:
+        """Generate what a first call of these arrays takes, else of one run; return "", or why LLVM makes no code."""
+        if self._why is None:
+            try:
+                if self.once is not None:
+                    self.once.prepare(1)
+                if not all(self.code.common):
+                    self.blocks.prepare(-(-self._runs(arrays) // self.width))
+                self._why = ""
+            except Unsupported as error:
+                self._why = str(error)
+        return self._why
+
+    def _runs(self, arrays: Sequence[Any]) -> int:
+        return next((len(x) for x, d in zip(arrays, self.differs, strict=False) if d), 1)
 
     def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
         """Return the results of all runs, with a leading axis of runs."""
         arrays, given = list(self._first), len(self._first)
         arrays += [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types[given:], strict=True)]
-        runs = next((len(x) for x, d in zip(arrays, self.differs, strict=True) if d), 1)
+        runs = self._runs(arrays)
         code = self.code
         outputs = [np.empty((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
         shared = aligned(code.shared)

@@ -86,6 +86,8 @@ def chosen(
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
     choice = _available() or _cached(function, arguments, differs, MOST if engine == "native" else most)
+    if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
+        choice = Choice(None, why)
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)
     return choice

@@ -115,7 +115,7 @@ class Lowering:
 def failed(operation: str, error: Exception, where: str) -> Unsupported:
     """Return an error by which XLA computes a program whose native code cannot be made, and say so once for a line."""
     refused = Unsupported(f"{operation}, whose native code failed ({type(error).__name__}: {error})", where)
-    _say(f"native code: {refused}; XLA computes")
+    say(f"native code: {refused}; XLA computes")
     return refused
 
 
@@ -131,7 +131,7 @@ def refusing(what: str) -> Iterator[None]:
 
 
 @cache
-def _say(text: str) -> None:
+def say(text: str) -> None:
     """Warn once in a process."""
     warnings.warn(text, RuntimeWarning, stacklevel=2)
 

@@ -10,6 +10,7 @@ import jax
 import llvmlite.binding as llvm
 
 from heliograph.codegen.llvm.module import Source
+from heliograph.codegen.lowering import refusing, say
 
 Function = Callable[[int, int, int, int, int], None]
 SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
@@ -90,15 +91,28 @@ def _hasty() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
+@refusing("a program")
 def generated(source: Source, level: int, width: int) -> Machine:
     """Generate code outside of the main thread, and wait for it.
 
     Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
     there could change its owner and nobody note it, and be freed twice.
+
+    Raises:
+        Unsupported: LLVM makes no code of it, which is said once.
     """
     if current_thread() is not main_thread():
         return Machine(source, level, width)
     return _hasty().submit(Machine, source, level, width).result()
+
+
+def _with_care(source: Source, width: int, hasty: Machine) -> Machine:
+    """Generate code with care; if that fails, that in haste goes on, and it is said once."""
+    try:
+        return Machine(source, 1, width)
+    except Exception as error:
+        say(f"native code: generated with care it failed ({type(error).__name__}: {error}); that in haste goes on")
+        return hasty
 
 
 class Tiers:
@@ -114,17 +128,33 @@ class Tiers:
         self._machine: Machine | None = None
         self._careful: Future[Machine] | None = None
 
+    def prepare(self, blocks: float) -> None:
+        """Generate code for a first execution for so many blocks, if there is none."""
+        with self._lock:
+            self._first(self._executions + self._of(blocks))
+
     def machine(self, blocks: float) -> Machine:
         """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
         with self._lock:
-            source, executions = self._source, blocks * self._source.work / max(self._source.operations, 1)
+            executions = self._of(blocks)
             self._executions += executions
-            pays = often(source.operations)
-            level = int(self._executions >= pays and not jax.config.values["jax_disable_most_optimizations"])
-            if self._machine is None:
-                self._machine = generated(source, level, self._widths[level])
-            elif self._machine.level < level:
-                self._careful = self._careful or background().submit(Machine, source, level, self._widths[level])
-                if executions >= pays or self._careful.done():
-                    self._machine = self._careful.result()
-            return self._machine
+            machine = self._first(self._executions)
+            if machine.level < self._level(self._executions):
+                self._careful = self._careful or background().submit(_with_care, self._source, self._widths[1], machine)
+                if executions >= often(self._source.operations) or self._careful.done():
+                    self._machine = machine = self._careful.result()
+            return machine
+
+    def _first(self, executions: float) -> Machine:
+        if self._machine is None:
+            level = self._level(executions)
+            self._machine = generated(self._source, level, self._widths[level])
+        return self._machine
+
+    def _of(self, blocks: float) -> float:
+        """Return the executions of each operation, on average, for so many blocks."""
+        return blocks * self._source.work / max(self._source.operations, 1)
+
+    def _level(self, executions: float) -> int:
+        pays = executions >= often(self._source.operations)
+        return int(pays and not jax.config.values["jax_disable_most_optimizations"])

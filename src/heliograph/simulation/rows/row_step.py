@@ -108,8 +108,6 @@ class RowStep:
         self._choice = chosen(_in_rows(self._layout), (self._numbers, row), (False, True))
         code = self._choice.code
         self._code = None if code is None else code.with_first(*self._numbers)
-        if self._code is not None:
-            self._code.prepare()
 
     @property
     def engine(self) -> str:
