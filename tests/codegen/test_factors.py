@@ -36,6 +36,16 @@ def test_eigenvalues_of_what_is_no_number_are_none():
     assert np.isnan(values[0]).all() and np.isnan(vectors[0]).all() and np.isfinite(values[1]).all()
 
 
+@pytest.mark.parametrize("scale", [2.0**900, 2.0**-900, 2.0**-1040])
+def test_eigenvalues_of_huge_and_tiny_matrices_are_those_of_the_matrix_in_other_units(scale):
+    """Whose squares overflow or vanish; a power of two is exact, but for entries that are subnormal numbers then."""
+    a = np.array([[[6.0, 2.0, 1.0], [2.0, 5.0, 3.0], [1.0, 3.0, 4.0]]])
+    values, vectors = compile(lambda a: tuple(jnp.linalg.eigh(a)), a[0])(scale * a)
+    expected, others = compile(lambda a: tuple(jnp.linalg.eigh(a)), a[0])(a)
+    np.testing.assert_allclose(values / scale, expected, rtol=4e-16 if scale > 2.0**-1000 else 1e-9)
+    np.testing.assert_allclose(vectors, others, rtol=1e-15)
+
+
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_systems_are_solved_with_the_largest_entry_first(n):
     """Also where the first entry of a column is zero; to rounding times the matrix's condition."""

@@ -33,12 +33,25 @@ KNOWN = MATRICES[:-1]  # LAPACK passes over NaN when it seeks a pivot
 GENERAL = np.concatenate([KNOWN, RANDOM.normal(size=(3, 3, 3)), np.array([[[0.0, 2, 1], [0, 1, 1], [0, 3, 2]]])])
 VECTORS = RANDOM.normal(size=(len(GENERAL), 3))
 PIVOTS = np.array([(i, j, k) for i in range(4) for j in range(1, 4) for k in range(2, 4)], np.int32)
+SEPARATE = [0, 1, 5, 6, 7, 9, 10, 11]  # of the known ones: no two eigenvalues are equal
 ROUNDED = 1000.0  # units: of matrices whose condition is some hundred
 
 
 def _eigenvalues_beside_the_largest(a: jax.Array) -> jax.Array:
     """An eigenvalue is known to the rounding of the matrix, also one that is zero."""
     return jnp.linalg.eigvalsh(a) + 3 * jnp.sum(jnp.abs(a))
+
+
+def _composed(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """V diag(w) V' beside the largest, and V'V beside 3; any sign, and any basis of equal eigenvalues', will do."""
+    w, v = jnp.linalg.eigh(a)
+    return (v * w) @ v.T + 3 * jnp.sum(jnp.abs(a)), v.T @ v + 3
+
+
+def _projectors(a: jax.Array) -> jax.Array:
+    """v v' of each eigenvector, whatever its sign, beside 3."""
+    _, v = jnp.linalg.eigh(a)
+    return v[:, None, :] * v[None, :, :] + 3
 
 
 def _of_one(matrices: np.ndarray) -> np.ndarray:
@@ -105,8 +118,12 @@ CASES: dict[str, list[Case]] = {
         Case(lambda a, b: jax.vmap(lambda c: jnp.linalg.solve(a, c))(b), (GENERAL, *_two(VECTORS)), ROUNDED, "sides"),
     ],
     "eigh": [
-        Case(_eigenvalues_beside_the_largest, (KNOWN[:7],), ROUNDED),
+        Case(_eigenvalues_beside_the_largest, (KNOWN,), ROUNDED),
         Case(jnp.linalg.eigvalsh, (_of_one(MATRICES),), ROUNDED),
+        Case(jnp.linalg.eigh, (MATRICES[-1:],)),
+        Case(_composed, (KNOWN,), ROUNDED, "composed"),
+        Case(_projectors, (KNOWN[SEPARATE],), ROUNDED, "projectors"),
+        Case(jax.vmap(_composed), _two(KNOWN), ROUNDED, "two"),
     ],
     "igamma": [Case(jax.scipy.special.gammainc, _masses(), 1e6)],
     "igammac": [Case(jax.scipy.special.gammaincc, _masses(), 1e6)],

@@ -2,7 +2,10 @@
 
 The cases are made of the table of rules, so that a new rule is covered by being there. What may differ, and why:
 
-* Subnormal numbers, which XLA's code takes for zeros, and native code computes with (`difference`).
+* Subnormal numbers, which XLA's code takes for zeros, and native code computes with (`difference`): arguments of the
+  table and results are held against NumPy instead (`test_subnormal.py`).
+* Eigenvectors, of which any sign, and of equal eigenvalues any basis, is right: V diag(w) V', V'V and v v' of separate
+  eigenvalues are compared (`matrices.py`).
 * Bits of NaN.
 * Units of rounding of functions, which both compute in their own way, and of sums and products, in their own order
   and with a product and a sum rounded once (`Case.units`). XLA's cosh, sinh and exp2 of large numbers have 14 digits,

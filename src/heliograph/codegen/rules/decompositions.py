@@ -30,8 +30,9 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     Park, On parallel Jacobi orderings (1989), by which it converges as the order by rows does.
     """
     n, eps = len(a), float(np.finfo(np.float64).eps)
-    entries = {(i, j): (a[i, j] + a[j, i]) / 2 for i in range(n) for j in range(i, n)}
     finite = jnp.all(jnp.isfinite(a))
+    unit = _unit(a)
+    entries = {(i, j): (a[i, j] / unit + a[j, i] / unit) / 2 for i in range(n) for j in range(i, n)}
     # Off-diagonal entries below eps ||A||_F / n are rounding.
     size = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
     vectors = {(i, j): jnp.asarray(float(i == j)) for i in range(n) for j in range(n)}
@@ -52,7 +53,13 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     values, columns = _sorted([entries[i, i] for i in range(n)], [[vectors[i, j] for i in range(n)] for j in range(n)])
     rows = jnp.stack([jnp.stack(column) for column in columns], axis=1)
-    return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values), jnp.nan)
+    return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values) * unit, jnp.nan)
+
+
+def _unit(a: jax.Array) -> jax.Array:
+    """Return a power of two in whose units squares of the matrix's entries neither overflow nor vanish, mostly 1."""
+    largest = jnp.max(jnp.abs(a))
+    return jnp.where(largest > 2.0**300, 2.0**600, jnp.where(largest < 2.0**-300, 2.0**-600, 1.0))
 
 
 def _tournament(n: int) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
