@@ -1,0 +1,96 @@
+"""The map of the library, made from its code: `python -m tests.map` writes it into the READMEs of the source.
+
+A room is a folder of `heliograph`. What it imports is read from its files, what it is from the first line of its
+README, and its floor from the order in which imports may go (tests/test_structure.py).
+"""
+
+import ast
+import re
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+
+SOURCE = Path(__file__).parents[1] / "src" / "heliograph"
+# Parts of the library, from the description of a world to the programs that people run, and what each is for.
+PARTS = {
+    "ground": "knows no sensor and no estimate",
+    "description": "the world as a user writes it down",
+    "estimation": "from measurements to estimates, alone and in a network; and checks of all that",
+    "design": "numbers from data, or for a purpose",
+    "application": "what people run: files, services, pages, commands",
+}
+ROOMS = {
+    "ground": ["numerics", "codegen", "disk", "factors"],
+    "description": ["random_affine", "model"],
+    "estimation": ["linear", "relays", "h_infinity", "filters", "smoothing", "fusion", "simulation", "testing"],
+    "design": ["learning", "planning"],
+    "application": ["live", "export", "files", "report", "campaign", "serving", "cli"],
+}
+BEGIN, END = "<!-- made by python -m tests.map -->", "<!-- end -->"
+
+
+@cache
+def taken() -> dict[tuple[str, str], set[str]]:
+    """Names that one room imports from another: {(who, of whom): {module.name}}."""
+    names = defaultdict(set)
+    for path in SOURCE.rglob("*.py"):
+        room, *inside = path.relative_to(SOURCE).parts
+        for node in ast.walk(ast.parse(path.read_text())) if inside else ():
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("heliograph."):
+                other = node.module.split(".")[1]
+                if other != room:
+                    names[room, other] |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def crossing(above: list[str], below: list[str]) -> set[str]:
+    """Names of the rooms `below` that the rooms `above` import."""
+    return {name for (who, whom), names in taken().items() if who in above and whom in below for name in names}
+
+
+def imports_of(room: str) -> list[str]:
+    """Rooms that a room imports from, in the order of the floors."""
+    return [other for rooms in ROOMS.values() for other in rooms if (room, other) in taken()]
+
+
+def sentence_of(room: str) -> str:
+    """What a room is: the first sentence of its README."""
+    first = (SOURCE / room / "README.md").read_text().splitlines()[0].removeprefix("**What it is.** ")
+    return re.split(r"(?<=[^.])\. ", first)[0].rstrip(".") + "."
+
+
+def picture() -> str:
+    """The floors, with the rooms on each."""
+    width = max(map(len, PARTS))
+    lines = [f"    {part:<{width}}   {'  '.join(rooms)}" for part, rooms in ROOMS.items()]
+    return "\n".join(f"{line}\n    {'':<{width}}     | {PARTS[part]}" for part, line in zip(PARTS, lines, strict=True))
+
+
+def map_of_rooms() -> str:
+    """The picture and a row for each room."""
+    rows = ["| room | what it is | imports |", "|---|---|---|"]
+    for rooms in ROOMS.values():
+        for room in rooms:
+            others = ", ".join(f"`{other}`" for other in imports_of(room)) or "nothing"
+            rows.append(f"| [`{room}`]({room}/README.md) | {sentence_of(room)} | {others} |")
+    return "\n".join([BEGIN, "", picture(), "", *rows, "", END])
+
+
+def imports_line(room: str) -> str:
+    """The line of a room's README that says what it imports."""
+    return f"**Imports:** {', '.join(f'`{other}`' for other in imports_of(room)) or 'no other room'}."
+
+
+def write() -> None:
+    """Write the map, and what each room imports."""
+    page = SOURCE / "README.md"
+    text = page.read_text()
+    page.write_text(text[: text.index(BEGIN)] + map_of_rooms() + text[text.index(END) + len(END) :])
+    for room in (room for rooms in ROOMS.values() for room in rooms):
+        page = SOURCE / room / "README.md"
+        lines = page.read_text().split("\n")
+        page.write_text("\n".join([lines[0], imports_line(room), *lines[2:]]))
+
+
+if __name__ == "__main__":
+    write()

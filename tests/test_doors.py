@@ -1,0 +1,52 @@
+"""Doors between rooms: the map is what the code says, and the names that cross a border may only become fewer."""
+
+import re
+
+import pytest
+
+from tests.map import ROOMS, SOURCE, crossing, imports_line, map_of_rooms
+from tests.test_structure import PUBLIC
+
+ALL = [room for rooms in ROOMS.values() for room in rooms]
+MADE_BY_EXPORT = {"step.h", "step.c"}  # files that users get
+
+
+def test_every_room_is_on_the_map():
+    assert sorted(ALL) == sorted(p.name for p in SOURCE.iterdir() if (p / "__init__.py").exists())
+    page = (SOURCE / "README.md").read_text()
+    assert map_of_rooms() in page, "write it by: python -m tests.map"
+
+
+@pytest.mark.parametrize("room", ALL)
+def test_the_readme_of_a_room_is_true(room):
+    """It says what the room imports, and names no file that is gone."""
+    text = (SOURCE / room / "README.md").read_text()
+    assert text.splitlines()[1] == imports_line(room), "write it by: python -m tests.map"
+    named = set(re.findall(r"`(?!test_|tests/)([\w/]+\.(?:py|c|h))`", text)) - MADE_BY_EXPORT
+    gone = [name for name in named if not (SOURCE / room / name).exists() and not (SOURCE / name).exists()]
+    assert not gone, f"{room}/README.md names {gone}"
+
+
+def test_the_map_names_no_file_that_is_gone():
+    for name in re.findall(r"`([\w/]+\.py)`", (SOURCE / "README.md").read_text().split("<!--")[0]):
+        assert (SOURCE / name).exists(), name
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "most"),
+    [
+        (("design", "application"), "estimation", 88),
+        (("application",), "estimation", 58),
+    ],
+)
+def test_few_names_cross(above, below, most):
+    """Equal, so that the number here falls with what crosses; lower it, never raise it."""
+    names = crossing([room for part in above for room in ROOMS[part]], ROOMS[below])
+    assert len(names) == most, f"lower the number to {len(names)}, or take fewer than {sorted(names)}"
+
+
+def test_few_names_cross_that_are_not_public():
+    public = {name for _, name in PUBLIC}
+    names = crossing(ROOMS["design"] + ROOMS["application"], ROOMS["estimation"])
+    inside = sorted(name for name in names if name.split(".")[-1] not in public)
+    assert len(inside) == 63, f"lower the number to {len(inside)}, or make public what is missing of {inside}"
