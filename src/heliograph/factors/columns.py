@@ -55,6 +55,13 @@ def joined(*parts: Columns) -> Columns:
     return Columns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
 
 
+def side_by_side(parts: Columns, weights: Array) -> Columns:
+    """Columns of sum_i w_i P_i of covariances P_i; `parts` have a leading axis."""
+    matrix = jnp.asarray(parts.matrix)
+    columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
+    return Columns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
+
+
 def nothing(n: int) -> Columns:
     """A covariance of zero of n components: no columns."""
     return Columns(np.zeros((n, 0)), np.zeros(0))
@@ -188,6 +195,14 @@ def columns_of(covariance: Array) -> Columns:
         root = root_of(covariance)
         return Columns(root, np.ones(root.shape[1]))
     return eliminated(jnp.asarray(covariance))
+
+
+def columns_of_each(covariances: np.ndarray) -> Columns:
+    """Columns (..., n, n) of known covariances (..., n, n), as many as components, some of them zero."""
+    n = covariances.shape[-1]
+    roots = [root_of(covariance) for covariance in covariances.reshape(-1, n, n)]
+    padded = [np.pad(root, ((0, 0), (0, n - root.shape[1]))) for root in roots]
+    return Columns(np.reshape(padded, covariances.shape), np.ones(covariances.shape[:-1]))
 
 
 def rounding_of(seconds: Array) -> Columns:

@@ -24,7 +24,7 @@ from heliograph.factors.columns import (
     unit_lower,
     unit_of,
 )
-from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding
+from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 
@@ -73,7 +73,12 @@ def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
     total = parts[0].covariance
     for part in parts[1:]:
         total = total + part.covariance
-    factors = eliminated(total, len(total) * unit_of(total))
+    return of_matrix(mean, total)
+
+
+def of_matrix(mean: jax.Array, covariance: jax.Array) -> Gaussian:
+    """Gaussian of a covariance matrix that is a sum of squares, by elimination."""
+    factors = eliminated(covariance, len(covariance) * unit_of(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
@@ -121,13 +126,18 @@ class Innovations(NamedTuple):
     variance: Float[jax.Array, " m"]
     whole: Float[jax.Array, " m"]
 
+    @property
+    def determined(self) -> jax.Array:
+        """Which components those before them determine, to rounding (m,)."""
+        return self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
+
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
         """log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
 
         A component that those before it determine, s_j = 0 to rounding, adds nothing where it agrees with them and
         -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation.
         """
-        known = self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
+        known = self.determined
         safe = jnp.where(known, 1.0, self.variance)
         density = -(self.value**2 * (1 / safe) + jnp.log(safe) + LOG_TURN) / 2
         reach = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
@@ -190,17 +200,22 @@ def _measured(
     return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False) * over[0], s[0]
 
 
-def merge(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
-    """Gaussian with the moments of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)'). `parts` have a leading axis.
+def moments_of_mixture(
+    means: Float[jax.Array, "parts n"], covariances: Float[jax.Array, "parts n n"], weights: Float[jax.Array, " parts"]
+) -> tuple[jax.Array, jax.Array]:
+    """Mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
 
     Means are taken about the first: of some so large that all are equal nothing is left, and no rounding to be squared.
     """
-    count, n = parts.mean.shape
-    about = parts.mean - parts.mean[0]
+    about = means - means[0]
     shift = weights @ about
-    roots = jnp.moveaxis(jnp.asarray(parts.root), 0, 1).reshape(n, count * n)
-    within = Columns(roots, (weights[:, None] * parts.variances).reshape(count * n))
-    return of_sum(parts.mean[0] + shift, within, Columns((about - shift).T, weights))
+    within = jnp.reshape(weights @ covariances.reshape(len(weights), -1), covariances.shape[1:])
+    return means[0] + shift, symmetric(within + Columns((about - shift).T, weights).covariance)
+
+
+def merge(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
+    """Gaussian with the moments of a mixture; `parts` have a leading axis."""
+    return of_matrix(*moments_of_mixture(parts.mean, parts.covariance, weights))
 
 
 class Backwards(NamedTuple):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import Columns
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
@@ -181,7 +182,9 @@ def _by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
     """Return the description of z = Q G R^-1 y + Q n for each mode."""
     values: Modes = channel.values if isinstance(channel, OverTime) else channel
     of_mean, of_spread = _of_channel(units)
-    scaled: Modes = replace(values, mean=of_mean * values.mean, spread=of_spread * values.spread)
+    noise = Columns(units.received[:, None] * values.noise.matrix, values.noise.weights)
+    gains = of_spread * values.gain_spread
+    scaled: Modes = replace(values, mean=of_mean * values.mean, gain_spread=gains, noise=noise)
     return OverTime(scaled) if isinstance(channel, OverTime) else scaled
 
 
@@ -192,7 +195,7 @@ def _components(components: Components | OverTime, units: Units) -> Components |
         values.weight,
         q[:, None] * values.gain / units.states,
         q * values.offset,
-        np.outer(q, q) * values.noise,
+        Columns(q[:, None] * values.noise.matrix, values.noise.weights),
         values.mode,
         values.transition,
     )

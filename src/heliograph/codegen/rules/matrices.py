@@ -24,7 +24,8 @@ def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float
 def _reduction(op: str, empty: float) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
-        x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), -1)
+        terms = math.prod(inputs[0].shape[axis] for axis in axes)  # none of a sum over nothing
+        x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
         return [array_of([total(lowering.graph, op, type, row, _within(type, empty)) for row in x.tolist()], shape)]
 
     return rule

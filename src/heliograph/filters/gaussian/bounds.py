@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelated, eliminated, joined, reciprocal, triangular, unit_of
+from heliograph.factors.columns import Columns, decorrelated, joined, reciprocal, triangular
 from heliograph.factors.gaussian import Gaussian, observe, of_sum
 from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
-from heliograph.filters.gaussian.signal import LOST, Received, Signal, homogeneous
+from heliograph.filters.gaussian.signal import Received, Signal, eliminated_spread, homogeneous
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
@@ -80,7 +80,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars:
     # The same bound as a Kalman update.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
     wide = prior._replace(variances=a * prior.variances)
-    return observe(wide, slopes, a * z.innovation, _factored(noise), present)[0]
+    return observe(wide, slopes, a * z.innovation, eliminated_spread(noise), present)[0]
 
 
 def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scalar: Array) -> Gaussian:
@@ -106,7 +106,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
     cross = (slopes * prior.variances) @ prior.root.T
     parts = base + absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
     beta = smallest_scalars(zero_mean_sweep, scalar, parts)[0]
-    after = observe(prior, slopes, z.innovation, _factored(base + shift / beta - of_state), present)[0]
+    after = observe(prior, slopes, z.innovation, eliminated_spread(base + shift / beta - of_state), present)[0]
     wider = of_sum(after.mean, after.columns, Columns(explained, beta * share))
     return keep_unless(jnp.any(present), wider, after)
 
@@ -123,10 +123,6 @@ def bounded_covariance(signal: Signal, channel: SecondOrder, present: jax.Array)
     _, of_state, of_noise = _received(signal, channel, present)
     spread = channel.spread(homogeneous(signal.second, signal.mean, 1.0), present)
     return spread + of_state + of_noise + absent(present)
-
-
-def _factored(noise: jax.Array) -> Columns:
-    return eliminated(noise, LOST * unit_of(noise))
 
 
 def absent(present: jax.Array) -> jax.Array:

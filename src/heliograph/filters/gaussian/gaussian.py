@@ -4,8 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, joined
-from heliograph.factors.gaussian import Gaussian, observe
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
     FilterAngles,
@@ -15,7 +14,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
 from heliograph.filters.gaussian.precise import state_rounding
-from heliograph.filters.gaussian.signal import Received, Signal, received_noise, signal_of
+from heliograph.filters.gaussian.signal import Received, Signal, corrected_by, received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan
@@ -28,7 +27,7 @@ from heliograph.model.over_time import OverTime, at, at_each_step, first, unstac
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
-from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
@@ -93,16 +92,12 @@ def corrected(
     covariance and the density of the nominal law, whatever the rule bounds.
     """
     unknown = signal if unknown is None else unknown
-    expected, present = channel.mean_gain @ signal.mean + channel.offset, ~jnp.isnan(z)
-    z = nearest(z, expected, angles)
-    value = z - expected
+    expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
     # By the nominal law: the best update of a known one.
     slopes, noise = jnp.asarray(channel.mean_gain) @ unknown.slopes, received_noise(unknown, channel)
-    nominal, innovations = observe(unknown.prior, slopes, value, noise, present)
-    total = joined(Columns(slopes, unknown.prior.variances), noise).covariance
-    density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
-    after = rule.condition(unknown, channel, Received(value, present), nominal)
-    return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
+    nominal, innovation = corrected_by(unknown.prior, slopes, noise, z, expected, angles)
+    received = Received(jnp.asarray(innovation.value), ~jnp.isnan(z))
+    return rule.condition(unknown, channel, received, nominal), innovation
 
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:

@@ -12,10 +12,12 @@ import jax.numpy as jnp
 from heliograph.factors.columns import Columns, eliminated, joined, rounding_of, triangular, unit_of
 from heliograph.factors.gaussian import Gaussian, Innovations, observe
 from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
+from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import continued
+from heliograph.numerics.angle import Angles, continued, nearest
 from heliograph.numerics.linalg import contract
+from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
 LOST = 100  # roundings of its variance, which elimination leaves of a combination free of a random gain
@@ -105,27 +107,48 @@ def received_noise(signal: Signal, channel: SecondOrder) -> Columns:
     What the random gain adds, E[(G - M) y y' (G - M)'], is formed and eliminated: of a combination free of it, that
     leaves a hundred eps.
     """
-    gain = jnp.asarray(channel.mean_gain)
+    return noise_through(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
+
+
+def noise_through(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
+    """`received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ jnp.sqrt(signal.size)) ** 2)
-    known = triangular(joined(signal.noise.through(gain), channel.noise, rounding))
-    return joined(known, gain_noise(channel, signal.second, signal.mean))
+    known = triangular(joined(signal.noise.through(gain), link, rounding))
+    return joined(known, gain_noise(gain_spread, signal.second, signal.mean))
 
 
-def gain_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
+def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> Columns:
     """Factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
-    spread = contract(channel.gain_spread, homogeneous(second, mean, 1.0))
+    return eliminated_spread(contract(gain_spread, homogeneous(second, mean, 1.0)))
+
+
+def eliminated_spread(spread: jax.Array) -> Columns:
+    """Factors of a spread that is formed: of a combination free of it, elimination leaves a hundred eps."""
     return eliminated(spread, LOST * unit_of(spread))
 
 
 def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
     """Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
-    return joined(channel.noise, gain_noise(channel, second, mean))
+    return joined(channel.noise, gain_noise(channel.gain_spread, second, mean))
 
 
 def observe_received(signal: Signal, channel: SecondOrder, z: Received) -> tuple[Gaussian, Innovations]:
     """Condition the prior on what arrived behind the nominal law of the channel."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
     return observe(signal.prior, slopes, z.innovation, received_noise(signal, channel), z.present)
+
+
+def corrected_by(
+    x: Gaussian, slopes: jax.Array, noise: Columns, z: jax.Array, expected: jax.Array, angles: Angles = ()
+) -> tuple[Gaussian, Innovation]:
+    """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive."""
+    present = ~jnp.isnan(z)
+    z = nearest(z, expected, angles)
+    value = z - expected
+    after, innovations = observe(x, slopes, value, noise, present)
+    total = joined(Columns(slopes, x.variances), noise).covariance
+    density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
+    return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
 
 def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:

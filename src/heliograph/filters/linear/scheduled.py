@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.factors.columns import Columns, joined, root_of, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, given, move, observe
+from heliograph.factors.columns import Columns, columns_of_each, joined, rounding_of, triangular
+from heliograph.factors.gaussian import Gaussian, given, move
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.precise import state_rounding
+from heliograph.filters.gaussian.signal import corrected_by
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -173,11 +174,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         s: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
         expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
-        after, innovations = observe(state, slopes, z - expected, noise, ~jnp.isnan(z))
-        total = joined(Columns(slopes, state.variances), noise).covariance
-        present = ~jnp.isnan(z)
-        density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
-        return after, Innovation(z - expected, jnp.where(present[:, None] & present, total, jnp.nan), density)
+        return corrected_by(state, slopes, noise, z, expected)
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
@@ -218,16 +215,13 @@ def _factored(system: LinearSystem) -> SystemNoises:
     sizes = (np.abs(s.output) @ np.sqrt(start) + np.abs(s.offset)) ** 2
 
     def columns(covariances: np.ndarray, seconds: np.ndarray) -> Columns:
-        n = covariances.shape[-1]
-        roots = [root_of(covariance) for covariance in covariances]
-        padded = np.stack([np.pad(root, ((0, 0), (0, n - root.shape[1]))) for root in roots])
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
 
-        def of_step(root: jax.Array, seconds: jax.Array) -> Columns:
-            return triangular(joined(Columns(root, np.ones(n)), rounding_of(seconds)))
+        def of_step(own: Columns, seconds: jax.Array) -> Columns:
+            return triangular(joined(own, rounding_of(seconds)))
 
         with_rounding: Callable[..., Columns] = jax.vmap(of_step)
-        factors = with_rounding(padded, rounding)
+        factors = with_rounding(columns_of_each(covariances), rounding)
         return Columns(np.asarray(factors.matrix), np.asarray(factors.weights))
 
     return SystemNoises(columns(np.asarray(s.process), start), columns(np.asarray(s.noise), sizes))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.codegen.engine import compiled
+from heliograph.factors.columns import Columns, columns_of_each, joined, rounding_of
+from heliograph.factors.gaussian import Gaussian, given, merge, move, observe
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -20,9 +21,8 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.precise import above_rounding
-from heliograph.filters.innovation import log_density, mixed_innovation, posterior_weights
+from heliograph.filters.gaussian.belief import process_noise, start_of
+from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.channel import Channel, check_link, received_angles
@@ -33,7 +33,7 @@ from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.linalg import above_products, cholesky, psd_solve, symmetrize, with_rounding
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.base import AbstractRandomAffine, fold, memories
@@ -41,7 +41,8 @@ from heliograph.random_affine.chain import Autoregression
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Gaussian, Independent, Shaped
+from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Independent, Shaped
+from heliograph.random_affine.noise import Gaussian as GaussianNoise
 
 COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
 
@@ -121,7 +122,7 @@ def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
     """All combinations of the atoms of a noise's components."""
     match noise:
         # One atom, its mean, with the covariance about it.
-        case Gaussian():
+        case GaussianNoise():
             return [(1.0, np.asarray(noise.mean), np.asarray(noise.covariance))]
         case FiniteSupport():
             none = np.zeros((noise.dimension, noise.dimension))
@@ -150,13 +151,13 @@ class Components(Module):
     weight: P(combination | mode). transition: of the modes from the step before; a single mode for links without
     memory.
 
-    Shapes: weight, mode (a,), gain (a, m, n), offset (a, m), noise (a, m, m), transition (M, M).
+    Shapes: weight, mode (a,), gain (a, m, n), offset (a, m), noise (a, m, m) columns, transition (M, M).
     """
 
     weight: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
-    noise: np.ndarray
+    noise: Columns
     mode: np.ndarray
     transition: np.ndarray
 
@@ -164,13 +165,24 @@ class Components(Module):
 class MixtureBelief(NamedTuple):
     """One Gaussian for the state, and the modes' probabilities.
 
-    Shapes: mean (n,), covariance (n, n), law (M,). `moved` is true from the first prediction on.
+    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), law (M,). `moved` is true from the first prediction on.
     """
 
     mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " n"]
     law: Float[jax.Array, " M"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """The state given the data."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of the state."""
+        return self.gaussian.covariance
 
 
 class MixtureFilter(AbstractSizedFilter):
@@ -200,58 +212,46 @@ class MixtureFilter(AbstractSizedFilter):
         """True: it is a mixture over atoms."""
         return True
 
-    @compiled
+    @in_float64
     def init(self) -> MixtureBelief:
         """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)
-        mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
-        return MixtureBelief(mean, spread, jnp.asarray(self.initial), jnp.asarray(False))
+        prior = given(start.initial_mean, start.initial_covariance)
+        return MixtureBelief(*prior, jnp.asarray(self.initial), jnp.asarray(False))
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
         """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        transition = plant.transition_matrix(u)
-        moved = transition @ state.covariance @ transition.T
-        spread = above_products(moved, transition, state.covariance) + plant.noise_covariance(u)
+        noise = process_noise(plant, u, start_of(at(self.plant, 0)))
+        moved = move(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
-        return MixtureBelief(plant.transition(state.mean, u) + plant.noise_mean(), spread, law, jnp.asarray(True))
+        return MixtureBelief(*moved, law, jnp.asarray(True))
 
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching."""
-        c, z, (mean, spread, law, _) = at(self.components, k), jnp.asarray(z), state
-        prior = law[c.mode] * jnp.asarray(c.weight)
+        c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
+        prior, size = state.law[c.mode] * jnp.asarray(c.weight), jnp.sqrt(start_of(at(self.plant, 0)))
         present = ~jnp.isnan(z)
-        both = present[:, None] & present
 
-        # Kalman update of one combination: S = G P G' + R, its gain, likelihood and innovation.
-        def condition(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> tuple[jax.Array, ...]:
-            cross = jnp.where(present[:, None], gain @ spread, 0.0)
-            total = jnp.where(both, gain @ spread @ gain.T + noise, 0.0) + jnp.diag(jnp.where(present, 0.0, 1.0))
-            value = wrapped(z - gain @ mean - offset, self.observed_angles)
-            observed = jnp.where(present, value, 0.0)
-            solved = psd_solve(total, jnp.concatenate([cross, observed[:, None]], axis=1))
-            free = jnp.diagonal(cholesky(total)) > 0
-            likelihood = log_density(value, total, jnp.abs(z) + jnp.abs(z - value))
-            return likelihood, jnp.sum(~free), cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
+        # Kalman update of one combination, with the rounding of what it says of the state.
+        def condition(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, tuple[jax.Array, ...]]:
+            slopes, value = gain @ x.root, wrapped(z - gain @ x.mean - offset, self.observed_angles)
+            noise = joined(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
+            after, innovations = observe(x, slopes, value, noise, present)
+            likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
+            total = joined(Columns(slopes, x.variances), noise).covariance
+            return after, (likelihood, jnp.sum(present & innovations.determined), value, total)
 
-        likelihood, certain, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
+        after, (likelihood, certain, value, total) = jax.vmap(condition)(c.gain, c.offset, c.noise)
         weight, density, excluded = posterior_weights(prior, sharpest(likelihood, certain))
-        # Moments of the mixture: P - sum_a w_a K_a S_a K_a' + spread of the means.
-        shift = weight @ moved
-        apart = moved - shift
-        after = (
-            with_rounding(spread, len(z))
-            - jnp.einsum("a,aij->ij", weight, known)
-            + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
-        )
         # Innovation of the mixture, angles near that of the most probable combination.
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
-        innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), density)
-        modes = weight @ (c.mode[:, None] == jnp.arange(len(law)))
-        after = above_rounding(symmetrize(after), spread, start_of(at(self.plant, 0)))
-        updated = MixtureBelief(mean + shift, after, modes, state.moved)
+        total = jnp.where(present[:, None] & present, total, jnp.nan)
+        innovation = mixed_innovation(prior, value, total, density)
+        modes = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
+        updated = MixtureBelief(*merge(after, weight), modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @estimates
@@ -262,7 +262,8 @@ class MixtureFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments around the update."""
         plant = at(self.plant, step.k)
-        cross = step.before.covariance @ plant.transition_matrix(jnp.asarray(step.u)).T
+        x, slopes = step.before.gaussian, plant.transition_matrix(jnp.asarray(step.u)) @ step.before.gaussian.root
+        cross = (x.root * x.variances) @ slopes.T
         return moments_smoother_step(step.after, step.prior, cross, "nominal", plant.angles)
 
 
@@ -342,4 +343,4 @@ def _components(sensor: AnySensor, now: JointModes, before: JointModes, floor: f
     mode = np.array([i for _, i in parts])
     weight, gain, offset, noise = (np.array(column) for column in zip(*(c for c, _ in parts), strict=True))
     noise = noise + floor * np.eye(noise.shape[-1])
-    return Components(weight, gain, offset, noise, mode, np.asarray(before.transition))
+    return Components(weight, gain, offset, columns_of_each(noise), mode, np.asarray(before.transition))

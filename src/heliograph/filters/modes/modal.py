@@ -4,25 +4,29 @@ With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its transition and i
 noises white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~ zeta^j, so
 that a Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1),
 c = E[x] before data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
+
+The covariance of zeta is carried by factors; the moments before any data, which no measurement diminishes, are plain
+matrices.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
-from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.correction import absent, gain_and_covariance
-from heliograph.filters.gaussian.precise import (
-    above_rounding,
-    noise_rounding,
-    output_rounding,
-    state_rounding,
+from heliograph.factors.columns import (
+    Columns,
+    below_diagonal,
+    joined,
+    outer,
+    rounding_of,
+    side_by_side,
 )
-from heliograph.filters.innovation import gaussian_innovation
+from heliograph.factors.gaussian import Gaussian, given, of_columns
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.gaussian.belief import process_noise, start_of
+from heliograph.filters.gaussian.signal import corrected_by, eliminated_spread
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step
@@ -31,42 +35,77 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.linalg import above_products, symmetrize
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stacked
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import nominal_spread
+from heliograph.random_affine.moments.second_moments import divided, nominal_spread, undivided
 
 
 class ObservationModel(Module):
-    """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
+    """A channel at one step, mode by mode: E[(G, n) | mode], and what (G, n) varies by about it.
 
-    transition: of the modes from the step before to this one; radius: bound on the error of each of its entries.
+    transition: of the modes from the step before to this one; radius: bound on the error of each of its entries;
+    gain_spread and noise: as in `SecondOrder`, for each mode.
 
-    Shapes: transition and radius (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
+    Shapes: transition and radius (M, M), mean (M, m, p + 1), gain_spread (M, m, m, p + 1, p + 1), noise (M, m, m).
     """
 
     transition: Float[Array, "M M"]
     radius: Float[Array, "M M"]
     mean: Float[Array, "M m p1"]
-    spread: Float[Array, "M m m p1 p1"]
+    gain_spread: Float[Array, "M m m p1 p1"]
+    noise: Columns
+
+    @property
+    def spread(self) -> Float[Array, "M m m p1 p1"]:
+        """E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor."""
+        spread: Array = undivided(self.gain_spread, self.noise)
+        return spread
 
 
 class ModalBelief(NamedTuple):
-    """Estimate of zeta, mode by mode, its error covariance, and E[x~ x~' 1{mode}] before any data.
+    """Estimate of zeta, mode by mode, factors of its error's covariance, and E[x~ x~' 1{mode}] before any data.
 
     centre c = E[x] before data; P(mode) c is part of the mean, whose sum over the modes is that of x. `moved` is true
     from the first prediction on.
 
-    Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1, n + 1), centre (n,).
+    Shapes: with N = M (n + 1): mean, variances (N,), lower (N (N - 1) / 2,), moments (M, n + 1, n + 1), centre (n,).
     """
 
     mean: Float[jax.Array, " N"]
-    covariance: Float[jax.Array, "N N"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " N"]
     moments: Float[jax.Array, "M n1 n1"]
     centre: Float[jax.Array, " n"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """zeta given the data."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of the error of zeta."""
+        return self.gaussian.covariance
+
+    @property
+    def law(self) -> jax.Array:
+        """Probabilities of the modes before any data (M,)."""
+        return self.moments[:, -1, -1]
+
+
+class Output(NamedTuple):
+    """A measurement z = common + H zeta + noise of zeta.
+
+    Shapes: matrix H (m, N), common (m,), noise (m, columns).
+    """
+
+    matrix: jax.Array
+    common: jax.Array
+    noise: Columns
 
 
 class AbstractModalFilter(AbstractSizedFilter):
@@ -80,22 +119,19 @@ class AbstractModalFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """x = sum_j zeta^j."""
-        projection = self._projection()
-        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
+        projection, x = self._projection(), state.gaussian
+        return Estimate(projection @ x.mean, Columns(projection @ x.root, x.variances).covariance, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
         return plan(self, inputs, self._projection())
 
-    def above_rounding(self, after: jax.Array, prior: jax.Array, law: jax.Array) -> jax.Array:
-        """Cov(zeta) and, for the part of x in each mode, its share of what the mean cannot say."""
-        return after + mean_rounding(at(self.plant, 0), law, after, prior)
-
-    def rounding(self, gains: jax.Array, random: jax.Array, k: Step) -> jax.Array:
-        """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
-        of_z = received_rounding(at(self.sensor, k), start_of(at(self.plant, 0)), gains)
-        variance: jax.Array = of_z + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
-        return variance
+    def moved_noise(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
+        """Covariance (N, N) of the process noise and of the rounding of zeta, by E[1{next} 1{next}'] of the modes."""
+        own = process_noise(at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0)))
+        one = rounding_of(np.ones(1))  # of the mode's indicator
+        parts = Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
+        return Columns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
 
     def _projection(self) -> Float[np.ndarray, "n N"]:
         return sum_of_modes(len(self.states), len(self.initial))
@@ -105,18 +141,18 @@ class ModalFilter(AbstractModalFilter):
     """The linear minimum-mean-square-error filter of a linear plant behind links with memory.
 
     The estimate of zeta includes the modes' probabilities; its covariance is singular, since the modes' indicators
-    sum to 1, and is never inverted. Which components arrive must not depend on the modes. The innovation covariance
-    is exact; the innovation is not Gaussian, so its Gaussian likelihood is nominal.
+    sum to 1, which its factors take as it is. Which components arrive must not depend on the modes. The innovation
+    covariance is exact; the innovation is not Gaussian, so its Gaussian likelihood is nominal.
 
     Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994).
     """
 
-    @compiled
+    @in_float64
     def init(self) -> ModalBelief:
         """Return the prior, independent of the mode."""
-        law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
-        moments = law[:, None, None] * second
-        return ModalBelief(jnp.kron(law, jnp.append(centre, 1.0)), covariance, moments, centre, jnp.asarray(False))
+        law, (prior, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
+        moments, centre = law[:, None, None] * second, jnp.asarray(at(self.plant, 0).initial_mean)
+        return ModalBelief(*prior, moments, centre, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
@@ -124,68 +160,101 @@ class ModalFilter(AbstractModalFilter):
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
-        step, move, noise, centre, rows = self._moves(state, u, k)
-        # E[x~ x~' 1{mode}] one step later, and F P F' + the covariance above.
-        moments, fresh = _spread_of_moves(state.moments, move, noise, rows)
-        covariance = symmetrize(above_products(step @ state.covariance @ step.T, step, state.covariance) + fresh)
+        (move, noise, centre), rows = moved_about(at(self.plant, k), u, state.centre), self._rows(state, k)
+        law, x = state.law @ rows, state.gaussian
         # F zeta about the moving centre.
-        law = state.moments[:, -1, -1]
-        mean = step @ (state.mean - known_part(law, state.centre)) + known_part(law @ rows, centre)
-        return ModalBelief(mean, covariance, moments, centre, jnp.asarray(True))
+        root = moved_by_mode(x.root, move, rows)
+        known = x.mean - known_part(state.law, state.centre)
+        mean = moved_by_mode(known[:, None], move, rows)[:, 0] + known_part(law, centre)
+        # Columns of F P F' and of the covariance above.
+        carried = jax.vmap(lambda a: move @ a @ move.T)(state.moments)
+        fresh = joined(spread_of_moves(carried, rows), self.moved_noise(u, k, Columns(jnp.eye(len(law)), law)))
+        moments = jnp.einsum("ij,iab->jab", rows, carried) + law[:, None, None] * noise
+        after = of_columns(mean, joined(Columns(root, x.variances), fresh))
+        return ModalBelief(*after, moments, centre, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
         """Correct with the components of z that arrived.
 
-        Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
+        Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j the spread of
+        the gains in mode j.
         """
-        observed, added, common, rounded = self._observe(state, k)
-        law = state.moments[:, -1, -1]
-        expected = common + observed @ (state.mean - known_part(law, state.centre))
-        mean, covariance, innovation = linear_observation(
-            state.mean, state.covariance, observed, added, expected, rounded, z
-        )
-        covariance = self.above_rounding(covariance, state.covariance, law)
-        return state._replace(mean=mean, covariance=covariance), innovation
+        known = state.mean - known_part(state.law, state.centre)
+        after, innovation = observe_modes(state.gaussian, known, self._output(state, k), z)
+        return ModalBelief(*after, *state[3:]), innovation
 
-    def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, ...]:
-        """Return F, the plant's A~ and Q~, the next centre c, and the transition matrix of the chain."""
-        move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
-        rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
-        return jnp.kron(rows.T, move), move, noise, centre, rows
+    def _rows(self, state: ModalBelief, k: Step) -> jax.Array:
+        """Transition matrix of the chain (M, M)."""
+        return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
-    def _observe(self, state: ModalBelief, k: Step) -> tuple[jax.Array, ...]:
-        """Return the output matrix of zeta less the mean output, Cov(z - E[z | zeta]), mean output, rounding of z."""
-        channel = at(self.channel, k)
-        gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(at(self.sensor, k), state.centre)
-        law = state.moments[:, -1, -1]
-        sent = jax.vmap(lambda a: above_products(measure @ a @ measure.T, measure, a))(state.moments)
-        second = sent + law[:, None, None] * noise
-        random = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
-        added = random + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
-        observed, common = without_common(gains @ measure, law)
-        return joined(observed), added, common, self.rounding(gains, random, k)
+    def _output(self, state: ModalBelief, k: Step) -> Output:
+        """Return what is measured of zeta, less the mean output."""
+        channel, sensor = at(self.channel, k), at(self.sensor, k)
+        (measure, noise), law = measured_about(sensor, state.centre), state.law
+        matrix, common = without_common(jnp.asarray(channel.mean) @ measure, law)
+        sent = jax.vmap(lambda a: measure @ a @ measure.T)(state.moments) + law[:, None, None] * noise
+        random = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent)
+        known = known_noise(channel, sensor.noise.columns, law)
+        rounding = rounding_of_received(jnp.asarray(channel.mean), sent)
+        return Output(beside(matrix), common, joined(known, rounding, eliminated_spread(random)))
 
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update of zeta."""
-        output = self._observe(step.prior, step.k)[0]
-        transition, move, noise, _, rows = self._moves(step.before, step.u, step.k)
-        process = _spread_of_moves(step.before.moments, move, noise, rows)[1]
-        size = jnp.append(start_of(at(self.plant, 0)), 1.0)
-        rounded = state_rounding(jnp.kron(step.prior.moments[:, -1, -1], size))
-        return linear_smoother_step(step, (transition, process, output), rounded, self.claim, self._projection())
+        before, output = step.before, self._output(step.prior, step.k).matrix
+        move, rows = moved_about(at(self.plant, step.k), step.u, before.centre)[0], self._rows(before, step.k)
+        transition = moved_by_mode(jnp.eye(len(before.mean)), move, rows)
+        carried = jax.vmap(lambda a: move @ a @ move.T)(before.moments)
+        own = self.moved_noise(step.u, step.k, Columns(jnp.eye(len(rows)), before.law @ rows))
+        model = transition, joined(spread_of_moves(carried, rows), own).covariance, output
+        rounded = np.zeros(len(before.mean))  # it is part of the noise
+        return linear_smoother_step(step, model, rounded, self.claim, self._projection())
 
 
-def _spread_of_moves(
-    moments: jax.Array, move: jax.Array, noise: jax.Array, rows: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """E[x~ x~' 1{mode}] one step later (M, n + 1, n + 1), and Cov(zeta+ - F zeta) (N, N)."""
-    modes, size = len(moments), len(move)
-    carried = jax.vmap(lambda a: above_products(move @ a @ move.T, move, a))(moments)
-    added = (moments[:, -1, -1] @ rows)[:, None, None] * noise
-    chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
-    fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
-    return jnp.einsum("ij,iab->jab", rows, carried) + added, fresh
+def moved_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax.Array:
+    """F times columns (N, c), F[j, i] = Pi[i, j] A~: each part is moved, then all are mixed by the chain."""
+    parts = columns.reshape(len(rows), len(move), -1)
+    moved = jax.vmap(lambda part: move @ part)(parts).reshape(len(rows), -1)
+    return jnp.reshape(rows.T @ moved, columns.shape)
+
+
+def spread_of_moves(carried: jax.Array, rows: jax.Array) -> Columns:
+    """Covariance (N, N) of zeta+ by the random move of the mode, sum_i Cov(1{next} | i) x E_i, of E_i (M, s, s)."""
+    return apart_by_mode(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], carried))
+
+
+def covariance_of_mode(rows: jax.Array) -> jax.Array:
+    """Cov(1{j}, 1{l} | i) = delta_jl Pi_ij - Pi_ij Pi_il, (M, M, M)."""
+    return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
+
+
+def apart_by_mode(among: jax.Array) -> Columns:
+    """Columns (M s) of a covariance whose parts of size s sum to zero over the modes, from all modes but the last.
+
+    Shapes: among (M - 1, s, M - 1, s).
+    """
+    others, size = among.shape[:2]
+    factors = eliminated_spread(among.reshape(others * size, others * size))
+    return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
+
+
+def known_noise(channel: ObservationModel, sent: Columns, law: jax.Array) -> Columns:
+    """Columns (m, M columns) of sum_j P(j) (Hbar_j Cov(v) Hbar_j' + Cov n_j), which no signal scales."""
+    gains = jnp.asarray(channel.mean)[:, :, :-1]
+    through = Columns(gains @ sent.matrix, jnp.broadcast_to(sent.weights, (len(law), len(sent.weights))))
+    return joined(side_by_side(through, law), side_by_side(channel.noise, law))
+
+
+def rounding_of_received(gains: jax.Array, sent: jax.Array) -> Columns:
+    """Rounding (m, m) of z, of gains (M, m, p + 1), from E[y~ y~' 1{mode}] (M, p + 1, p + 1)."""
+    return rounding_of(jnp.einsum("jma,jab,jmb->m", gains, sent, gains))
+
+
+def kron(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A x B, by a matrix product, which keeps known zeros."""
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    products = outer(a.reshape(-1), b.reshape(-1)).reshape(*a.shape, *b.shape)
+    return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
 
 
 def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
@@ -193,52 +262,10 @@ def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
-def linear_observation(
-    mean: Float[jax.Array, " N"],
-    covariance: Float[jax.Array, "N N"],
-    received: Float[jax.Array, "m N"],
-    added: Float[jax.Array, "m m"],
-    expected: Float[jax.Array, " m"],
-    rounded: Float[jax.Array, " m"],
-    z: ArrayLike,
-) -> tuple[jax.Array, jax.Array, Innovation]:
-    """Posterior mean and covariance of zeta given the components of z that arrived.
-
-    Cov(z | zeta) is `added`, and the variance that rounding gives to each component `rounded`.
-    """
-    z = jnp.asarray(z)
-    present = ~jnp.isnan(z)
-    both = present[:, None] & present
-    # Innovation covariance S = H P H' + Cov(z | zeta), absent components of unit variance.
-    cross = received @ covariance
-    total = cross @ received.T + added
-    gain, after = gain_and_covariance(
-        covariance,
-        jnp.where(present[:, None], cross, 0.0),
-        jnp.where(both, total, 0.0) + absent(present),
-        jnp.where(present[:, None], received, 0.0),
-        jnp.where(both, added, 0.0) + absent(present),
-        jnp.where(present, rounded, 0.0),
-    )
-    return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
-
-
-def received_rounding(sensor: LinearSensor, size: jax.Array, gains: jax.Array) -> jax.Array:
-    """Variance (m,) that rounding gives to z by what the outputs are off, behind the greatest of the modes' gains."""
-    of_noise = noise_rounding(sensor.noise.mean, sensor.noise.covariance)
-    of_outputs = output_rounding(sensor.matrix, size) + of_noise
-    largest: jax.Array = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
-    return largest**2
-
-
-def mean_rounding(
-    start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array, precise: jax.Array | bool = False
-) -> jax.Array:
-    """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
-    n, size = len(start.initial_mean), start_of(start)
-    projection = sum_of_modes(n, len(law))
-    left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
-    return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size, precise) - left))
+def observe_modes(x: Gaussian, known: jax.Array, output: Output, z: ArrayLike) -> tuple[Gaussian, Innovation]:
+    """Condition zeta on the components of z that arrived; `known` is its mean less P(mode) c."""
+    expected = output.common + output.matrix @ known
+    return corrected_by(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
 
 
 def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -253,12 +280,22 @@ def measure_matrix(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
     return measure, padded(jnp.asarray(sensor.noise.covariance))
 
 
-def prior_of_modes(start: LinearPlant, law: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """c, Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1), and E[x~ x~'], at the start."""
+def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
+    """Law of zeta at the start, and E[x~ x~'].
+
+    Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
+    """
     spread, law = padded(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
-    square = jnp.zeros_like(spread).at[-1, -1].set(1.0)
-    covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
-    return jnp.asarray(start.initial_mean), covariance, spread + square
+    state = given(start.initial_mean, start.initial_covariance)
+    mode = apart_by_mode((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
+    # Factors of both, x before the indicator in each part.
+    last = np.zeros((len(spread), len(spread)))
+    last[-1, -1] = 1.0
+    ends = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
+    root = jnp.kron(np.eye(len(law)), padded(state.root)) + jnp.kron(ends, last)
+    variances = jnp.concatenate([jnp.outer(law, state.variances), jnp.append(mode.weights, 0.0)[:, None]], axis=1)
+    prior = Gaussian(jnp.kron(law, jnp.append(state.mean, 1.0)), below_diagonal(root), variances.reshape(-1))
+    return prior, spread + last
 
 
 def known_part(law: jax.Array, centre: jax.Array) -> jax.Array:
@@ -287,7 +324,7 @@ def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Ar
     return output.at[:, :, -1].add(-common), common
 
 
-def joined(output: jax.Array) -> jax.Array:
+def beside(output: jax.Array) -> jax.Array:
     """Output matrices (M, m, n + 1) as one matrix (m, N) that acts on zeta."""
     return jnp.concatenate(list(output), axis=1)
 
@@ -295,13 +332,6 @@ def joined(output: jax.Array) -> jax.Array:
 def padded(a: jax.Array) -> jax.Array:
     """[[A, 0], [0, 0]]."""
     return jnp.pad(a, ((0, 1), (0, 1)))
-
-
-def blocks(parts: jax.Array) -> jax.Array:
-    """Matrices (M, s, s) as the diagonal blocks of (M s, M s)."""
-    modes, size, _ = parts.shape
-    placed = jnp.eye(modes)[:, None, :, None] * parts[:, :, None, :]
-    return placed.reshape(modes * size, modes * size)
 
 
 M = TypeVar("M", bound=AbstractModalFilter)
@@ -337,8 +367,9 @@ def observation_models(channel: Channel) -> tuple[Float[Array, " M"], Observatio
 def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
     """Moments of the channel by mode at one step, and the transition from the step before."""
     mean = stacked([m.moments(1).mean[:-1] for m in now.maps])
-    spread = stacked([nominal_spread(m).center for m in now.maps])
-    return ObservationModel(before.transition, before.radius, mean, spread)
+    gains, noises = zip(*(divided(nominal_spread(m).center) for m in now.maps), strict=True)
+    noise = Columns(*(stacked(part) for part in zip(*noises, strict=True)))
+    return ObservationModel(before.transition, before.radius, mean, stacked(gains), noise)
 
 
 def claim_of_modes(channel: Channel) -> Claim:

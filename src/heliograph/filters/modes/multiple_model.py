@@ -4,6 +4,8 @@ Each uses the Markov chain, updates through each mode's map with a Gaussian upda
 They differ in when Gaussians are merged; all reduce a mixture to two moments, so that no claim is exact.
 """
 
+import math
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -12,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.factors.gaussian import Gaussian, given, merge
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian, given, merge, moments_of_mixture, of_matrix
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -22,18 +25,16 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.belief import moments_around, predicted, start_of
-from heliograph.filters.gaussian.gaussian import corrected
-from heliograph.filters.gaussian.signal import Signal, signal_of
+from heliograph.filters.gaussian.belief import moments_around, predicted, process_noise, start_of
+from heliograph.filters.gaussian.signal import Signal, corrected_by, noise_through, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.modes.side_information import SideInformation, by_pattern, pattern_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, nearest, wrapped
@@ -41,7 +42,6 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.second_moments import QuadraticMap, described_by
 
 T = TypeVar("T", bound=PyTree)
 
@@ -60,25 +60,29 @@ def receive(
     """
     # Channel moments by mode, given which components arrived.
     kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
-    mean, spread = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
+    links = jax.tree.map(lambda part: jnp.asarray(part)[mode, kind], (channel.mean, channel.gain_spread, channel.noise))
     # Prior weights given which components arrived.
     chance = weight * jnp.asarray(channel.chance)[mode, kind]
     total = jnp.sum(chance)
     prior = jnp.where(total > 0, chance / jnp.where(total > 0, total, 1.0), weight)
-
-    def single(sent: Signal, mean: jax.Array, spread: jax.Array) -> tuple[Gaussian, Innovation]:
-        law = QuadraticMap(spread, jnp.zeros_like(spread))
-        none = QuadraticMap(jnp.zeros_like(spread), jnp.zeros_like(spread))
-        link = described_by(mean, law, none, none, law, False)
-        return corrected(sent, link, Polytope(), z, angles)
-
-    posteriors, received = jax.vmap(single)(signal, mean, spread)
+    correct = partial(_correct_in_mode, z=z, angles=angles)
+    posteriors, received = jax.vmap(correct)(signal, *links)
     # Posterior weights; beliefs stay as they are where no mode, or not this one, can produce such a value.
     weights, density, excluded = posterior_weights(prior, jnp.where(chance > 0, received.log_likelihood, -jnp.inf))
     possible = (chance > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
     after = jax.tree.map(lambda a, b: jnp.where(possible[:, None], a, b), posteriors, signal.prior)
     value = nearest(jnp.asarray(received.value), received.value[jnp.argmax(prior)], angles)
     return after, weights, mixed_innovation(prior, value, received.covariance, density)
+
+
+def _correct_in_mode(
+    signal: Signal, mean: jax.Array, gain_spread: jax.Array, link: Columns, z: jax.Array, angles: Angles
+) -> tuple[Gaussian, Innovation]:
+    """Correct the prior of a signal in one mode of the channel, of moments as in `SecondOrder`."""
+    expected = mean[:, :-1] @ signal.mean + mean[:, -1]
+    z = nearest(z, expected, angles)
+    slopes, noise = mean[:, :-1] @ signal.slopes, noise_through(signal, mean[:, :-1], gain_spread, link)
+    return corrected_by(signal.prior, slopes, noise, z, expected)
 
 
 def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
@@ -127,55 +131,88 @@ class ModalBeliefs(NamedTuple):
 class AbstractMerging(Module):
     """Rule that decides when the Gaussians of modes are merged."""
 
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Components and weights after a transition of the chain, before that of the plant."""
-        raise unwritten(self, "moved")
+    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Weights (M, K) of the components in K mixtures that replace them, and those after the chain's transition.
+
+        K is M, or 1 where all components become the same.
+        """
+        raise unwritten(self, "mixing")
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (component, mode) of the measurement update: all that can have a weight."""
         items = np.arange(modes)
         return items, items
 
+    def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
+        """Components after the update of all pairs, and the probability of each present mode."""
+        return parts, weight
+
 
 class MergeAll(AbstractMerging):
     """One Gaussian for all modes (GPB1)."""
 
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Replace every component by the whole mixture."""
-        law = jnp.sum(state.weight @ rows, axis=0)
-        whole, _ = merged(state.parts, jnp.sum(state.weight, axis=1, keepdims=True))
-        every: Gaussian = jax.tree.map(lambda moment: jnp.repeat(moment, len(rows), axis=0), whole)
-        return ModalBeliefs(*every, jnp.diag(law), state.moved)
+        return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ rows, axis=0))
 
 
 class MergeByNextMode(AbstractMerging):
     """One Gaussian per mode, mixed by the mode that the chain comes from (IMM)."""
 
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Component j becomes the mixture of all components that lead to mode j."""
-        parts, law = merged(state.parts, state.weight @ rows)
-        return ModalBeliefs(*parts, jnp.diag(law), state.moved)
+        mixed = weight @ rows
+        return mixed, jnp.diag(jnp.sum(mixed, axis=0))
 
 
 class MergeByMode(AbstractMerging):
     """One Gaussian per mode, each updated in every next mode (GPB2)."""
 
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Components keep the mode of their last update."""
-        parts, law = merged(state.parts, state.weight)
-        return ModalBeliefs(*parts, law[:, None] * rows, state.moved)
+        return weight, jnp.sum(weight, axis=0)[:, None] * rows
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Pair every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
+    def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
+        """One component for each present mode."""
+        modes = math.isqrt(len(weight))
+        pairs = weight[:, None] * (self.pairs(modes)[1][:, None] == np.arange(modes))
+        return jax.vmap(partial(merge, parts), in_axes=1)(shares(pairs)), jnp.sum(pairs, axis=0)
 
-def merged(parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
-    """Gaussians with the moments of mixtures with weight (components, mixtures), and each mixture's weight."""
+
+def shares(weight: jax.Array) -> jax.Array:
+    """Weights (components, mixtures) of which each column sums to 1: equal ones where a mixture has none."""
     law = jnp.sum(weight, axis=0)
     some = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
-    share = jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
-    return jax.vmap(lambda weights: merge(parts, weights), in_axes=1)(share), law
+    return jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
+
+
+def mixed_and_moved(
+    plant: AbstractPlant,
+    transform: AbstractTransform,
+    parts: Gaussian,
+    weight: jax.Array,
+    u: jax.Array,
+    start: jax.Array,
+) -> Gaussian:
+    """f(x, u) + w of each mixture (components, mixtures), by two moments; a linear plant moves the parts first."""
+    share = shares(weight)
+    if not isinstance(plant, LinearPlant):
+        mixtures = jax.vmap(partial(merge, parts), in_axes=1)(share)
+        return jax.vmap(lambda x: predicted(plant, transform, x, u, start))(mixtures)
+    matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
+    means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
+    spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
+
+    def mix(weights: jax.Array) -> Gaussian:
+        mean, covariance = moments_of_mixture(means, spreads, weights)
+        return of_matrix(mean, covariance + noise)
+
+    moved: Gaussian = jax.vmap(mix, in_axes=1)(share)
+    return moved
 
 
 NODES = 3  # modes that stand for a gain that drifts
@@ -211,11 +248,11 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
-        state = self.merging.moved(state, rows)
-        start = start_of(at(self.plant, 0))
-        parts = jax.vmap(lambda x: predicted(plant, self.transform, x, u, start))(state.parts)
-        parts = parts._replace(mean=together(plant, parts.mean, jnp.sum(state.weight, axis=1)))
-        return ModalBeliefs(*parts, state.weight, jnp.asarray(True))
+        mixing, weight = self.merging.mixing(state.weight, rows)
+        moved = mixed_and_moved(plant, self.transform, state.parts, mixing, u, start_of(at(self.plant, 0)))
+        parts: Gaussian = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(rows), leaf.shape[1])), moved)
+        parts = parts._replace(mean=together(plant, parts.mean, jnp.sum(weight, axis=1)))
+        return ModalBeliefs(*parts, weight, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
@@ -226,15 +263,14 @@ class MultipleModelFilter(AbstractSizedFilter):
         signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
         signal = jax.tree.map(lambda leaf: leaf[i], signals)
         after, weight, mixed = receive(signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles)
-        posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
-        parts, law = merged(after._replace(mean=together(plant, after.mean, weight)), posterior)
+        parts, law = self.merging.kept(after._replace(mean=together(plant, after.mean, weight)), weight)
         return ModalBeliefs(*parts, jnp.diag(law), state.moved), mixed
 
     @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
-        whole = _whole(state)
-        return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
+        mean, covariance = moments_of_mixture(state.mean, state.covariance, jnp.sum(state.weight, axis=1))
+        return Estimate(wrapped(mean, first(self.plant).angles), covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments of the whole mixture around the update; modes are not smoothed."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, given, merge
+from heliograph.factors.gaussian import Gaussian, given, moments_of_mixture
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -122,8 +122,8 @@ class ParticleFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: Particles) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
-        whole = merge(state.parts, state.weight)
-        return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
+        mean, covariance = moments_of_mixture(state.mean, state.covariance, state.weight)
+        return Estimate(wrapped(mean, first(self.plant).angles), covariance, self.claim)
 
 
 def _chosen(law: jax.Array, uniform: jax.Array) -> jax.Array:

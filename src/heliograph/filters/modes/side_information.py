@@ -10,17 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
+from heliograph.factors.columns import Columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.correction import absent, gain_and_bound, is_precise
+from heliograph.filters.gaussian.precise import above_rounding, noise_rounding, output_rounding
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.modal import (
-    joined,
-    mean_rounding,
+    beside,
     measured_about,
     moved_about,
     padded,
-    received_rounding,
     sum_of_modes,
     without_common,
 )
@@ -28,7 +28,7 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, over_time, unstack
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cached
@@ -40,26 +40,32 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import memories
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import symmetric_product
+from heliograph.random_affine.moments.second_moments import divided, symmetric_product, undivided
 
 
 class SideInformation(Module):
     """A channel at one step, by mode and by pattern of arrivals.
 
     transition: of the modes from the step before to this one. For each pattern of components that arrive: `present`,
-    its `chance` in each mode, and in that mode and pattern E[(G, n)] and the spread, as a tensor. flags: P(flag |
-    mode).
+    its `chance` in each mode, and in that mode and pattern E[(G, n)] and, as in `SecondOrder`, `gain_spread` and
+    `noise`. flags: P(flag | mode).
 
-    Shapes: transition (M, M), present (A, m), chance (M, A), mean (M, A, m, p + 1), spread (M, A, m, m, p + 1, p + 1),
-    flags (M, F).
+    Shapes: transition (M, M), present (A, m), chance (M, A), mean (M, A, m, p + 1), gain_spread (M, A, m, m, p + 1,
+    p + 1), noise (M, A, m, m), flags (M, F).
     """
 
     transition: Float[Array, "M M"]
     present: Bool[Array, "A m"]
     chance: Float[Array, "M A"]
     mean: Float[Array, "M A m p1"]
-    spread: Float[Array, "M A m m p1 p1"]
+    gain_spread: Float[Array, "M A m m p1 p1"]
+    noise: Columns
     flags: Float[Array, "M F"]
+
+    @property
+    def spread(self) -> Float[Array, "M A m m p1 p1"]:
+        """E[((G, n) - mean) Y ((G, n) - mean)' | mode, pattern] as a tensor."""
+        return undivided(self.gain_spread, self.noise)
 
 
 class SideInformationBelief(NamedTuple):
@@ -277,7 +283,7 @@ def _used(
     added = added + law[:, None, None] * jnp.diag(of_z)
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = without_common(mean @ measure, law)
-    output = joined(jnp.where(law[:, None, None] > 0, output, 0.0))
+    output = beside(jnp.where(law[:, None, None] > 0, output, 0.0))
     prior = state.covariance
     # S = H P H' + sum_j Cov(z | zeta, j), K = P H' S^-1, with the rounding of S, which no difference of modes is below.
     cross, value = output @ prior, z - common - output @ state.mean
@@ -299,6 +305,24 @@ def _used(
     after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)
     fresh = jnp.where(there[:, None] & there, jnp.sum(added, axis=0), 0.0) + absent(there)
     return after, value, total, is_precise(seen, fresh)
+
+
+def received_rounding(sensor: LinearSensor, size: jax.Array, gains: jax.Array) -> jax.Array:
+    """Variance (m,) that rounding gives to z by what the outputs are off, behind the greatest of the modes' gains."""
+    of_noise = noise_rounding(sensor.noise.mean, sensor.noise.covariance)
+    of_outputs = output_rounding(sensor.matrix, size) + of_noise
+    largest: jax.Array = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
+    return largest**2
+
+
+def mean_rounding(
+    start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array, precise: jax.Array | bool = False
+) -> jax.Array:
+    """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
+    n, size = len(start.initial_mean), start_of(start)
+    projection = sum_of_modes(n, len(law))
+    left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
+    return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size, precise) - left))
 
 
 def pattern_of(channel: SideInformation, there: Bool[Array, " m"]) -> jax.Array:
@@ -395,4 +419,7 @@ def _side_information(
     divisor = np.where(chance > 0, chance, 1.0)
     mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
     spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
-    return SideInformation(before.transition, np.array(kinds).reshape(len(kinds), m), chance, mean, spread, flags)
+    gains, noises = zip(*(divided(part) for row in spread for part in row), strict=True)
+    noise = Columns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
+    present = np.array(kinds).reshape(len(kinds), m)
+    return SideInformation(before.transition, present, chance, mean, np.reshape(gains, spread.shape), noise, flags)

@@ -6,23 +6,29 @@ Terms that depend on the law p of the modes are bounded over the interval of pos
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from heliograph.codegen.engine import compiled
+from heliograph.factors.columns import Columns, joined
+from heliograph.factors.gaussian import Gaussian, of_columns
 from heliograph.filters.base import Step, corrects, predicts
+from heliograph.filters.gaussian.signal import eliminated_spread
 from heliograph.filters.modes.modal import (
     AbstractModalFilter,
+    Output,
+    apart_by_mode,
+    beside,
     built_of_modes,
     claim_of_modes,
-    joined,
     known_part,
-    linear_observation,
     measured_about,
     moved_about,
+    moved_by_mode,
+    observe_modes,
     prior_of_modes,
+    rounding_of_received,
     without_common,
 )
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -32,28 +38,38 @@ from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import eigh
-from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
 
 class UncertainBelief(NamedTuple):
-    """Estimate of zeta, a bound on its error covariance, E[x~ x~'], and bounds on the modes' probabilities.
+    """Estimate of zeta, factors of a bound on its error's covariance, E[x~ x~'], and bounds on the modes' law.
 
-    x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`. `moved` is true from the first
-    prediction on.
+    x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`. `moved` is true from the first prediction on.
 
-    Shapes: mean (N,), covariance (N, N), second (n + 1, n + 1), centre (n,), law, low and high (M,).
+    Shapes: mean, variances (N,), lower (N (N - 1) / 2,), second (n + 1, n + 1), centre (n,), law, low and high (M,).
     """
 
     mean: Float[jax.Array, " N"]
-    covariance: Float[jax.Array, "N N"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " N"]
     second: Float[jax.Array, "n1 n1"]
     centre: Float[jax.Array, " n"]
     law: Float[jax.Array, " M"]
     low: Float[jax.Array, " M"]
     high: Float[jax.Array, " M"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """zeta given the data, with the bound."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Bound on the covariance of the error of zeta."""
+        return self.gaussian.covariance
 
 
 class UncertainModalFilter(AbstractModalFilter):
@@ -62,57 +78,51 @@ class UncertainModalFilter(AbstractModalFilter):
     Source: the filter of Costa (1994) with Young's inequality for the uncertain part of the chain.
     """
 
-    @compiled
+    @in_float64
     def init(self) -> UncertainBelief:
         """Return the prior, independent of the mode, whose initial law is known."""
-        law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
-        mean = jnp.kron(law, jnp.append(centre, 1.0))
-        return UncertainBelief(mean, covariance, second, centre, law, law, law, jnp.asarray(False))
+        law, (prior, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
+        centre = jnp.asarray(at(self.plant, 0).initial_mean)
+        return UncertainBelief(*prior, second, centre, law, law, law, jnp.asarray(False))
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
         """Propagate the bound on Sigma-; at the first prediction the mode has its initial law."""
-        channel = at(self.channel, k)
+        channel, x = at(self.channel, k), state.gaussian
         move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
-        modes = len(state.law)
         # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
-        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
+        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
         radius = jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
         carried = move @ state.second @ move.T
-        chosen, wandering = _each_row(rows, radius)
-        middle, reach = _middle(state.low, state.high)
-        # F Sigma F', D, and the bound W on the covariance of the noise.
-        step = jnp.kron(rows.T, move)
-        known = step @ state.covariance @ step.T
-        apart = jnp.kron(_worst(wandering, middle, reach), carried)
-        low, high = _bounds(rows, radius, state.low, state.high)
-        fresh = jnp.kron(_worst(chosen, middle, reach), carried) + jnp.kron(_worst_diagonal(low, high), noise)
+        chosen, wandering = (_worst(items, *_middle(state.low, state.high)) for items in _each_row(rows, radius))
         # Young's inequality, b = root(tr D / tr F Sigma F').
-        young = jnp.sqrt(_ratio(jnp.trace(apart), jnp.trace(known)))
-        extra = jnp.where(young > 0, apart + apart / jnp.where(young > 0, young, 1.0), 0.0)
-        covariance = symmetrize((1 + young) * known + extra + fresh)
-        # E[x~ x~'], nominal law and mean one step later.
-        after, law = carried + noise, state.law @ rows
-        mean = step @ (state.mean - known_part(state.law, state.centre)) + known_part(law, centre)
-        return UncertainBelief(mean, covariance, after, centre, law, low, high, jnp.asarray(True))
+        root = moved_by_mode(x.root, move, rows)
+        young = jnp.sqrt(_ratio(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ x.variances)))
+        wide = chosen + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * wandering
+        # Columns of (1 + b) F Sigma F', of (1 + 1 / b) D and of the bound W on the covariance of the noise.
+        low, high = _bounds(rows, radius, state.low, state.high)
+        among = apart_by_mode(jnp.einsum("jl,ab->jalb", wide[:-1, :-1], carried))
+        own = self.moved_noise(u, k, eliminated_spread(_worst_diagonal(low, high)))
+        known, law = x.mean - known_part(state.law, state.centre), state.law @ rows
+        mean = moved_by_mode(known[:, None], move, rows)[:, 0] + known_part(law, centre)
+        after = of_columns(mean, joined(Columns(root, (1 + young) * x.variances), among, own))
+        # E[x~ x~'] and nominal law one step later.
+        return UncertainBelief(*after, carried + noise, centre, law, low, high, jnp.asarray(True))
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
         """Correct with z; the covariance of z given zeta is bounded over the laws of the modes."""
-        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        sensor, channel = at(self.sensor, k), at(self.channel, k)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
         random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
         added = _worst(random + gains @ noise @ gains.swapaxes(1, 2), *_middle(state.low, state.high))
-        output, common = without_common(gains @ measure, state.law)
-        observed = joined(output)
-        expected = common + observed @ (state.mean - known_part(state.law, state.centre))
-        rounded = self.rounding(gains, jnp.max(random, axis=0), k)
-        mean, covariance, innovation = linear_observation(
-            state.mean, state.covariance, observed, added, expected, rounded, z
-        )
-        covariance = self.above_rounding(covariance, state.covariance, state.law)
-        return state._replace(mean=mean, covariance=covariance), innovation
+        matrix, common = without_common(gains @ measure, state.law)
+        rounding = rounding_of_received(gains, state.law[:, None, None] * second)
+        known = state.mean - known_part(state.law, state.centre)
+        output = Output(beside(matrix), common, joined(rounding, eliminated_spread(added)))
+        after, innovation = observe_modes(state.gaussian, known, output, z)
+        return UncertainBelief(*after, *state[3:]), innovation
 
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments of zeta around the update; the filter's bound is not proved for smoothed estimates."""

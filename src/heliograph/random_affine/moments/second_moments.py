@@ -171,6 +171,16 @@ def divided(spread: Tensor) -> tuple[Tensor, Columns]:
     return spread - xp.where(apart, covariance, 0.0)[..., None, None] * corner, padded
 
 
+def undivided(gain: Tensor, noise: Columns) -> Tensor:
+    """Spread of gain and noise together, from what `divided` returns; both may have leading axes."""
+    xp = library(gain, noise)
+    covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
+    corner = np.zeros(gain.shape[-2:])
+    corner[-1, -1] = 1.0
+    whole: Tensor = gain + covariance[..., None, None] * corner
+    return whole
+
+
 def _or_one(value: jax.Array) -> jax.Array:
     return jnp.where(value > 0, value, 1.0)
 
