@@ -35,9 +35,10 @@ from soak import SEED, release
 from soak_networks import HORIZON, network
 
 import heliograph as hg
-from heliograph.codegen import accumulated, compiled, engine
-from heliograph.codegen.machine import features
+from heliograph.engine import choice
 from heliograph.simulation.runs import native as runs
+from straightline import accumulated, compiled
+from straightline.machine import features
 
 HERE = Path(__file__).resolve().parent
 DONE, RESULTS = HERE.parent / "out" / "engines.jsonl", HERE / "engines.json"
@@ -62,7 +63,7 @@ def rounded_more(item: hg.Network, index: int) -> Any:
         return (*features()[:2], False)
 
     def forget() -> None:
-        for programs in (runs._made, engine._made):
+        for programs in (runs._made, choice._made):
             programs.cache_clear()
 
     forget()

@@ -33,7 +33,7 @@ def release() -> str:
     """What decides about the results: the sources' tree."""
     from hashlib import sha256
 
-    paths = ["src/heliograph/codegen", "benchmarks/programs"]
+    paths = ["src/straightline", "benchmarks/programs"]
     listed = subprocess.run(["git", "ls-files", "-s", "--", *paths], cwd=HERE.parent, capture_output=True, check=False)
     return sha256(listed.stdout).hexdigest()[:16]
 

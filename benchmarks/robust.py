@@ -13,7 +13,7 @@ import numpy as np
 from links_with_memory import STEPS, means_of
 
 import heliograph as hg
-from heliograph.codegen.engine import engine_of
+from heliograph.engine.choice import engine_of
 
 RUNS, PASSES = 2000, 15
 ANCHORS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import chosen, computed
+from heliograph.engine.choice import chosen, computed
 from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.model import Estimate, Innovation
 from heliograph.numerics.float64 import compiled

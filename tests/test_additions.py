@@ -212,9 +212,10 @@ def outcomes(tmp_path_factory) -> dict[str, str]:
             at = before.index(anchor) + len(anchor) if anchor else len(before)
             path.write_text(before[:at] + made + before[at:])
     trials = {kind: trial for kind, (_, trial) in KINDS.items()}
+    places = os.pathsep.join([str(copy.parent), str(SOURCE.parent)])  # the second for what is beside the library
     done = subprocess.run(
         [sys.executable, "-c", WORLD + TRIALS, json.dumps(trials)],
-        env=os.environ | {"PYTHONPATH": str(copy.parent), "JAX_PLATFORMS": "cpu"},
+        env=os.environ | {"PYTHONPATH": places, "JAX_PLATFORMS": "cpu"},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]

@@ -17,7 +17,7 @@ SOURCE = Path(heliograph.__file__).parent
 # Later may import earlier, never the reverse.
 ORDER = [
     ["numerics"],
-    ["codegen"],
+    ["engine"],
     ["disk"],
     ["factors"],
     ["random_affine"],

@@ -22,7 +22,7 @@ def prepare(p: Arrays) -> Contender:
         last, means = jax.lax.scan(step, start, (gains, z))
         return means, last.covariance
 
-    how = f"over_runs, all cores; {hg.codegen.engine_of(one_run, p['gains'], p['z'])}"
+    how = f"over_runs, all cores; {hg.engine.engine_of(one_run, p['gains'], p['z'])}"
     return Contender(lambda: hg.simulation.over_runs(one_run, p["gains"], p["z"]), lambda result: result[0], how)
 
 

@@ -23,7 +23,7 @@ def prepare(p: Arrays) -> Contender:
         smoothed = interval.sweep(steps)
         return smoothed.mean, smoothed.covariance[0]
 
-    how = f"over_runs, all cores; {hg.codegen.engine_of(one_run, p['gains'], p['z'])}"
+    how = f"over_runs, all cores; {hg.engine.engine_of(one_run, p['gains'], p['z'])}"
     return Contender(lambda: hg.simulation.over_runs(one_run, p["gains"], p["z"]), lambda result: result[0], how)
 
 

@@ -11,7 +11,7 @@ def prepare(p: Arrays) -> Contender:
     planned = hg.smoothing.planned_smoother(
         hg.kalman_filter(plant, sensor), p["z"].shape[1], hg.smoothing.FixedInterval()
     )
-    how = f"over_runs, all cores; {hg.codegen.engine_of(planned.means, p['z'])}"
+    how = f"over_runs, all cores; {hg.engine.engine_of(planned.means, p['z'])}"
     return Contender(lambda: hg.simulation.over_runs(planned.means, p["z"]), lambda result: result, how)
 
 

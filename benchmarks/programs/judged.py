@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.codegen.compiled import Compiled
-from heliograph.codegen.nodes import Unsupported
-from heliograph.codegen.program import lower
 from programs.flow import program
 from programs.writer import Program, Variable
+from straightline.compiled import Compiled
+from straightline.nodes import Unsupported
+from straightline.program import lower
 
 RUNS = 16
 DISTURBED = 6  # times that a program is computed with other roundings

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from tests.filters.modal_problems import BURSTS, PLANT, RELAY, SENSOR, bursts, variances
 
 STEPS = 200  # after which no variance changes any more

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.codegen.engine import chosen
+from heliograph.engine.choice import chosen
 from heliograph.filters.rows import _results, data_of
 from tests.follow import follow
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.codegen.compiled import aligned
 from heliograph.model.estimate import Claim
+from straightline.compiled import aligned
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1, [1.0, -1.0], 1.0, [[1.0], [0.0]], inputs=["push"])
 SENSOR = hg.LinearSensor(np.eye(2), 0.5)

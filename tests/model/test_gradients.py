@@ -9,7 +9,7 @@ import pytest
 from scipy import special
 
 import heliograph as hg
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.factors.columns import Columns
 from heliograph.random_affine.moments.push import push
 

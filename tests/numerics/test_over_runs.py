@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.codegen.program import lower
 from heliograph.numerics.linalg import times
 from heliograph.numerics.over_runs import runs_last, runs_last_of, where_any, where_each
+from straightline.program import lower
 
 RNG = np.random.default_rng(0)
 A, B = RNG.normal(size=(3, 4, 2, 2)), RNG.normal(size=(2, 2))

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
-from heliograph.codegen.c_source import Real
 from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import RESERVED, step_program
 from heliograph.export.text import CText, Form, c_text
@@ -19,7 +18,8 @@ from heliograph.factors.columns import computed_in
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
-from heliograph.numerics.check import fail, instance, shown
+from heliograph.numerics.check import InputError, fail, instance, shown
+from straightline.c_source import Real
 
 PRECISIONS: dict[str, Real] = {"double": "double", "float": "float"}
 COMPILER = "cc"
@@ -103,7 +103,10 @@ def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[
         raise fail("single precision", expected, type(filter).__name__)
     with computed_in(np.float64 if real == "double" else np.float32):
         program = step_program(filter, real)
-    return c_text(program, Form(prefix, real, names, kind))
+    try:
+        return c_text(program, Form(prefix, real, names, kind))
+    except ValueError as error:
+        raise InputError(str(error)) from None  # a number of the filter beyond single precision
 
 
 def carries_factors(filter: AbstractFilter) -> bool:

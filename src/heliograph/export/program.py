@@ -11,17 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.c_source import Real
-from heliograph.codegen.folding import is_finite
-from heliograph.codegen.graph import Graph
-from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, code_line, scalars, traced, type_of
-from heliograph.codegen.memory import LARGE, InMemory
-from heliograph.codegen.nodes import Buffer, Node, Type, Unsupported
 from heliograph.filters.base import AbstractFilter, step_with_judgement
 from heliograph.filters.plausibility import LIMIT
 from heliograph.model.inputs import inputs_spoil
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
+from straightline.c_source import Real
+from straightline.folding import is_finite
+from straightline.graph import Graph
+from straightline.lowering import RULES, Lowering, Value, array_of, code_line, scalars, traced, type_of
+from straightline.memory import LARGE, InMemory
+from straightline.nodes import Buffer, Node, Type, Unsupported
 
 # Finite where the arguments are, but for overflow and divisions by zero, which the finished step is checked for.
 PRESERVING = frozenset((

@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph
-from heliograph.codegen.c_source import CSource, Place, Real, c_type, literal
-from heliograph.codegen.nodes import Node, Type, Unsupported
 from heliograph.disk.quoting import visible
 from heliograph.export.program import StepProgram, no_c, place_of
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
+from straightline.c_source import CSource, Place, Real, c_type, literal
+from straightline.nodes import Node, Type, Unsupported
 
 MEANING: dict[Claim, str] = {
     "exact": "the covariance is E[(x - mean)(x - mean)']",

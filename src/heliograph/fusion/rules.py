@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.fusion.intersection import (
     equal_shares,
     intersect,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.fusion.intersection import inverse
 from heliograph.numerics.check import array, fail, probabilities, shown
 from heliograph.numerics.lapack import pseudo_solve, regular_solve

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.live.later import Sweeper
 from heliograph.live.snapshot import Identity, network_identity
 from heliograph.model.over_time import first, steps_covered

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import chosen, of_arrays, setting
+from heliograph.engine.choice import chosen, of_arrays, setting
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion

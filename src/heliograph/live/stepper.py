@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.compiled import Alone
-from heliograph.codegen.engine import attempted, setting
-from heliograph.codegen.nodes import Unsupported
-from heliograph.codegen.program import lower
+from heliograph.engine.choice import attempted, setting
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.trees.static import Static
 from heliograph.numerics.types import Float, PyTree
+from straightline.compiled import Alone
+from straightline.nodes import Unsupported
+from straightline.program import lower
 
 Leaves = list[np.ndarray]
 

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of, over_rows
 from heliograph.numerics.check import instance

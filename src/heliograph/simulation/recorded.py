@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_times, fail, instance, rank, table
 from heliograph.numerics.dates import unequal_steps

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import chosen, compiled, computed, of_arrays
+from heliograph.engine.choice import chosen, compiled, computed, of_arrays
 from heliograph.filters.base import AbstractFilter, sized
 from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import AllReports

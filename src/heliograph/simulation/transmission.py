@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance, rank

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 
-from heliograph.codegen.rules.arrived import arrived
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
@@ -13,6 +12,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.medium import AbstractMedium
 from heliograph.simulation.stepping import AllFilters
+from straightline.rules.arrived import arrived
 
 
 class World(Module):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point

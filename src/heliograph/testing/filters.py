@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import STRENGTH, Estimate, Innovation
 from heliograph.numerics.check import standard_deviations

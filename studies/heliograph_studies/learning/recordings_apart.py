@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from heliograph.codegen.engine import chosen
+from heliograph.engine.choice import chosen
 from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
 from heliograph.learning.likelihood.maximise import Evaluated, maximise

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.codegen.engine import chosen
+from heliograph.engine.choice import chosen
 from heliograph.filters.gaussian.unscented import Unscented
 from heliograph.filters.rows import _results, data_of
 from heliograph.numerics.float64 import in_float64

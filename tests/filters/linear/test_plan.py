@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.filters.linear.plan import PlannedFilter
 from heliograph.numerics.float64 import compiled
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.filters.modes.multiple_model import shares
 from heliograph.testing import check_filter
 from tests.follow import follow

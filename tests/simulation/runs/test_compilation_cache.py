@@ -9,7 +9,7 @@ import jax
 import pytest
 
 import heliograph as hg
-from heliograph.codegen.engine import SETTING
+from heliograph.engine.choice import SETTING
 
 PROGRAM = """
 import sys, heliograph

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.codegen.engine import SETTING
-from heliograph.codegen.nodes import Node, Unsupported
+from heliograph.engine.choice import SETTING
 from heliograph.relays.design import local_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
@@ -17,6 +16,7 @@ from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Traje
 from heliograph.simulation.runs.native import native
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
+from straightline.nodes import Node, Unsupported
 from tests.relays.relay_problems import example
 from tests.simulation.both import Both
 from tests.simulation.test_relay_worlds import relays

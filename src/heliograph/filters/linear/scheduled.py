@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.factors.columns import Columns, columns_of_each, joined, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, given, move
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.factors.columns import Columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import start_of

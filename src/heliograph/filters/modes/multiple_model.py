@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian, given, merge, moments_of_mixture, of_matrix
 from heliograph.filters.base import (

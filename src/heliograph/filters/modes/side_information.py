@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.factors.columns import Columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import start_of

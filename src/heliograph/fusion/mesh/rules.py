@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import chosen
+from heliograph.engine.choice import chosen
 from heliograph.fusion.intersection import intersection_weights, trace_shares
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, correct
 from heliograph.fusion.mesh.graph import Graph

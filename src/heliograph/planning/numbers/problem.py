@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import compiled
+from heliograph.engine.choice import compiled
 from heliograph.learning.description import Description, describe
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, array, fail, instance, items, table

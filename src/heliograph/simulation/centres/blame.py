@@ -6,7 +6,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from heliograph.codegen.engine import chosen
+from heliograph.engine.choice import chosen
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement, why_values
 from heliograph.numerics.float64 import quickly_compiled, to_numpy

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.codegen.engine import computed
+from heliograph.engine.choice import computed
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import HALF
 from heliograph.filters.rows import data_of, over_rows

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import chosen
-from heliograph.codegen.lowering import like
+from heliograph.engine.choice import chosen
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64, understood
 from heliograph.numerics.module import Module
@@ -21,6 +20,7 @@ from heliograph.simulation.judging import plausible_step
 from heliograph.simulation.network import Network
 from heliograph.simulation.rows.columns import columns_of
 from heliograph.simulation.stepping import AllFilters, begun
+from straightline.lowering import like
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each

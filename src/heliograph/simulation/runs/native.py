@@ -15,13 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from heliograph.codegen.accumulated import Accumulated, Begun
-from heliograph.codegen.compiled import threads
-from heliograph.codegen.engine import attempted
-from heliograph.codegen.lowering import Lowering, array_of, keys_of, traced
-from heliograph.codegen.memory import LONG, InMemory
-from heliograph.codegen.nodes import Buffer, Type, Unsupported
-from heliograph.codegen.program import Program, Summed, folded
+from heliograph.engine.choice import attempted
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.medium import medium_of
@@ -34,6 +28,12 @@ from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.smoothed import Part, Recorded, Smoother, finished, reduced_run
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
+from straightline.accumulated import Accumulated, Begun
+from straightline.compiled import threads
+from straightline.lowering import Lowering, array_of, keys_of, traced
+from straightline.memory import LONG, InMemory
+from straightline.nodes import Buffer, Type, Unsupported
+from straightline.program import Program, Summed, folded
 
 PROGRAMS = 64  # whose code is held at once
 PLAIN = (0.0, 1.0, -1.0)  # numbers that are known in a program

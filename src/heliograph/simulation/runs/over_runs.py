@@ -6,11 +6,11 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from heliograph.codegen.compiled import threads
-from heliograph.codegen.engine import chosen
+from heliograph.engine.choice import chosen
 from heliograph.numerics.check import check_count, fail, shown
 from heliograph.numerics.float64 import fully_optimised, to_numpy
 from heliograph.numerics.types import PyTree
+from straightline.compiled import threads
 
 WIDTH = 128  # runs in parallel: the smoother steps of a hundred steps of them stay in the cache
 
@@ -21,7 +21,7 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     The function is written with jax.numpy and may step filters under `jax.lax.scan`. It is compiled once for a function
     and its shapes, so define it once. NumPy arrays come back, and each core computes its share of the runs. Native code
     computes them, or XLA, `width` runs in parallel, for functions that native code does not support
-    (`heliograph.codegen.engine_of` says which).
+    (`heliograph.engine.engine_of` says which).
 
     Args:
         function: of one run's arrays.

@@ -1,0 +1,218 @@
+"""Choice of the engine for a function of one run: native code where it supports the program, else XLA.
+
+The environment variable HELIOGRAPH_ENGINE forces one: "native", which refuses unsupported programs, or "xla".
+"""
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache, wraps
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+import jax
+import numpy as np
+
+from heliograph.numerics import float64
+from heliograph.numerics.check import fail, shown
+from heliograph.numerics.collector import no_collector
+from heliograph.numerics.stack import with_room
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import PyTree
+from straightline.compiled import Compiled
+from straightline.graph import MOST
+from straightline.lowering import like, traced
+from straightline.machine import target
+from straightline.nodes import Unsupported
+from straightline.program import lower_traced
+
+Code = TypeVar("Code")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+SETTING = "HELIOGRAPH_ENGINE"
+COMPILED = 256  # functions whose code is held at once
+SHORT = 8_000  # operations: native code of 11,000 takes as long to make as a program of XLA, one of a thousand a third
+ENGINES = ("native", "xla")
+
+
+class Choice(NamedTuple):
+    """Code of a function, or the reason why XLA computes it; `arrays` are those of its arguments and of its closure."""
+
+    code: Compiled | None
+    why: str
+    arrays: tuple[Any, ...] = ()
+
+    @property
+    def explained(self) -> str:
+        """Return "native: ..." with the number of operations, or "xla: ..." with the reason."""
+        if self.code is None:
+            return f"xla: {self.why}"
+        code = self.code.code
+        slow = f", {code.divisions} of them divisions and roots" if code.divisions else ""
+        return f"native: {code.operations} operations{slow}"
+
+    def results(self) -> PyTree:
+        """Run the code on the arrays."""
+        assert self.code is not None
+        return self.code(*self.arrays)
+
+
+def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
+    """Explain which engine computes a function of one run over runs of these arguments, and why.
+
+    Args:
+        function: a function of the arrays of one run.
+        arguments: its arguments for several runs: trees of arrays with a leading axis of runs.
+
+    Returns:
+        "native: ..." with the number of operations, or "xla: ..." with the reason.
+
+    Raises:
+        ValueError: no function; HELIOGRAPH_ENGINE is "native" and the program is not supported.
+    """
+    if not callable(function):
+        raise fail("function of one run", "a function of arrays", shown(function))
+    return chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
+
+
+def chosen(
+    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int = MOST
+) -> Choice:
+    """Return the code of a function of one run for arguments like these, compiled once; or why there is none.
+
+    XLA computes a program of more than `most` operations, unless native code is forced.
+    """
+    engine = setting()
+    if engine == "xla":
+        return Choice(None, f"{SETTING} is set to it")
+    choice = _available() or _cached(function, arguments, differs, MOST if engine == "native" else most)
+    if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
+        choice = Choice(None, why)
+    if choice.code is None and engine == "native":
+        raise fail("native code", "a program of operations that it takes", choice.why)
+    return choice
+
+
+def computed(
+    function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree], most: int = MOST
+) -> PyTree:
+    """Compute a function once, in double precision, as NumPy arrays: by native code where it supports the function.
+
+    Args:
+        function: a function of trees of arrays.
+        by_xla: the same function compiled by XLA, which computes it elsewhere.
+        arguments: its arguments.
+        most: operations above which XLA computes.
+    """
+    with jax.enable_x64(True):
+        choice = chosen(function, arguments, [False] * len(arguments), most)
+        if choice.code is None:
+            return float64.to_numpy(by_xla(*arguments))
+        return of_arrays(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
+
+
+def of_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> PyTree:
+    """Change the arrays of results; what they have beside arrays, such as a model's functions, stays."""
+    return jax.tree.map(lambda leaf: change(leaf) if isinstance(leaf, np.ndarray) else leaf, results)
+
+
+def compiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function that is called now and then, once per structure and shapes of its arguments.
+
+    Native code computes it if it is short, else XLA as by `float64.compiled`; both in double precision, from numbers
+    and to NumPy arrays. Inside a trace it is the plain function.
+    """
+    by_xla = float64.compiled(function)
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if kwargs or is_traced(*args):
+            return by_xla(*args, **kwargs)
+        float64.check_process()
+        returned: R = computed(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
+        return returned
+
+    return call
+
+
+def setting() -> str:
+    """Return the forced engine, "" if none is."""
+    engine = os.environ.get(SETTING, "")
+    if engine not in ("", *ENGINES):
+        raise fail(SETTING, " or ".join(ENGINES), engine)
+    return engine
+
+
+def attempted(make: Callable[[], Code]) -> Code | None:
+    """Return native code, or None if XLA has to compute instead."""
+    engine = setting()
+    if engine == "xla" or _available() is not None:
+        return None
+    try:
+        with no_collector():
+            return with_room(make)()
+    except Unsupported as error:
+        if engine == "native":
+            raise fail("native code", "a program of operations that it takes", str(error)) from None
+        return None
+
+
+@cache
+def _available() -> Choice | None:
+    """Return None if this machine can run native code, else the reason, which is reported once."""
+    try:
+        target()
+    except RuntimeError as error:
+        warnings.warn(f"native code: expected a processor that LLVM knows, got {error}; XLA computes", stacklevel=4)
+        return Choice(None, "LLVM does not know this processor")
+    return None
+
+
+def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int) -> Choice:
+    """Return code for the structure of a function and its arguments, which may be objects with arrays."""
+    # Arrays become arguments; all other leaves are part of the cached key.
+    leaves, form = jax.tree.flatten((function, *arguments))
+    apart = [False] * len(jax.tree.leaves(function))
+    apart += [d for a, d in zip(arguments, differs, strict=True) for _ in jax.tree.leaves(a)]
+    is_array = [isinstance(x, np.ndarray | jax.Array) for x in leaves]
+    arrays = tuple(x for x, a in zip(leaves, is_array, strict=True) if a)
+    kinds = tuple(
+        _Array(x.shape[1:] if d else x.shape, x.dtype, d) if a else x
+        for x, a, d in zip(leaves, is_array, apart, strict=True)
+    )
+    # A leaf without a hash has no key: XLA computes.
+    try:
+        code, why = _made(form, kinds, most)
+    except TypeError as error:
+        if "unhashable" not in str(error):
+            raise
+        return Choice(None, f"the function holds an object that cannot be compared with another: {error}")
+    return Choice(code, why, arrays)
+
+
+class _Array(NamedTuple):
+    """Shape and type of one run's array."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    differs: bool
+
+
+@lru_cache(COMPILED)
+@with_room
+@no_collector()
+def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Compiled | None, str]:
+    """Compile code for one structure, and the shapes and types of its arrays."""
+    arrays = [k for k in kinds if isinstance(k, _Array)]
+
+    def call(*values: Any) -> PyTree:
+        items = iter(values)
+        leaves = [next(items) if isinstance(k, _Array) else k for k in kinds]
+        function, *arguments = jax.tree.unflatten(form, leaves)
+        return function(*arguments)
+
+    traced_program, tree = traced(call, *(like(k.shape, k.dtype) for k in arrays))
+    try:
+        return Compiled(lower_traced(traced_program, tree, most), [k.differs for k in arrays]), ""
+    except Unsupported as error:
+        return None, str(error)

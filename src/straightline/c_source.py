@@ -1,0 +1,310 @@
+"""Graphs as statements of C99: a local variable for each number; operations, loops and guards as in the graph."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from straightline.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Type, Unsupported
+from straightline.program import needed
+
+Real = Literal["double", "float"]
+
+INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|", "xor": "^"}
+ORDER = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+# Orders of floating-point numbers: operators would raise a flag at NaN, which is a component that did not arrive.
+QUIET = {"lt": "isless", "le": "islessequal", "gt": "isgreater", "ge": "isgreaterequal"}
+# Functions of libm by the operation's name; in single precision they end in f.
+FUNCTIONS = {name: name for name in (
+    "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan2", "pow", "floor", "ceil", "asin",
+    "acos", "atan", "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "erf", "erfc", "lgamma",
+)} | {"abs": "fabs", "rem": "fmod", "round_even": "nearbyint", "round_away": "round"}  # fmt: skip
+# What is more than one operator or function; a and b are names or literals, never expressions.
+COMPOSED: dict[str, Callable[..., str]] = {
+    "neg": "-{0}".format,
+    "max": "(isgreater({0}, {1}) || {0} != {0} || ({0} == {1} && !signbit({0})) ? {0} : {1})".format,
+    "min": "(isless({0}, {1}) || {0} != {0} || ({0} == {1} && signbit({0})) ? {0} : {1})".format,
+    "sign": "(isgreater({0}, 0) ? 1 : isless({0}, 0) ? -1 : {0})".format,
+    "is_finite": "!!isfinite({0})".format,
+}
+# Operations on integers, of b bits: {t} the type, {u} that without a sign. What C leaves undefined is JAX's: numbers
+# wrap around, a division by zero has all bits, a shift by all bits leaves nothing or the sign.
+WHOLE: dict[str, Callable[..., str]] = {
+    "add": "({t})(({u}){0} + ({u}){1})".format,
+    "sub": "({t})(({u}){0} - ({u}){1})".format,
+    "mul": "({t})(({u}){0} * ({u}){1})".format,
+    "neg": "({t})(0 - ({u}){0})".format,
+    "abs": "({0} < 0 ? ({t})(0 - ({u}){0}) : {0})".format,
+    "sign": "(({0} > 0) - ({0} < 0))".format,
+    "max": "({0} > {1} ? {0} : {1})".format,
+    "min": "({0} < {1} ? {0} : {1})".format,
+    "div": "({1} == 0 ? -1 : {1} == -1 ? ({t})(0 - ({u}){0}) : {0} / {1})".format,
+    "rem": "({1} == 0 ? {0} : {1} == -1 ? 0 : {0} % {1})".format,
+    "shift_left": "(({u}){1} < {b} ? ({t})(({u}){0} << {1}) : 0)".format,
+    "shift_right": "(({u}){1} < {b} ? ({t})(({u}){0} >> {1}) : 0)".format,
+    "shift_right_signed": "({t})(({s}){0} < 0 ? ~(~({s}){0} >> {by}) : ({s}){0} >> {by})".format,
+}
+UNSIGNED: dict[str, Callable[..., str]] = {
+    "div": "({1} ? {0} / {1} : ({t})-1)".format,
+    "rem": "({1} ? {0} % {1} : {0})".format,
+    "abs": "{0}".format,
+    "sign": "({0} != 0)".format,
+}
+
+
+def c_type(type: Type, real: Real) -> str:
+    """Return the C type of a number in the program."""
+    names = {"f64": real, "bool": "int", "i32": "int32_t", "i64": "int64_t", "u32": "uint32_t", "u64": "uint64_t"}
+    return names[type]
+
+
+def literal(value: float | int | bool, type: Type, real: Real) -> str:
+    """Return a known number as a literal with every digit that its type has.
+
+    Raises:
+        ValueError: a number beyond the range of single precision.
+    """
+    if type == "bool":
+        return "1" if value else "0"
+    if type != "f64":
+        ending = f"{'u' if type[0] == 'u' else ''}{'ll' if type[1:] == '64' else ''}"
+        if value >= 0:
+            return f"{int(value)}{ending}"
+        return f"({int(value) + 1}{ending} - 1)"  # of the least number C has no literal
+    # Floating-point numbers: the shortest text that reads back as the same number.
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "(-INFINITY)"
+    if real == "float":
+        with np.errstate(over="ignore", under="ignore"):
+            single = np.float32(value)
+        if not np.isfinite(single):
+            raise ValueError(f"single precision: expected numbers up to 3.4e38, got {value}")
+        text = f"{single!s}f"
+    else:
+        text = repr(float(value))
+    return f"({text})" if text.startswith("-") else text
+
+
+def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
+    """Return an operation on names and literals.
+
+    Raises:
+        Unsupported: an operation that C does not have.
+    """
+    op, source = node.op, node.args[0].type
+    if op == "select":
+        return f"({arguments[0]} ? {arguments[1]} : {arguments[2]})"
+    if op in ("convert", "bitcast"):
+        return (_converted if op == "convert" else _as_other)(source, node.type, arguments[0], real)
+    if op == "not":
+        return f"!{arguments[0]}" if source == "bool" else f"({c_type(source, real)})~{arguments[0]}"
+    if source == "f64" and op in QUIET:
+        return f"{QUIET[op]}({', '.join(arguments)})"
+    if op in ORDER:
+        return f"{arguments[0]} {ORDER[op]} {arguments[1]}"
+    # Integers first, since C's operators differ from those of floating-point numbers.
+    if source == "bool" and op in ("max", "min"):
+        return WHOLE[op](*arguments)
+    if source not in ("f64", "bool") and op in WHOLE:
+        return _of_integers(op, source, arguments)
+    if op in COMPOSED:
+        return COMPOSED[op](*arguments)
+    if op in INFIX:
+        return f"{arguments[0]} {INFIX[op]} {arguments[1]}"
+    if op in FUNCTIONS and source == "f64":
+        return f"{FUNCTIONS[op]}{'f' if real == 'float' else ''}({', '.join(arguments)})"
+    raise Unsupported(op)
+
+
+def _of_integers(op: str, type: Type, arguments: Sequence[str]) -> str:
+    bits = int(type[1:])
+    if type[0] == "u" and op in UNSIGNED:
+        return UNSIGNED[op](*arguments, t=f"uint{bits}_t")
+    by = f"(({arguments[-1]} >= 0 && {arguments[-1]} < {bits}) ? {arguments[-1]} : {bits - 1})"
+    if type[0] == "u":
+        by = by.replace(f"{arguments[-1]} >= 0 && ", "")
+    kind = f"uint{bits}_t" if type[0] == "u" else f"int{bits}_t"
+    return WHOLE[op](*arguments, t=kind, u=f"uint{bits}_t", s=f"int{bits}_t", b=bits, by=by)
+
+
+def _converted(source: Type, target: Type, name: str, real: Real) -> str:
+    """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
+    if target == "bool":
+        return f"({name} != 0)"
+    kind = c_type(target, real)
+    if source != "f64" or target == "f64":
+        return f"({kind}){name}"
+    bits, least = int(target[1:]), "0"
+    end = f"{2.0 ** (bits - (target[0] == 'i')):.1f}{'f' if real == 'float' else ''}"
+    most = f"{kind[:-2].upper()}_MAX"
+    if target[0] == "i":
+        least = f"{kind[:-2].upper()}_MIN"
+    low = f"islessequal({name}, {f'-{end}' if target[0] == 'i' else '0'})"
+    return f"(isgreaterequal({name}, {end}) ? {most} : {low} ? {least} : {name} == {name} ? ({kind}){name} : 0)"
+
+
+def _as_other(source: Type, target: Type, name: str, real: Real) -> str:
+    """Read the bits of a number as another; a number of single precision is one of double precision then."""
+    if "f64" not in (source, target):
+        return f"({c_type(target, real)}){name}"
+    fields = " ".join(f"{c_type(t, 'double')} {t};" for t in (source, target))
+    return f"({c_type(target, real)})((union {{ {fields} }}){{ .{source} = {name} }}).{target}"
+
+
+WIDTH = 100  # characters of a line of a table
+Place = Callable[[str], str]  # from an index to what stands there
+
+
+class CSource:
+    """Statements that compute some nodes, and the tables that they read.
+
+    `places`: expressions of the numbers of each input. `prefix`: prefix of the names of tables.
+    """
+
+    def __init__(self, roots: Iterable[Node], places: Mapping[Buffer, Place], real: Real, prefix: str):
+        self.places, self.real, self.prefix = places, real, prefix
+        self.needed = needed(roots)
+        self.names: dict[Node, str] = {}
+        self.arrays: dict[Buffer, str] = {}
+        self.tables: dict[tuple[str, bytes], tuple[str, str]] = {}
+        self.operations: dict[str, int] = {}
+        self.count = 0
+
+    def name(self, node: Node) -> str:
+        """Return the variable or literal of a number."""
+        return literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
+
+    def _end(self, node: Node) -> str:
+        """Return a number as the end of a range: the largest of the precision in place of one beyond it."""
+        if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
+            return self.name(node)
+        largest = float(np.finfo(np.float32).max)
+        return literal(
+            min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real
+        )
+
+    def statements(self, block: Block, indent: str = "    ") -> list[str]:
+        """Return a block's statements, in order."""
+        lines: list[str] = []
+        for statement in block.items:
+            # Only what is needed; the end of a loop always is.
+            if statement not in self.needed and not isinstance(statement, Check):
+                continue
+            if isinstance(statement, Node):
+                lines += self._node(statement, indent)
+            elif isinstance(statement, Loop):
+                lines += self._loop(statement, indent)
+            elif isinstance(statement, Guard):
+                lines += self._guard(statement, indent)
+            elif isinstance(statement, Store):
+                entry = self._entry(statement.buffer, statement.offset, statement.strides, statement.indices)
+                lines.append(f"{indent}{entry} = {self.name(statement.node)};")
+            else:
+                condition = statement.loop.condition
+                assert condition is not None  # only a loop that ends by its condition has a check
+                lines.append(f"{indent}if (!{self.name(condition)}) break;")
+        return lines
+
+    def declarations(self, indent: str = "    ") -> list[str]:
+        """Declare the arrays that the statements fill."""
+        arrays = self.arrays.items()
+        return [f"{indent}{c_type(b.type, self.real)} {name}[{max(b.size, 1)}];" for b, name in arrays]
+
+    def table_definitions(self) -> list[str]:
+        """Define the tables, one definition each."""
+        return [text for _, text in self.tables.values()]
+
+    def _new(self) -> str:
+        self.count += 1
+        return f"v{self.count}"
+
+    def _node(self, node: Node, indent: str) -> list[str]:
+        if node.op in ("constant", "counter", "parameter", "result", "guarded"):
+            return []
+        if node.op == "load":
+            text = self._load(node)
+        else:
+            named = self._end if node.op in ("min", "max") else self.name
+            text = expression(node, [named(a) for a in node.args], self.real)
+            self.operations[node.op] = self.operations.get(node.op, 0) + 1
+        self.names[node] = self._new()
+        return [f"{indent}const {c_type(node.type, self.real)} {self.names[node]} = {text};"]
+
+    def _load(self, node: Node) -> str:
+        buffer, offset, strides = node.value
+        return self._entry(buffer, offset, strides, node.args)
+
+    def _entry(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
+        """Return the expression of a number in memory, which may be part of another array."""
+        whole, start = buffer.owner
+        index = self._at(start + offset, strides, indices)
+        if whole.table is not None:
+            return f"{self._table(whole)}[{index}]"
+        if whole in self.places:
+            return self.places[whole](index)
+        return f"{self.arrays.setdefault(whole, f'a{len(self.arrays)}')}[{index}]"
+
+    def _at(self, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
+        terms = [f"{s} * {self.name(i)}" if s != 1 else self.name(i) for s, i in zip(strides, indices, strict=True)]
+        return " + ".join(([str(offset)] if offset or not terms else []) + terms)
+
+    def _table(self, buffer: Buffer) -> str:
+        assert buffer.table is not None
+        values: np.ndarray = np.ascontiguousarray(buffer.table)
+        key = (buffer.type, values.tobytes())
+        if key not in self.tables:
+            name = f"{self.prefix}_table_{len(self.tables)}"
+            numbers = [literal(x, buffer.type, self.real) for x in values.ravel().tolist()]
+            head = f"static const {c_type(buffer.type, self.real)} {name}[{len(numbers)}] = {{"
+            self.tables[key] = name, "\n".join([head, *_wrapped(numbers), "};"])
+        return self.tables[key][0]
+
+    def _loop(self, loop: Loop, indent: str) -> list[str]:
+        """Write a loop, with variables that carry numbers from turn to turn."""
+        deeper, lines = f"{indent}    ", []
+        carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed.keys()]
+        for index in carried:
+            name, start = self._new(), loop.initial[index]
+            lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name(start)};")
+            self.names[loop.parameters[index]] = self.names[loop.results[index]] = name
+        head = "for (;;) {"
+        if loop.length is not None:
+            counter = self._new()
+            if loop.counter is not None:
+                self.names[loop.counter] = counter
+            head = f"for (int64_t {counter} = 0; {counter} < {loop.length}; ++{counter}) {{"
+        lines += [f"{indent}{head}", *self.statements(loop.body, deeper)]
+        # What follows may be another parameter, which must not have changed yet.
+        ends: list[str] = []
+        for index in carried:
+            node = loop.following[index]
+            ends.append(self.name(node))
+            if node.op == "parameter":
+                ends[-1] = self._new()
+                lines.append(f"{deeper}const {c_type(node.type, self.real)} {ends[-1]} = {self.name(node)};")
+        lines += [f"{deeper}{self.names[loop.parameters[p]]} = {end};" for p, end in zip(carried, ends, strict=True)]
+        return [*lines, f"{indent}}}"]
+
+    def _guard(self, guard: Guard, indent: str) -> list[str]:
+        """Write a guarded block; its results are zero if the condition does not hold."""
+        results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
+        lines = []
+        for outcome, _ in results:
+            self.names[outcome] = self._new()
+            lines.append(f"{indent}{c_type(outcome.type, self.real)} {self.names[outcome]} = 0;")
+        deeper = f"{indent}    "
+        lines += [f"{indent}if ({self.name(guard.condition)}) {{", *self.statements(guard.body, deeper)]
+        return [*lines, *(f"{deeper}{self.names[r]} = {self.name(v)};" for r, v in results), f"{indent}}}"]
+
+
+def _wrapped(numbers: Sequence[str]) -> list[str]:
+    lines, line = [], "   "
+    for number in numbers:
+        if len(line) + len(number) + 2 > WIDTH:
+            lines.append(line)
+            line = "   "
+        line += f" {number},"
+    return [*lines, line]

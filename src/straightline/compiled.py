@@ -1,0 +1,186 @@
+"""Functions of one run, compiled for many: LLVM IR as code of this machine, called on arrays of runs, on all cores."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from functools import cache
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from straightline.folding import DTYPES
+from straightline.llvm.module import LINE, Code, written
+from straightline.machine import LONG, WIDEST, Machine, Tiers, features, generated, narrow
+from straightline.nodes import Unsupported
+from straightline.program import Program, lower
+
+LITTLE = 100_000  # operations of vectors: done sooner than other threads are woken
+SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
+
+
+class Compiled:
+    """Code for blocks of runs, one for each number of a vector; of `width` runs, or of as many as suit the processor.
+
+    `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
+    it. Results have the same bits whatever the width and the number of cores.
+    """
+
+    def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
+        self.width = width or WIDEST
+        self.differs = list(differs)
+        self.types = [DTYPES[b.type] for b in program.inputs]
+        self.shapes = [b.shape for b in program.inputs]
+        self.tree = program.tree
+        self.code: Code = written(program, self.differs, self.width, features()[2])
+        self.blocks = Tiers(self.code.blocks, (width or narrow(), self.width))
+        self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
+        self._why: str | None = None
+        self._first: list[np.ndarray] = []
+        self._addresses, self._tables = list[int](), addresses(self.code.tables)
+
+    def with_first(self, *leaves: Any) -> "Compiled":
+        """Return the same code whose first arguments are these, which calls leave out."""
+        new = copy(self)
+        new._first = [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types, strict=False)]
+        new._addresses = addresses(new._first)
+        return new
+
+    def prepare(self, arrays: Sequence[Any] = ()) -> str:
+        """Generate what a first call of these arrays takes, else of one run; return "", or why LLVM makes no code."""
+        if self._why is None:
+            try:
+                if self.once is not None:
+                    self.once.prepare(1)
+                if not all(self.code.common):
+                    self.blocks.prepare(-(-self._runs(arrays) // self.width))
+                self._why = ""
+            except Unsupported as error:
+                self._why = str(error)
+        return self._why
+
+    def _runs(self, arrays: Sequence[Any]) -> int:
+        return next((len(x) for x, d in zip(arrays, self.differs, strict=False) if d), 1)
+
+    def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
+        """Return the results of all runs, with a leading axis of runs."""
+        arrays, given = list(self._first), len(self._first)
+        arrays += [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types[given:], strict=True)]
+        runs = self._runs(arrays)
+        code = self.code
+        outputs = [np.empty((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
+        shared = aligned(code.shared)
+        ends = addresses([*outputs, shared])
+        pointers = np.array([*self._addresses, *addresses(arrays[given:]), *self._tables, *ends], dtype=np.uint64)
+        if self.once is not None:
+            once = self.once.machine(1)
+            once.run(pointers.ctypes.data, 0, 0, 1, 1)
+            self._copy_common(outputs, shared)
+        if not all(code.common):
+            memory = arrays, code.tables, outputs, shared
+            self._run(Call(self.blocks.machine(-(-runs // self.width)), pointers, memory, runs), cores)
+        return jax.tree.unflatten(self.tree, outputs)
+
+    def _run(self, call: "Call", cores: int | None) -> None:
+        blocks, scratch = -(-call.runs // call.machine.width), self.code.scratch
+        if cores == 1 or blocks * self.code.blocks.work < LITTLE:
+            call.compute(0, blocks, scratch)
+            return
+        cores = cores or cpu_count()
+        share = -(-blocks // (cores * SHARES))
+        starts = range(0, blocks, share)
+        list(threads().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
+
+    def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
+        for array, common, offset, buffer in zip(
+            outputs, self.code.common, self.code.places, self.code.outputs, strict=True
+        ):
+            if common:
+                size = buffer.size * array.itemsize
+                array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
+
+
+class Call(NamedTuple):
+    """Code and all the memory of one call, held by each thread that computes a part of it.
+
+    Who waits for the parts may stop waiting, at a Ctrl-C for example: the threads go on to write.
+    """
+
+    machine: Machine
+    pointers: np.ndarray
+    memory: Any
+    runs: int
+
+    def compute(self, begin: int, end: int, scratch: int) -> None:
+        """Compute blocks of runs in this thread, with so many bytes of its own."""
+        own = aligned(scratch)
+        self.machine.run(self.pointers.ctypes.data, own.ctypes.data, begin, end, self.runs)
+
+
+class Alone:
+    """Code for one run with its own memory of arguments and results, which a call reads and writes in place.
+
+    `in_place` says which results, leaf by leaf, are written over which arguments, such as a filter's state.
+    """
+
+    def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
+        self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
+        level = int(self.code.operations <= LONG)
+        self.machine, self.tree, self._in_place = generated(self.code.blocks, level, 1), program.tree, in_place
+        self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
+        self._place([])
+
+    def again(self, first: Sequence[np.ndarray]) -> "Alone":
+        """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
+        new = copy(self)
+        new._place(first)
+        return new
+
+    def _place(self, first: Sequence[np.ndarray]) -> None:
+        """Allocate memory for a call."""
+        kinds = self._arguments
+        self.inputs = [np.ascontiguousarray(x, t).reshape(s) for x, (s, t) in zip(first, kinds, strict=False)]
+        self.inputs += [np.zeros(*kind) for kind in kinds[len(first) :]]
+        fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in self.code.outputs]
+        self.outputs = [self.inputs[self._in_place[k]] if k in self._in_place else x for k, x in enumerate(fresh)]
+        self.scratch, self._shared = aligned(self.code.scratch), aligned(self.code.shared)
+        every = [*self.inputs, *self.code.tables, *self.outputs, self._shared]
+        self.pointers = np.array(addresses(every), dtype=np.uint64)
+        self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
+
+    def __call__(self) -> None:
+        """Compute `outputs` from `inputs`."""
+        run, pointers, scratch = self._call
+        run(pointers, scratch, 0, 1, 1)
+
+
+def compile(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = ()) -> Compiled:
+    """Compile a function of one run's arguments, of the shapes of these, for many runs."""
+    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
+    return Compiled(lower(function, *examples), differs)
+
+
+def addresses(arrays: Sequence[np.ndarray]) -> list[int]:
+    """Return the addresses of arrays."""
+    return [x.__array_interface__["data"][0] for x in arrays]
+
+
+def aligned(size: int) -> np.ndarray:
+    """Allocate bytes at an address that is a multiple of a cache line."""
+    whole = np.zeros(size + LINE, np.uint8)
+    start = -whole.ctypes.data % LINE
+    return whole[start : start + size]
+
+
+def cpu_count() -> int:
+    """Return the number of cores of this machine."""
+    return os.cpu_count() or 1
+
+
+@cache
+def threads() -> ThreadPoolExecutor:
+    """Return the thread pool of the process, one thread for each core."""
+    return ThreadPoolExecutor(cpu_count())

@@ -1,0 +1,312 @@
+"""Simplification of scalar operations: constants, neutral elements, two operations as one.
+
+A product with zero is zero only if the other factor is known to be finite: data may be NaN. In a product of matrices a
+known zero leaves its term out (`rules/matrices.py`).
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from straightline.nodes import Node, Number, Type
+
+COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
+DTYPES: dict[str, Any] = {
+    "f64": np.float64,
+    "bool": np.bool_,
+    "i32": np.int32,
+    "i64": np.int64,
+    "u32": np.uint32,
+    "u64": np.uint64,
+}
+
+
+class Graph(Protocol):
+    """A program that makes nodes; `numbers` are those that are known not to be NaN."""
+
+    numbers: set[Node]
+
+    def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
+        """Return the node of an operation."""
+
+    def constant(self, value: Number, type: Type) -> Node:
+        """Return the node of a constant."""
+
+
+def wrapped(number: int, like: Any) -> Any:
+    """Return the integer of a type that has the lowest bits of a number."""
+    kind = type(like)
+    bits = 8 * like.itemsize
+    rest = number % (1 << bits)
+    return kind(rest - (1 << bits) if rest > np.iinfo(kind).max else rest)
+
+
+def _shift_left(a: Any, b: Any) -> Any:
+    return wrapped(int(a) << int(b), a) if 0 <= b < 8 * a.itemsize else a * 0
+
+
+def _shift_right(a: Any, b: Any) -> Any:
+    bits = 8 * a.itemsize
+    return wrapped(int(a) % (1 << bits) >> int(b), a) if 0 <= b < bits else a * 0
+
+
+def _shift_right_signed(a: Any, b: Any) -> Any:
+    last = 8 * a.itemsize - 1
+    signed = int(a) - (int(a) >> last << last + 1 if a > 0 else 0)  # the highest bit is the sign, of any type
+    return wrapped(signed >> (int(b) if 0 <= b <= last else last), a)
+
+
+def _divided(a: Any, b: Any) -> Any:
+    """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
+    if isinstance(a, np.floating):
+        return np.divide(a, b)
+    return wrapped(_quotient(int(a), int(b)) if b else -1, a)
+
+
+def _remainder(a: Any, b: Any) -> Any:
+    """Return what is left of a division, with the sign of a; of integers by 0 all."""
+    if isinstance(a, np.floating):
+        return np.fmod(a, b)
+    return wrapped(int(a) - _quotient(int(a), int(b)) * int(b) if b else int(a), a)
+
+
+def _quotient(a: int, b: int) -> int:
+    return abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
+
+
+def _maximum(a: Any, b: Any) -> Any:
+    """Return the larger number, 0 of two zeros unless both are -0; NaN if either is."""
+    return a + b if a == b == 0 and isinstance(a, np.floating) else np.maximum(a, b)
+
+
+def _minimum(a: Any, b: Any) -> Any:
+    return -_maximum(-a, -b) if isinstance(a, np.floating) else np.minimum(a, b)
+
+
+def _sign(a: Any) -> Any:
+    return a if a == 0 else np.sign(a)
+
+
+def _round_away(a: Any) -> Any:
+    whole = np.trunc(a)
+    return whole + np.copysign(1.0, a) if np.abs(a - whole) >= 0.5 else whole
+
+
+def _power(a: Any, b: Any) -> Any:
+    """Compute a^b as the C library does; NumPy takes the root for b = 1/2, also of -0 and -infinity."""
+    try:
+        return np.float64(math.pow(a, b))
+    except (ValueError, OverflowError):
+        return np.power(a, b)
+
+
+def _converted(a: Any, kind: Any) -> Any:
+    """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
+    if not isinstance(a, np.floating) or kind in (np.float64, np.bool_):
+        return a.astype(kind)
+    ends = np.iinfo(kind)
+    return kind(0 if np.isnan(a) else ends.max if a >= ends.max else ends.min if a <= ends.min else int(a))
+
+
+# Operations whose numbers of known numbers are computed here; others wait for the run.
+EVALUATED: dict[str, Callable[..., Any]] = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divided, "rem": _remainder, "neg": np.negative,
+    "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "log": np.log, "log1p": np.log1p, "expm1": np.expm1,
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "atan2": np.arctan2, "pow": _power,
+    "round_even": np.rint, "round_away": _round_away,
+    "floor": np.floor, "ceil": np.ceil, "sign": _sign, "is_finite": np.isfinite,
+    "max": _maximum, "min": _minimum,
+    "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
+    "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert,
+    "shift_left": _shift_left, "shift_right": _shift_right,
+    "shift_right_signed": _shift_right_signed,
+}  # fmt: skip
+
+
+def folded(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    """Return an existing or simpler node of the same value; None if there is none."""
+    for a in args:
+        if a.op != "constant":
+            rule = SIMPLER.get(op)
+            return None if rule is None else rule(graph, type, *args)
+    return _evaluated(graph, op, type, args)
+
+
+def _evaluated(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    numbers = [DTYPES[a.type](a.value) for a in args]
+    with np.errstate(all="ignore"):
+        if op == "select":
+            return args[1] if numbers[0] else args[2]
+        if op == "convert":
+            value = _converted(numbers[0], DTYPES[type])
+        elif op == "bitcast":
+            value = numbers[0].view(DTYPES[type])
+        elif op in EVALUATED:
+            value = EVALUATED[op](*numbers)
+        else:
+            return None
+    return graph.constant(value.item(), type)
+
+
+def _is(node: Node, number: float) -> bool:
+    return bool(node.op == "constant" and node.value == number)
+
+
+def is_finite(node: Node) -> bool:
+    """Return whether a number is finite whatever the data."""
+    if node.type != "f64" or (node.op == "constant" and math.isfinite(node.value)):
+        return True
+    return node.op == "convert" or (node.op == "select" and all(is_finite(a) for a in node.args[1:]))
+
+
+def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if a.op == "constant" and a.value == 0:
+        return b
+    if b.op == "constant" and b.value == 0:
+        return a
+    if type == "f64" and b.op == "neg":
+        return graph.node("sub", type, a, b.args[0])
+    if type == "f64" and a.op == "neg":
+        return graph.node("sub", type, b, a.args[0])
+    return None
+
+
+def _sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if _is(b, 0):
+        return a
+    if type == "f64" and _is(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
+        return graph.node("neg", type, b)
+    if type == "f64" and b.op == "neg":
+        return graph.node("add", type, a, b.args[0])
+    return None
+
+
+def _mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op != "constant":
+        return None
+    if a.value == 1:
+        return b
+    if a.value == 0 and is_finite(b):
+        return a
+    if type == "f64" and a.value == -1:
+        return graph.node("neg", type, b)
+    if a.value == 0.5 and b.op == "add" and b.args[0] is b.args[1]:
+        return b.args[0]
+    if a.value == -0.0 or b.op != "neg":
+        return None
+    return graph.node("mul", type, graph.constant(-a.value, type), b.args[0])
+
+
+def _div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Replace a division by a power of two by the product with its reciprocal, which is exact."""
+    if type != "f64" or b.op != "constant" or not b.value or not math.isfinite(b.value):
+        return None
+    if abs(math.frexp(b.value)[0]) != 0.5 or not 1e-300 < abs(b.value) < 1e300:
+        return None
+    return graph.node("mul", type, a, graph.constant(1 / b.value, type))
+
+
+def _neg(graph: Graph, type: Type, a: Node) -> Node | None:
+    return a.args[0] if a.op == "neg" else None
+
+
+def _and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and type == "bool":
+        return b if a.value else a
+    return a if a is b else None
+
+
+def _or(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and type == "bool":
+        return a if a.value else b
+    if a.op == "constant" and a.value == 0:
+        return b
+    return a if a is b else None
+
+
+def _xor(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and not a.value:
+        return b
+    return graph.node("not", type, b) if a.op == "constant" and type == "bool" else None
+
+
+def _not(graph: Graph, type: Type, a: Node) -> Node | None:
+    return a.args[0] if a.op == "not" else None
+
+
+def _shift(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    return a if _is(b, 0) else None
+
+
+def _same(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    return a if a is b else None
+
+
+def _select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
+    if a is b:
+        return a
+    if condition.op == "constant":
+        return a if condition.value else b
+    if condition.op == "not":
+        return graph.node("select", type, condition.args[0], b, a)
+    if a.op == "select" and a.args[0] is condition:
+        return graph.node("select", type, condition, a.args[1], b)
+    if b.op == "select" and b.args[0] is condition:
+        return graph.node("select", type, condition, a, b.args[2])
+    if type == "bool" and a.op == "constant" and b.op == "constant":
+        return condition if a.value else graph.node("not", "bool", condition)
+    return None
+
+
+def _compare(op: str) -> Callable[..., Node | None]:
+    def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+        """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
+        if a is b and (a.type != "f64" or a in graph.numbers or is_finite(a)):
+            return graph.constant(op == "eq", "bool")
+        if a.op == "constant":
+            a, b = b, a
+        if b.op != "constant":
+            return None
+        flag = a.args[0] if a.op == "convert" and a.args[0].type == "bool" else a
+        if flag.type != "bool" or b.value not in (0, 1):
+            return None
+        return flag if bool(b.value) == (op == "eq") else graph.node("not", "bool", flag)
+
+    return rule
+
+
+def _order(strict: bool, turned: bool) -> Callable[..., Node | None]:
+    def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+        """Write the order of two flags, false before true, as logic: LLVM has no such comparison of vectors of them."""
+        if a.type != "bool":
+            return None
+        low, high = (b, a) if turned else (a, b)
+        return graph.node("and" if strict else "or", "bool", graph.node("not", "bool", low), high)
+
+    return rule
+
+
+def _convert(graph: Graph, type: Type, a: Node) -> Node | None:
+    if a.type == type:
+        return a
+    if type == "bool":
+        return graph.node("ne", "bool", a, graph.constant(0.0 if a.type == "f64" else 0, a.type))
+    return None
+
+
+SIMPLER: dict[str, Callable[..., Node | None]] = {
+    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "and": _and, "or": _or, "xor": _xor, "not": _not,
+    "shift_left": _shift, "shift_right": _shift, "max": _same, "min": _same, "select": _select, "eq": _compare("eq"),
+    "ne": _compare("ne"), "convert": _convert, "lt": _order(True, False), "le": _order(False, False),
+    "gt": _order(True, True), "ge": _order(False, True),
+}  # fmt: skip

@@ -1,0 +1,86 @@
+"""Programs under construction: equal expressions are one node, and each stands in the outermost block that it can.
+
+A node is one number in every run. Constants are folded when a node is made (`folding`), and a node belongs to the
+outermost block that has all its arguments: what a loop does not change is computed before it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from straightline.folding import COMMUTATIVE, folded
+from straightline.nodes import Block, Buffer, Node, Number, Store, Type, Unsupported
+
+MOST = 400_000  # nodes made, constants and what is dropped again among them
+
+
+class Graph:
+    """A program under construction, of `most` nodes. Nodes are made in `current`, the innermost open block."""
+
+    def __init__(self, most: int = MOST) -> None:
+        self.most = most
+        self.top = Block(None)
+        self.current = self.top
+        self.serial = 0
+        self.numbers: set[Node] = set()  # known not to be NaN
+
+    def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
+        """Return a node of an operation: a constant, an existing equal node, or a new one."""
+        simpler = folded(self, op, type, args)
+        if simpler is not None:
+            return simpler
+        if op in COMMUTATIVE and args[0].serial > args[1].serial:
+            args = (args[1], args[0])
+        return self._once(op, type, args, value)
+
+    def constant(self, value: Number, type: Type) -> Node:
+        """Make a constant."""
+        key = (type, value if value != 0 or type != "f64" else str(value))  # two zeros
+        known = self.top.seen.get(key)
+        if known is None:
+            known = self.top.seen[key] = self.fresh("constant", type, (), self.top, value)
+        return known
+
+    def fresh(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
+        """Make a node that equals no other, and that no block contains yet."""
+        self.serial += 1
+        if self.serial > self.most:
+            raise Unsupported(f"a program of more than {self.most} operations")
+        return Node(op, type, args, block, value, self.serial)
+
+    def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
+        """Load buffer[offset + sum strides * indices], after the buffer is filled."""
+        pairs = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
+        offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
+        if buffer.table is not None and not pairs:
+            return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
+        row = len(buffer.first)
+        if row and all(s % row == 0 for s, _ in pairs):  # another row alone
+            offset += buffer.first[offset % row] - offset % row
+        indices = tuple(i for _, i in pairs)
+        value = (buffer, offset, tuple(s for s, _ in pairs))
+        return self._once("load", buffer.type, indices, value, buffer.block.depth)
+
+    def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
+        """Store a number, in the open block."""
+        written = Store(self.current, buffer, node, offset, strides, indices)
+        buffer.stores.append(written)
+        self.current.items.append(written)
+
+    def _once(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int = 0) -> Node:
+        """Return the equal node of an open block, or make one: in the outermost block that may have it.
+
+        That has all arguments and at least this depth, or is pinned: such a block holds what is made within it.
+        """
+        key, block = (op, type, args, value), self.current
+        while (equal := block.seen.get(key)) is None and block.parent is not None:
+            block = block.parent
+        if equal is not None:
+            return equal
+        block = self.current
+        if block.parent is not None:
+            depth = max(depth, *[a.block.depth for a in args], 0)
+            while block.depth > depth and not block.pinned and block.parent is not None:
+                block = block.parent
+        made = block.seen[key] = self.fresh(op, type, args, block, value)
+        block.items.append(made)
+        return made

@@ -1,0 +1,160 @@
+"""Graphs as functions of JAX, operation by operation on scalars: `vmap` makes them arrays of runs, for any device.
+
+XLA then has nothing but elementwise operations, which it fuses; derivatives are those of the scalar operations.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from straightline.folding import DTYPES
+from straightline.memory import InMemory
+from straightline.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Unsupported
+from straightline.program import Program, needed
+from straightline.rules.random_bits import hashed
+
+lax = jax.lax
+OPERATIONS: dict[str, Callable[..., jax.Array]] = {
+    "threefry": hashed,
+    "select": lax.select, "not": lax.bitwise_not, "and": lax.bitwise_and, "or": lax.bitwise_or, "xor": lax.bitwise_xor,
+    "shift_right": lax.shift_right_logical, "shift_right_signed": lax.shift_right_arithmetic,
+    "round_away": partial(lax.round, rounding_method=lax.RoundingMethod.AWAY_FROM_ZERO),
+    "round_even": partial(lax.round, rounding_method=lax.RoundingMethod.TO_NEAREST_EVEN),
+}  # fmt: skip
+Memory = dict[Buffer, jax.Array]  # numbers of one run
+
+
+def function_of(program: Program) -> Callable[..., PyTree]:
+    """Return the function of one run's arrays that a program computes, for JAX to trace, map and differentiate."""
+    return lambda *arrays: jax.tree.unflatten(program.tree, _Evaluation(program).results(arrays))
+
+
+class _Evaluation:
+    """Values of nodes and numbers in memory while JAX traces the function."""
+
+    def __init__(self, program: Program):
+        self.program = program
+        nodes = [n for x in program.outputs if not isinstance(x, InMemory) for n in x.ravel().tolist()]
+        if not all(isinstance(n, Node) for n in nodes):
+            raise Unsupported("keys of random numbers as results")
+        self.needed = needed([*nodes, *(x.buffer for x in program.outputs if isinstance(x, InMemory))])
+        self.values: dict[Node, jax.Array] = {}
+        self.memory: Memory = {}
+
+    def results(self, arrays: tuple[Any, ...]) -> list[jax.Array]:
+        """Return the results for these arguments, leaf by leaf."""
+        for buffer, array in zip(self.program.inputs, arrays, strict=True):
+            self.memory[buffer] = jnp.asarray(array, DTYPES[buffer.type]).reshape(-1)
+        for buffer in {x.owner[0] for x in self.needed if isinstance(x, Buffer)} - set(self.memory):
+            start = np.zeros(buffer.size) if buffer.table is None else buffer.table.ravel()
+            self.memory[buffer] = jnp.asarray(start, DTYPES[buffer.type])
+        self.block(self.program.graph.top.items)
+        return [self._result(x) for x in self.program.outputs]
+
+    def _result(self, value: Any) -> jax.Array:
+        if not isinstance(value, InMemory):
+            nodes = [self.value(n) for n in value.ravel().tolist()]
+            return jnp.stack(nodes).reshape(value.shape) if nodes else jnp.zeros(value.shape)
+        owner, start = value.buffer.owner
+        grid = np.indices(value.shape).reshape(value.ndim, -1)
+        places = np.array(value.strides, int) @ grid + start + value.offset
+        moved = sum((s * self.value(i) for s, i in value.moves), jnp.asarray(places))
+        return self.memory[owner][moved].reshape(value.shape)
+
+    def value(self, node: Node) -> jax.Array:
+        """Return the value of a node."""
+        return jnp.asarray(node.value, DTYPES[node.type]) if node.op == "constant" else self.values[node]
+
+    def block(self, items: list[Any]) -> None:
+        """Evaluate operations and statements in order."""
+        for statement in items:
+            if statement not in self.needed:  # a check of a loop among them
+                continue
+            if isinstance(statement, Store):
+                entry = self._entry_at(statement.buffer, statement.offset, statement.strides, statement.indices)
+                owner = statement.buffer.owner[0]
+                self.memory[owner] = self.memory[owner].at[entry].set(self.value(statement.node))
+            elif isinstance(statement, Loop):
+                self._loop(statement)
+            elif isinstance(statement, Guard):
+                self._guard(statement)
+            elif statement.op not in ("counter", "parameter", "result", "guarded"):
+                self.values[statement] = self._operation(statement)
+
+    def _operation(self, node: Node) -> jax.Array:
+        if node.op == "load":
+            buffer, offset, strides = node.value
+            return self.memory[buffer.owner[0]][self._entry_at(buffer, offset, strides, node.args)]
+        arguments = [self.value(a) for a in node.args]
+        if node.op == "convert":
+            return arguments[0].astype(DTYPES[node.type])
+        if node.op == "bitcast":
+            return lax.bitcast_convert_type(arguments[0], DTYPES[node.type])
+        if node.op == "threefry":
+            arguments = [a.astype(np.uint64) for a in arguments]
+        operation = OPERATIONS[node.op] if node.op in OPERATIONS else getattr(lax, node.op)
+        computed: jax.Array = operation(*arguments)
+        return computed
+
+    def _entry_at(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
+        pairs = zip(strides, indices, strict=True)
+        return sum((s * self.value(i) for s, i in pairs), buffer.owner[1] + offset)
+
+    def _within(self, block: Block) -> list[Buffer]:
+        """Return the buffers that a block stores into, or the blocks inside it."""
+        stores = [x for x in self.needed if isinstance(x, Store) and block in x.block.inwards()]
+        return list(dict.fromkeys(x.buffer.owner[0] for x in sorted(stores, key=lambda x: x.node.serial)))
+
+    def _loop(self, loop: Loop) -> None:
+        """Evaluate a loop: the carry is that of the graph, and the memory that the body fills."""
+        carried = [
+            k for k, pair in enumerate(zip(loop.parameters, loop.results, strict=True)) if {*pair} & self.needed.keys()
+        ]
+        filled, outer, memory = self._within(loop.body), self.values, self.memory
+
+        # In a turn the parameters and the memory are those of the carry.
+        def within(carry: PyTree, counter: Any) -> None:
+            self.values, self.memory = dict(outer), memory | dict(zip(filled, carry[1], strict=True))
+            self.values |= zip((loop.parameters[k] for k in carried), carry[0], strict=True)
+            if loop.counter is not None:
+                self.values[loop.counter] = jnp.asarray(counter, np.int64)
+
+        def turn(counter: Any, carry: PyTree) -> PyTree:
+            within(carry, counter)
+            self.block(loop.body.items)
+            return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
+
+        def goes_on(carry: PyTree) -> jax.Array:
+            within(carry, 0)
+            self.block(loop.body.items[: next(i for i, x in enumerate(loop.body.items) if isinstance(x, Check))])
+            assert loop.condition is not None
+            return self.value(loop.condition)
+
+        # From the first carry to the last, whose values are the loop's results.
+        start = [self.value(loop.initial[k]) for k in carried], [memory[b] for b in filled]
+        if loop.length is None:
+            end = lax.while_loop(goes_on, lambda carry: turn(0, carry), start)
+        else:
+            end = lax.fori_loop(0, loop.length, turn, start)
+        self.values, self.memory = outer, memory | dict(zip(filled, end[1], strict=True))
+        self.values |= zip((loop.results[k] for k in carried), end[0], strict=True)
+
+    def _guard(self, guard: Guard) -> None:
+        """Evaluate a guarded block where its condition holds; its results are zeros elsewhere."""
+        used = [k for k, r in enumerate(guard.results) if r in self.needed]
+        filled, outer, memory = self._within(guard.body), self.values, self.memory
+
+        def taken() -> PyTree:
+            self.values, self.memory = dict(outer), dict(memory)
+            self.block(guard.body.items)
+            return [self.value(guard.values[k]) for k in used], [self.memory[b] for b in filled]
+
+        nothing = [jnp.zeros((), DTYPES[guard.results[k].type]) for k in used]
+        end = lax.cond(self.value(guard.condition), taken, lambda: (nothing, [memory[b] for b in filled]))
+        self.values, self.memory = outer, memory | dict(zip(filled, end[1], strict=True))
+        self.values |= zip((guard.results[k] for k in used), end[0], strict=True)

@@ -1,0 +1,41 @@
+"""Text of LLVM IR that depends on the number of lanes W: the types <W x T>, the lanes' numbers, and gathers."""
+
+from functools import cache
+
+from straightline.llvm.transposed import Lines
+
+
+@cache
+def types(width: int) -> str:
+    """Return the text that names each type <W x T> `%T`, and an integer of W bits `%lanes`."""
+    vectors = [f"%{scalar} = type <{width} x {scalar}>\n" for scalar in ("double", "i64", "i32", "i8", "i1")]
+    return "".join([*vectors, f"%lanes = type i{width}\n"])
+
+
+# W as a number: the size of a vector of bytes.
+WIDTH = "ptrtoint (ptr getelementptr (%i8, ptr null, i64 1) to i64)"
+
+
+def lane_numbers(width: int) -> str:
+    """Write `%i64 @hg_lanes()`: 0, 1, ... W - 1."""
+    numbers = ", ".join(f"i64 {lane}" for lane in range(width))
+    return f"define internal %i64 @hg_lanes() noinline nounwind {{\n  ret %i64 <{numbers}>\n}}\n"
+
+
+def gather_name(bits: int, spread: bool) -> str:
+    """Return the name of a gather."""
+    return f"hg_gather{bits}_{'lanes' if spread else 'table'}"
+
+
+def gather(bits: int, spread: bool, width: int) -> str:
+    """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, a load for each lane; of its entries if `spread`."""
+    vector, text, total = f"%i{bits}", Lines(), "poison"
+    row, entry = (f"[{width} x i{bits}]", ", i64 {}") if spread else (f"i{bits}", "")
+    for lane in range(width):
+        index = text.add(f"extractelement %i64 %places, i64 {lane}")
+        address = text.add(f"getelementptr {row}, ptr %start, i64 {index}{entry.format(lane)}")
+        number = text.add(f"load i{bits}, ptr {address}, align {bits // 8}")
+        total = text.add(f"insertelement {vector} {total}, i{bits} {number}, i64 {lane}")
+    head = f"define internal {vector} @{gather_name(bits, spread)}(ptr %start, %i64 %places) noinline nounwind"
+    body = "\n".join(text.lines)
+    return f"{head} {{\n{body}\n  ret {vector} {total}\n}}\n"

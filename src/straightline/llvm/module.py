@@ -1,0 +1,334 @@
+"""Functions of a compiled program as text of LLVM IR, and the layout of its numbers in memory."""
+
+import math
+import zlib
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from straightline.folding import DTYPES
+from straightline.llvm.lanes import WIDTH, gather, lane_numbers, types
+from straightline.llvm.operations import BITS
+from straightline.llvm.text import Slots, Writer, loops_of, turns_of
+from straightline.llvm.transposed import mover
+from straightline.lowering import Lowering, Value, refusing
+from straightline.memory import LONG, InMemory, contiguous
+from straightline.nodes import Buffer, Node, Type, Unsupported
+from straightline.program import (
+    Program,
+    Summed,
+    crossing,
+    in_order,
+    needed,
+    products_of,
+    row_length,
+    uses,
+    varying,
+)
+from straightline.rules.loops import copied
+from straightline.rules.random_bits import hash_function
+from straightline.vectors.elementary import functions
+
+LONGEST = 200_000  # operations: at 120,000 LLVM takes half as long as XLA, 0.1 ms each
+LINE = 64  # bytes: where vectors of any width may start
+
+
+class Source(NamedTuple):
+    """Text of a function with its count of operations, and how many it executes for a block of runs, loop by loop.
+
+    The text waits compressed, to a tenth: it is needed again only if the program turns out to be executed often.
+    `helpers` write the functions that it calls, for a count of lanes.
+    """
+
+    compressed: bytes
+    helpers: Sequence[Callable[[int], str]]
+    operations: int
+    work: int
+
+    def text(self, width: int) -> str:
+        """Return the text for vectors of so many runs."""
+        body = zlib.decompress(self.compressed).decode()
+        return "\n".join([types(width), *(helper(width) for helper in self.helpers), body])
+
+
+class Output(NamedTuple):
+    """Type and shape of a result of one run: its buffer without the program that fills it."""
+
+    type: Type
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Return the count of numbers of one run."""
+        return math.prod(self.shape)
+
+
+class Code(NamedTuple):
+    """Text of the two functions, of which the second is for vectors of one number, and their arguments.
+
+    `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
+    `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` are those in the
+    program, `divisions` those of them that divide or take roots.
+    """
+
+    blocks: Source
+    once: Source | None
+    tables: list[np.ndarray]
+    outputs: list[Output]
+    common: list[bool]
+    places: list[int]  # of common outputs in the shared memory
+    shared: int
+    scratch: int
+    operations: int
+    divisions: int
+
+
+def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
+    """Store the results of a program, each in a buffer of its own."""
+    lowering = Lowering()
+    lowering.graph = program.graph
+    results: list[Buffer] = []
+    for number, value in enumerate(program.outputs):
+        nodes_only = number in last or not isinstance(value, InMemory)
+        stored = _filled(lowering, value) if nodes_only else _stored(lowering, value, results)
+        results.append(stored.buffer)
+    return results
+
+
+def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
+    """Return an array's buffer if it is all of one that the program filled; else copy the array."""
+    buffer = value.buffer
+    whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
+    alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
+    if whole and alone and value.size == buffer.size:
+        buffer.shape = value.shape
+        return value
+    return _filled(lowering, value) if value.size <= LONG else copied(lowering, value)
+
+
+def _filled(lowering: Lowering, value: Value) -> InMemory:
+    """Store an array in new memory, constants too."""
+    flat: list[Node] = lowering.nodes(value).ravel().tolist()
+    type: Type = value.type if isinstance(value, InMemory) else flat[0].type
+    buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
+    for index, node in enumerate(flat):
+        lowering.graph.store(buffer, node, index, (), ())
+    return InMemory.whole(buffer)
+
+
+@refusing("the text of a program")
+def written(
+    program: Program,
+    differing: Iterable[bool],
+    width: int,
+    fuse: bool,
+    alone: bool = False,
+    last: Collection[int] = (),
+    summed: Summed | None = None,
+) -> Code:
+    """Write a program; `differing` says of each input whether it differs between runs.
+
+    `width`: the most runs of a vector. `alone`: one run, whose arrays are used in place; results of the numbers `last`
+    may overwrite arguments. `summed`: outputs that are summed over runs. The program is let go of.
+
+    Raises:
+        Unsupported: an operation that has no text, or a program that is too long.
+    """
+    outputs = output_buffers(program, last)
+    lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
+    items = in_order(needed(outputs))
+    counts = Counter([x.op for x in items if isinstance(x, Node)])
+    operations = counts.total() - counts["constant"]
+    if operations > LONGEST:
+        raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
+    # Numbers that differ between runs; all others are computed once.
+    spread = {*items, *program.inputs} if alone else varying(items, lanes)
+    products = products_of(items) if fuse else set()
+    tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
+    common = [b not in spread for b in outputs]
+    spread -= set(tables)
+    # Layout: per thread in scratch memory, shared by all runs in shared memory.
+    owners = dict.fromkeys(x.owner[0] for x in items if isinstance(x, Buffer))
+    added = set() if summed is None else {b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in spread}
+    _check_sums(items, added)
+    scratch, in_scratch = _places(
+        [
+            b
+            for b in owners
+            if b not in added and b in spread and b.kind != "table" and not (alone and (b in outputs or b in lanes))
+        ],
+        width,
+        0,
+    )
+    mine = crossing(items, spread)
+    # What blocks read of memory that is filled anew in each turn of a loop has a place for each turn.
+    turning = {b for b in owners if b not in spread and b.kind == "scratch" and loops_of(b.block)}
+    turning &= _read(mine) if turning else turning
+    shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0, turning)
+    # The function of blocks computes what differs, and reads the rest from slots.
+    slots = Slots(shared)
+    pointers = [*program.inputs, *tables, *outputs]
+    blocks = Writer(alone, mine, products, spread, slots)
+    blocks.turning = turning
+    text, movers = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, width, summed)
+    # The other function fills these slots, once for all runs.
+    roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
+    roots += [b for b, c in zip(outputs, common, strict=True) if c]
+    once = None
+    if roots:
+        writer = Writer(True, needed(roots), products, set(), slots)
+        writer.turning = turning
+        once = _source(_once(writer, program, pointers, in_shared), writer, [])
+    arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
+    places = [in_shared.get(b, 0) for b in outputs]
+    source, results = _source(text, blocks, movers), [Output(b.type, b.shape) for b in outputs]
+    divisions = counts["div"] + counts["sqrt"]
+    program.graph.top.let_go()
+    return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions)
+
+
+def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
+    """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
+    read = _read(items) if outputs else set()
+    if any(b.inside is not None or b in read or b.type != "f64" for b in outputs):
+        raise Unsupported("a sum over runs of numbers that are used again")
+
+
+def _read(items: Iterable[Any]) -> set[Buffer]:
+    """Return the buffers that these items, or what they use directly, load numbers of."""
+    nodes = (node for x in items for node in (x, *uses(x)) if isinstance(node, Node))
+    return {node.value[0].owner[0] for node in nodes if node.op == "load"}
+
+
+def _source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -> Source:
+    """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
+    counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
+    turns = {block: turns_of(block) for block in counts}
+    work = sum(count * turns[block] for block, count in counts.items())
+    helpers: list[Callable[[int], str]] = [*movers, *(partial(gather, *kind) for kind in sorted(writer.gathered))]
+    called = writer.called - {"threefry"}
+    if called:
+        helpers.append(partial(functions, called))
+    if "threefry" in writer.called:
+        text = f"{hash_function()}\n{text}"
+    return Source(zlib.compress(text.encode(), 1), helpers, counts.total(), work)
+
+
+def _places(
+    buffers: Iterable[Buffer], width: int, start: int, turning: Collection[Buffer] = ()
+) -> tuple[int, dict[Buffer, int]]:
+    """Place buffers one after another; return the end and each one's offset, in bytes; of some one for each turn."""
+    places: dict[Buffer, int] = {}
+    for buffer in buffers:
+        places[buffer] = start
+        copies = turns_of(buffer.block) if buffer in turning else 1
+        start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
+    return start, places
+
+
+HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
+
+
+def _blocks(
+    writer: Writer,
+    program: Program,
+    pointers: list[Buffer],
+    lanes: list[Buffer],
+    outputs: list[Buffer],
+    in_scratch: dict[Buffer, int],
+    in_shared: dict[Buffer, int],
+    alone: bool,
+    width: int,
+    summed: Summed | None,
+) -> tuple[str, list[Callable[[int], str]]]:
+    """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back.
+
+    Return it with what writes the functions that move inputs and outputs.
+    """
+    names = _pointers(writer, pointers, in_shared)
+    for buffer, offset in in_scratch.items():
+        writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
+    # Loop over blocks; the block `number` has runs from `first` on.
+    writer.line("%last = sub i64 %runs, 1")
+    writer.line("br label %block")
+    writer.start("block")
+    writer.line("%number = phi i64 [%begin, %entry], [%next, %done]")
+    writer.line(f"%first = mul i64 %number, {WIDTH}")
+    movers = set[tuple[int, bool]]()
+
+    def move(kind: str, buffer: Buffer) -> None:
+        bits = BITS[buffer.type]
+        movers.add((bits, kind == "take"))
+        pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
+        writer.line(f"call void @{kind}{bits}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
+
+    # Inputs to lanes, the operations, lanes to outputs.
+    taken = [] if alone else [b for b in lanes if b in in_scratch and b.size]
+    given = [] if alone else [b for b in outputs if b in in_scratch and b.size]
+    for buffer in taken:
+        move("take", buffer)
+    helpers: list[Callable[[int], str]] = []
+    if summed is not None:
+        helpers.append(lane_numbers)
+        added = [b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in writer.spread]
+        _add(writer, summed, names, program.inputs[summed.number], added, width)
+    writer.block(program.graph.top)
+    for buffer in given:
+        if buffer not in writer.sums:
+            move("give", buffer)
+    # Next block.
+    writer.line("br label %done")
+    writer.start("done")
+    writer.line("%next = add i64 %number, 1")
+    writer.line("%more = icmp slt i64 %next, %end")
+    writer.line("br i1 %more, label %block, label %exit")
+    writer.start("exit")
+    body = "\n".join(writer.lines)
+    helpers += [partial(mover, *kind) for kind in sorted(movers)]
+    return f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n", helpers
+
+
+def _add(
+    writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer], width: int
+) -> None:
+    """Make the stores to some outputs add to sums over runs.
+
+    A run's place in a row is that of a block of the most runs, which begins with the batch of its first run: so sums
+    have the same bits whatever the number of runs in a vector.
+    """
+    begin = writer.add(f"and i64 %first, {-width}")
+    address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {begin}")
+    run = writer.add(f"load i32, ptr {address}, align 4")
+    batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
+    batch = writer.add(f"add i64 {batch}, {writer.add(f'sub i64 %first, {begin}')}")
+    count = writer.everywhere(writer.add("sub i64 %runs, %first"), "i64")
+    writer.counted = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {count}")
+    for buffer in outputs:
+        writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {batch}")
+        writer.sums[buffer] = row_length(width, summed.batches)
+
+
+def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:
+    """Write the function that computes what all runs share."""
+    _pointers(writer, pointers, in_shared)
+    writer.block(program.graph.top)
+    body = "\n".join(writer.lines)
+    return f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n"
+
+
+def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
+    """Load the addresses of inputs, tables and outputs, the bases of their buffers; return the names of all."""
+    names: dict[Buffer, str] = {}
+    for number, buffer in enumerate([*pointers, None]):
+        address = writer.add(f"getelementptr ptr, ptr %pointers, i64 {number}")
+        name = writer.add(f"load ptr, ptr {address}, align 8")
+        if buffer is None:
+            writer.slots.base = name
+        else:
+            names[buffer] = writer.bases[buffer] = name
+    for buffer, start in in_shared.items():
+        writer.bases[buffer] = writer.add(f"getelementptr i8, ptr {writer.slots.base}, i64 {start}")
+    return names

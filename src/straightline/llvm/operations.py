@@ -1,0 +1,184 @@
+"""Scalar operations as text of LLVM IR, on vectors <W x T> of as many runs.
+
+A text names the type <W x T> by `%T` and leaves W open: `lanes.types` defines the names, and with them W. The compiler
+decides nothing: a product and a sum are one fused operation only where the text says so, so that the bits of a result
+depend neither on the width nor on the level of optimisation.
+"""
+
+import struct
+from collections.abc import Callable
+
+from straightline.nodes import Node, Type, Unsupported
+from straightline.vectors.elementary import FUNCTIONS, SCALAR
+
+LLVM = {"f64": "double", "bool": "i1", "i32": "i32", "i64": "i64", "u32": "i32", "u64": "i64"}
+BITS = {"f64": 64, "bool": 8, "i32": 32, "i64": 64, "u32": 32, "u64": 64}  # in memory
+FLOAT = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
+INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor"}
+ORDER = {"eq": "eq", "ne": "ne", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge"}
+UNARY = {
+    "sqrt": "sqrt",
+    "abs": "fabs",
+    "floor": "floor",
+    "ceil": "ceil",
+    "round_even": "roundeven",
+    "round_away": "round",
+}
+CALLED = {*FUNCTIONS, *SCALAR, "threefry"}  # functions of their own, `hg_` before the name
+
+Emit = Callable[[str], str]  # the text of an operation -> the name of its result
+
+
+def vector(type: Type) -> str:
+    """Return the name of the type <W x T>."""
+    return f"%{LLVM[type]}"
+
+
+def literal(value: float | int | bool, type: Type) -> str:
+    """Return a constant; doubles by their bits."""
+    if type == "f64":
+        return "0x" + struct.pack(">d", float(value)).hex().upper()
+    if type == "bool":
+        return "true" if value else "false"
+    return str(int(value))
+
+
+def splat(value: float | int | bool, type: Type) -> str:
+    """Return a constant in all lanes."""
+    return f"splat ({LLVM[type]} {literal(value, type)})"
+
+
+def operation(node: Node, names: list[str], emit: Emit) -> str:
+    """Emit the operation of a node on its arguments' names; return the name of the result."""
+    source: Type = node.args[0].type if node.args else node.type
+    operand_type = vector(source)
+    op, result_type = node.op, vector(node.type)
+    if source == "f64" and op in FLOAT:
+        return emit(f"{FLOAT[op]} {operand_type} {names[0]}, {names[1]}")
+    if op == "select":
+        return emit(f"select {operand_type} {names[0]}, {result_type} {names[1]}, {result_type} {names[2]}")
+    # Comparisons and conversions depend on the type of the arguments.
+    if op in ORDER:
+        return emit(f"{_comparison(op, source)} {operand_type} {names[0]}, {names[1]}")
+    if op == "convert":
+        return _converted(source, node.type, names[0], emit)
+    if op == "bitcast":
+        return emit(f"bitcast {operand_type} {names[0]} to {result_type}")
+    if op == "not":
+        return emit(f"xor {operand_type} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
+    # Functions of `vector_math`, then arithmetic by type.
+    if op in CALLED:
+        typed = ", ".join(f"{vector(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
+        return emit(f"call {result_type} @hg_{op}({typed})")
+    return (_of_doubles if source == "f64" else _of_integers)(node, names, operand_type, emit)
+
+
+def _comparison(op: str, type: Type) -> str:
+    if type == "f64":
+        return "fcmp une" if op == "ne" else f"fcmp o{op}"
+    if op in ("eq", "ne"):
+        return f"icmp {op}"
+    return f"icmp {'u' if type in ('u32', 'u64', 'bool') else 's'}{op}"
+
+
+def _of_doubles(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    op, first = node.op, f"{text} {names[0]}"
+    if op == "neg":
+        return emit(f"fneg {first}")
+    if op in UNARY:
+        return emit(f"call {text} @llvm.{UNARY[op]}({first})")
+    # maximum and minimum of IEEE 754-2019: NaN if either is.
+    if op in ("max", "min"):
+        return emit(f"call {text} @llvm.{op}imum({first}, {text} {names[1]})")
+    if op == "is_finite":
+        size = emit(f"call {text} @llvm.fabs({first})")
+        return emit(f"fcmp olt {text} {size}, {splat(float('inf'), 'f64')}")
+    # sign x = x for zeros and NaN.
+    if op == "sign":
+        signed = emit(f"call {text} @llvm.copysign({text} {splat(1.0, 'f64')}, {first})")
+        other = emit(f"fcmp one {first}, {splat(0.0, 'f64')}")
+        return emit(f"select {vector('bool')} {other}, {text} {signed}, {first}")
+    if op == "rem":
+        return emit(f"frem {first}, {names[1]}")
+    raise Unsupported(op)
+
+
+def _of_integers(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
+    if op in INTEGER:
+        return emit(f"{INTEGER[op]} {first}, {names[1]}")
+    if op == "neg":
+        return emit(f"sub {text} zeroinitializer, {names[0]}")
+    signed = type[0] == "i"
+    if type == "bool" and op in ("max", "min"):  # LLVM's own, in haste for masks of AVX-512, end the process
+        return emit(f"{'or' if op == 'max' else 'and'} {first}, {names[1]}")
+    if op in ("max", "min"):
+        return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}({first}, {text} {names[1]})")
+    if op == "abs" and signed:
+        return emit(f"call {text} @llvm.abs({first}, i1 false)")
+    if op == "sign":
+        limited = emit(f"call {text} @llvm.{'s' if signed else 'u'}min({first}, {text} {splat(1, type)})")
+        return emit(f"call {text} @llvm.smax({text} {limited}, {text} {splat(-1, type)})") if signed else limited
+    if op in ("div", "rem"):
+        return _divided(node, names, text, emit)
+    if op in ("shift_left", "shift_right", "shift_right_signed"):
+        return _shifted(node, names, text, emit)
+    raise Unsupported(f"{op} of {type}")
+
+
+def _divided(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    """Emit a division of integers, or its rest: by 0 all bits set, or a; the least number by -1 is itself, or 0."""
+    op, type, (a, b) = node.op, node.args[0].type, names
+    how = f"{'s' if type[0] == 'i' else 'u'}{op}"
+    if node.args[1].op == "constant" and node.args[1].value not in (0, -1):
+        return emit(f"{how} {text} {a}, {b}")
+    # What LLVM does not define is divided by 1, which has the right result of the least number by -1.
+    truth = vector("bool")
+    zero = unsafe = emit(f"icmp eq {text} {b}, zeroinitializer")
+    if type[0] == "i":
+        unsafe = emit(f"or {truth} {zero}, {emit(f'icmp eq {text} {b}, {splat(-1, type)}')}")
+        least = emit(f"icmp eq {text} {a}, {splat(-(2 ** (BITS[type] - 1)), type)}")
+        unsafe = emit(f"and {truth} {unsafe}, {emit(f'or {truth} {zero}, {least}')}")
+    safe = emit(f"select {truth} {unsafe}, {text} {splat(1, type)}, {text} {b}")
+    divided = emit(f"{how} {text} {a}, {safe}")
+    return emit(f"select {truth} {zero}, {text} {splat(-1, type) if op == 'div' else a}, {text} {divided}")
+
+
+def _shifted(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    """Emit a shift; by all bits or more, 0 is left, or the sign."""
+    op, type, (a, b), by = node.op, node.args[0].type, names, node.args[1]
+    how = {"shift_left": "shl", "shift_right": "lshr"}.get(op, "ashr")
+    if by.op == "constant" and 0 <= by.value < BITS[type]:
+        return emit(f"{how} {text} {a}, {b}")
+    within = emit(f"call {text} @llvm.umin({text} {b}, {text} {splat(BITS[type] - 1, type)})")
+    shifted = emit(f"{how} {text} {a}, {within}")
+    if how == "ashr":
+        return shifted
+    inside = emit(f"icmp ult {text} {b}, {splat(BITS[type], type)}")
+    return emit(f"select {vector('bool')} {inside}, {text} {shifted}, {text} zeroinitializer")
+
+
+def _converted(source: Type, target: Type, name: str, emit: Emit) -> str:
+    operand_type, result_type = vector(source), vector(target)
+    if source == target or LLVM[source] == LLVM[target]:
+        return name
+    if target == "f64":
+        return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {operand_type} {name} to {result_type}")
+    if source == "f64":
+        how = "fptosi" if target[0] == "i" else "fptoui"
+        return emit(f"call {result_type} @llvm.{how}.sat({operand_type} {name})")
+    if BITS[target] < BITS[source]:
+        return emit(f"trunc {operand_type} {name} to {result_type}")
+    return emit(f"{'sext' if source[0] == 'i' else 'zext'} {operand_type} {name} to {result_type}")
+
+
+def fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
+    """Emit a b + c, c - a b or a b - c, rounded once, from the names of a, b, c."""
+    doubles = vector("f64")
+    a, b, c = names
+    if node.op == "sub":
+        if node.args[1] is product:
+            a = emit(f"fneg {doubles} {a}")
+        else:
+            c = emit(f"fneg {doubles} {c}")
+    return emit(f"call {doubles} @llvm.fma({doubles} {a}, {doubles} {b}, {doubles} {c})")

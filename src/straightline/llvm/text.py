@@ -1,0 +1,347 @@
+"""Programs as text of LLVM IR: one function for blocks of W runs, and one for what all runs share.
+
+What the second computes is in memory between them, in `Slots`.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+from typing import Any
+
+from straightline.llvm.lanes import gather_name
+from straightline.llvm.operations import BITS, CALLED, LLVM, fused, operation, splat, vector
+from straightline.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Type
+from straightline.program import fusable
+
+Scope = dict[Any, str]
+
+
+class Slots:
+    """Layout of numbers that all runs share: one function computes them, the other reads them.
+
+    A number in a loop has a place for each turn.
+    """
+
+    def __init__(self, size: int):
+        self.size = size  # bytes
+        self.places: dict[Node, int] = {}
+        self.base = ""
+
+    def offset_of(self, node: Node) -> int:
+        """Return the offset of a number, assigned at its first use."""
+        if node not in self.places:
+            self.places[node] = self.size
+            self.size += 8 * turns_of(node.block)
+        return self.places[node]
+
+    def load(self, writer: "Writer", node: Node) -> str:
+        """Load a shared number, a scalar."""
+        address = self._address(writer, node)
+        if node.type == "bool":
+            return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
+        return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
+
+    def store(self, writer: "Writer", node: Node, name: str) -> None:
+        """Store a number, which the other function uses."""
+        kind = vector(node.type)
+        address = self._address(writer, node)
+        if node.type == "bool":
+            name, kind = writer.add(f"zext {kind} {name} to %i8"), "%i8"
+        writer.line(f"store {kind} {name}, ptr {address}, align 1")
+
+    def _address(self, writer: "Writer", node: Node) -> str:
+        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {self.offset_of(node)}")
+        return writer.of_turn(start, node.block, 8)
+
+
+def loops_of(block: Block) -> list[Loop]:
+    """Return the loops around a block's nodes, innermost first."""
+    return [b.owner for b in block.inwards() if isinstance(b.owner, Loop)]
+
+
+def turns_of(block: Block) -> int:
+    """Return how many turns the loops around a block's nodes make together; of unknown length one."""
+    return math.prod(loop.length or 1 for loop in loops_of(block))
+
+
+class Writer:
+    """Writer of a program's operations in the set `mine`: those that differ between runs, or those that do not.
+
+    `single`: vectors are of one number. `bases` has each buffer's address, `spread` the buffers with a number for each
+    lane. `shared` locates numbers that all runs share and that the other function computes.
+    """
+
+    def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: Slots):
+        self.single, self.mine, self.products, self.spread, self.slots = single, mine, products, spread, slots
+        self.lines: list[str] = []
+        self.scopes: list[Scope] = [{}]
+        self.label = "entry"
+        self.count = 0
+        self.called: set[str] = set()
+        self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has entries
+        self.read: set[Buffer] = set()  # buffers that all runs share
+        self.bases: dict[Buffer, str] = {}
+        self.turning: Collection[Buffer] = ()  # shared buffers within loops that have a place for each turn
+        self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
+        self.counted = ""  # the lanes that count
+
+    def add(self, text: str) -> str:
+        """Append an operation; return the new name of its result."""
+        self.count += 1
+        self.lines.append(f"  %t{self.count} = {text}")
+        return f"%t{self.count}"
+
+    def line(self, text: str) -> None:
+        """Append a line without a result."""
+        self.lines.append(f"  {text}")
+
+    def start(self, label: str) -> None:
+        """Begin a basic block."""
+        self.lines.append(f"{label}:")
+        self.label = label
+
+    def block(self, block: Block) -> None:
+        """Write operations and statements in order."""
+        for statement in block.items:
+            if statement not in self.mine:
+                continue
+            if isinstance(statement, Node):
+                if statement not in self.products:
+                    self._keep(statement, self._compute(statement))
+            elif isinstance(statement, Store):
+                self._store(statement)
+            elif isinstance(statement, Loop):
+                self._loop(statement)
+            elif isinstance(statement, Guard):
+                self._guard(statement)
+
+    def _keep(self, node: Node, name: str) -> None:
+        self.scopes[-1][node] = name
+        if self.single and node in self.slots.places:
+            self.slots.store(self, node, name)
+
+    def _compute(self, node: Node) -> str:
+        if node.op == "load":
+            return self._load(node)
+        product = fusable(node, self.products)
+        if product is not None:
+            rest = node.args[0] if node.args[1] is product else node.args[1]
+            names = [self.operand(n) for n in (*product.args, rest)]
+            return fused(node, product, names, self.add)
+        if node.op in CALLED:
+            self.called.add(node.op)
+        return operation(node, [self.operand(a) for a in node.args], self.add)
+
+    def operand(self, node: Node) -> str:
+        """Return the name of a number in all lanes."""
+        for scope in reversed(self.scopes):
+            if node in scope:
+                return scope[node]
+        if node.op == "constant":
+            name = self.scopes[0][node] = splat(node.value, node.type)
+            return name
+        if node in self.mine and node.op != "counter":
+            raise RuntimeError(f"{node} is used before it is computed")
+        name = self.scopes[-1][node] = self.everywhere(self.scalar(node), node.type)
+        return name
+
+    def scalar(self, node: Node) -> str:
+        """Return the name of a number that all lanes share."""
+        if node.op == "constant":
+            return str(int(node.value))
+        key = ("scalar", node)
+        for scope in reversed(self.scopes):
+            if key in scope:
+                return scope[key]
+        if node in self.mine or any(node in scope for scope in self.scopes):
+            name = self.add(f"extractelement {vector(node.type)} {self.operand(node)}, i64 0")
+        elif node.op == "load" and all(self._is_scalar(i) for i in node.args):
+            name = self._scalar_load(node)
+        else:
+            name = self.slots.load(self, node)
+        self.scopes[-1][key] = name
+        return name
+
+    def _is_scalar(self, node: Node) -> bool:
+        return node.op in ("constant", "counter") or node not in self.mine or self.single
+
+    def everywhere(self, name: str, type: Type) -> str:
+        """Return the name of a vector of a scalar."""
+        kind = vector(type)
+        first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
+        if self.single:
+            return first
+        return self.add(f"shufflevector {kind} {first}, {kind} poison, %i32 zeroinitializer")
+
+    def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
+        """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
+        owner, start = buffer.owner
+        base = self._base(owner)
+        if indices:
+            key = ("row", owner, tuple(strides), tuple(indices))
+            row = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
+            if row is None:
+                moved = ""
+                for stride, index in zip(strides, indices, strict=True):
+                    step = self.add(f"mul i64 {self.scalar(index)}, {stride}")
+                    moved = self.add(f"add i64 {moved}, {step}") if moved else step
+                row = self.scopes[-1][key] = self.add(f"getelementptr {entry}, ptr {base}, i64 {moved}")
+            base = row
+        return self.add(f"getelementptr {entry}, ptr {base}, i64 {offset + start}")
+
+    def _base(self, owner: Buffer) -> str:
+        """Return the address of a buffer's memory, in this turn of the loops around it."""
+        if owner not in self.turning:
+            return self.bases[owner]
+        key = ("base", owner)
+        base = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
+        if base is None:
+            bytes_ = owner.size * BITS[owner.type] // 8
+            base = self.scopes[-1][key] = self.of_turn(self.bases[owner], owner.block, bytes_)
+        return base
+
+    def of_turn(self, start: str, block: Block, bytes_: int) -> str:
+        """Return the address that belongs to this turn of the loops around a block; each turn has so many bytes."""
+        index = ""
+        for loop in loops_of(block):
+            assert loop.counter is not None
+            step = self.add(f"mul i64 {self.scalar(loop.counter)}, {bytes_}")
+            index = self.add(f"add i64 {index}, {step}") if index else step
+            bytes_ *= loop.length or 1
+        return self.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
+
+    def _load(self, node: Node) -> str:
+        buffer, offset, strides = node.value
+        if not all(self._is_scalar(i) for i in node.args):
+            return self._gather(node)
+        if buffer.owner[0] not in self.spread:
+            return self.everywhere(self._scalar_load(node), node.type)
+        address = self._address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
+        if node.type == "bool":
+            return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
+        return self.add(f"load {vector(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
+
+    def _scalar_load(self, node: Node) -> str:
+        buffer, offset, strides = node.value
+        self.read.add(buffer.owner[0])
+        address = self._address(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
+        if node.type == "bool":
+            return self.add(f"icmp ne i8 {self.add(f'load i8, ptr {address}, align 1')}, 0")
+        return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
+
+    def _gather(self, node: Node) -> str:
+        """Load a number at a different place in each lane."""
+        buffer, offset, strides = node.value
+        owner, start = buffer.owner
+        bits, spread = BITS[node.type], owner in self.spread
+        if not spread:
+            self.read.add(owner)
+        # Place of each lane: offset + sum strides * indices.
+        positions = f"splat (i64 {offset + start})"
+        for stride, index in zip(strides, node.args, strict=True):
+            step = self.add(f"mul %i64 {self.operand(index)}, splat (i64 {stride})")
+            positions = self.add(f"add %i64 {step}, {positions}")
+        # One load for each lane; booleans are stored as bytes.
+        self.gathered.add((bits, spread))
+        loaded = self.add(f"call %i{bits} @{gather_name(bits, spread)}(ptr {self._base(owner)}, %i64 {positions})")
+        if node.type == "bool":
+            return self.add(f"icmp ne %i8 {loaded}, zeroinitializer")
+        return self.add(f"bitcast %i64 {loaded} to %double") if node.type == "f64" else loaded
+
+    def _store(self, store: Store) -> None:
+        name, kind, bits = self.operand(store.node), vector(store.node.type), BITS[store.node.type]
+        entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
+        address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
+        if store.buffer in self.sums:
+            before = self.add(f"load {kind}, ptr {address}, align 8")
+            counted = self.add(f"select %i1 {self.counted}, {kind} {name}, {kind} zeroinitializer")
+            name = self.add(f"fadd {kind} {before}, {counted}")
+        if store.node.type == "bool":
+            name, kind = self.add(f"zext {kind} {name} to %i8"), "%i8"
+        self.line(f"store {kind} {name}, ptr {address}, align {bits // 8}")
+
+    def _loop(self, loop: Loop) -> None:
+        """Write a loop: parameters are phi nodes of the carry; a counted loop has at least one turn."""
+        self.count += 1
+        name, before = f"loop{self.count}", self.label
+        # Only the carried numbers that this function computes or reads.
+        pairs = zip(loop.parameters, loop.results, strict=True)
+        moving = [k for k, pair in enumerate(pairs) if any(n in self.mine for n in pair)]
+        starts = [self.operand(loop.initial[k]) for k in moving]
+        self.line(f"br label %{name}")
+        self.start(name)
+        begin = len(self.lines)
+        self.scopes.append({})
+        counter = f"%{name}.counter"
+        if loop.counter is not None:
+            self.scopes[-1]["scalar", loop.counter] = counter
+        for k in moving:
+            self._keep(loop.parameters[k], f"%{name}.p{k}")
+        if loop.counter is not None and loop.counter in self.mine:
+            self._keep(loop.counter, self.operand(loop.counter))
+        # Counted: body, then the latch. Conditional: the check is inside the body.
+        if loop.condition is None:
+            self.block(loop.body)
+            following = [self.operand(loop.following[k]) for k in moving]
+            self.line(f"br label %{name}.latch")
+            self.start(f"{name}.latch")
+            self.line(f"{counter}.next = add i64 {counter}, 1")
+            self.line(f"%{name}.more = icmp slt i64 {counter}.next, {loop.length}")
+            self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
+            finals = following
+        else:
+            following, finals = self._turns(loop, name, moving)
+        # The phi nodes come first, but their arguments are known only now.
+        phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
+        for k, start, after in zip(moving, starts, following, strict=True):
+            kind = vector(loop.parameters[k].type)
+            phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{before}], [{after}, %{self.label}]")
+        self.lines[begin:begin] = phis
+        self.start(f"{name}.end")
+        self.scopes.pop()
+        for k, final in zip(moving, finals, strict=True):
+            self._keep(loop.results[k], final)
+
+    def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
+        """Write a loop that ends when no lane's condition holds."""
+        # The body up to the loop's check, and what follows it in a turn.
+        checks = (i for i, s in enumerate(loop.body.items) if isinstance(s, Check) and s.loop is loop)
+        check = next(checks)
+        head, tail = Block(loop.body.parent), Block(loop.body.parent)
+        head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
+        self.block(head)
+        assert loop.condition is not None
+        # Another turn if some lane needs it.
+        some = self._any(loop.condition)
+        self.line(f"br i1 {some}, label %{name}.turn, label %{name}.end")
+        self.start(f"{name}.turn")
+        self.block(tail)
+        following = [self.operand(loop.following[k]) for k in moving]
+        self.line(f"br label %{name}.latch")
+        self.start(f"{name}.latch")
+        self.line(f"br label %{name}")
+        return following, [f"%{name}.p{k}" for k in moving]
+
+    def _any(self, condition: Node) -> str:
+        """Emit whether a condition holds in some lane."""
+        return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.operand(condition)} to %lanes')}, 0")
+
+    def _guard(self, guard: Guard) -> None:
+        self.count += 1
+        name = f"guard{self.count}"
+        # Jump past the body if no lane needs it.
+        some = self._any(guard.condition)
+        before = self.label
+        self.line(f"br i1 {some}, label %{name}, label %{name}.end")
+        self.start(name)
+        self.scopes.append({})
+        self.block(guard.body)
+        used = [k for k, r in enumerate(guard.results) if r in self.mine]
+        values = [self.operand(guard.values[k]) for k in used]
+        after = self.label
+        self.line(f"br label %{name}.end")
+        self.start(f"{name}.end")
+        self.scopes.pop()
+        # Results are zero where the body was skipped.
+        for k, value in zip(used, values, strict=True):
+            kind = vector(guard.results[k].type)
+            self._keep(guard.results[k], self.add(f"phi {kind} [{value}, %{after}], [zeroinitializer, %{before}]"))

@@ -1,0 +1,232 @@
+"""Lowering of a traced function of one run to a graph of scalar operations.
+
+An array of the trace is a NumPy array of nodes (or of keys of random numbers), so that shape operations only move
+references; or, if it is long, `InMemory`. `RULES` has a rule for each operation of JAX, from the files of rules.
+"""
+
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+from jaxtyping import PyTree
+
+from straightline.graph import MOST, Graph
+from straightline.memory import LONG, InMemory
+from straightline.nodes import TYPES, Buffer, Key, Node, Type, Unsupported
+
+Value = Any  # a NumPy array of nodes or keys, or an array in memory
+Rule = Callable[["Lowering", JaxprEqn, list[Value]], Sequence[Value]]
+
+HERE = f"{Path(__file__).parent}{os.sep}"
+RULES: dict[str, Rule] = {}  # operation of JAX -> its nodes; arguments are NumPy arrays of nodes
+NAMES: dict[Any, str] = {}  # of types of numbers, which NumPy takes long to spell
+IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in memory as they are
+
+
+class Lowering:
+    """Lowering of operations one after another into a graph."""
+
+    def __init__(self, most: int = MOST) -> None:
+        self.graph = Graph(most)
+        self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
+        self.sizes: dict[Jaxpr, int] = {}  # of programs within loops and branches
+        self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}  # entries of A B' -> A and B, of each product
+
+    def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:
+        """Return the results of a traced program for these arguments."""
+        jaxpr: Any = program
+        if isinstance(program, ClosedJaxpr):
+            jaxpr, consts = program.jaxpr, program.consts
+        values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.known, consts), strict=True))
+        values |= zip(jaxpr.invars, inputs, strict=True)
+        for equation in jaxpr.eqns:
+            arguments = [self._read(values, v) for v in equation.invars]
+            values |= zip(equation.outvars, self.equation(equation, arguments), strict=True)
+        return [self._read(values, v) for v in jaxpr.outvars]
+
+    def results(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
+        """Return the results of a whole program; an array without entries, which has no node, is a typed view."""
+        avals: list[Any] = [v.aval for v in program.jaxpr.outvars]
+        values = self.inline(program, inputs)
+        return [x if x.size else self._empty(a) for x, a in zip(values, avals, strict=True)]
+
+    def _empty(self, aval: Any) -> InMemory:
+        return InMemory.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
+
+    def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+        """Return the results of one operation.
+
+        Raises:
+            Unsupported: no rule takes it, or the rule fails, which is said once for a line of code.
+        """
+        name = equation.primitive.name
+        try:
+            results = self._by_rule(equation, name, inputs)
+            for variable, value in zip(equation.outvars, results, strict=True):
+                aval: Any = variable.aval
+                if value.shape != aval.shape:
+                    raise ValueError(f"a result of shape {value.shape} for {aval.shape}")
+            return results
+        except Unsupported as error:
+            raise (error if error.where else Unsupported(error.operation, code_line(equation))) from None
+        except Exception as error:
+            raise failed(name, error, code_line(equation)) from error
+
+    def _by_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
+        if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
+            return IN_MEMORY[name](self, equation, inputs)
+        if name not in RULES:
+            raise Unsupported(name)
+        return RULES[name](self, equation, [self.nodes(x) for x in inputs])
+
+    def nodes(self, value: Value) -> np.ndarray:
+        """Return a value as a NumPy array of nodes."""
+        return value.nodes(self.graph) if isinstance(value, InMemory) else value
+
+    def scalar(self, value: Value) -> Node:
+        """Return the node of a value without axes."""
+        nodes = self.nodes(value)
+        if nodes.size != 1:
+            raise Unsupported("a condition for each entry of an array")
+        node: Node = nodes.item()
+        return node
+
+    def known(self, number: Any) -> Value:
+        """Return an array of known numbers: as constants, or as a table in memory if it is long."""
+        if isinstance(number, np.ndarray) and number.dtype == object:
+            return number
+        if isinstance(number, jax.Array) and jax.numpy.issubdtype(number.dtype, jax.dtypes.prng_key):
+            return keys_of(self.known(np.asarray(jax.random.key_data(number))))
+        array = np.asarray(number)
+        type = type_of(array)
+        if array.size > LONG:
+            return InMemory.whole(Buffer("table", type, array.shape, self.graph.top, array))
+        return array_of([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
+
+    def _read(self, values: dict[Var, Value], v: Any) -> Value:
+        return self.known(v.val) if isinstance(v, Literal) else values[v]
+
+
+def failed(operation: str, error: Exception, where: str) -> Unsupported:
+    """Return an error by which XLA computes a program whose native code cannot be made, and say so once for a line."""
+    refused = Unsupported(f"{operation}, whose native code failed ({type(error).__name__}: {error})", where)
+    say(f"native code: {refused}; XLA computes")
+    return refused
+
+
+@contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Turn a failure of what makes native code into a refusal, by which XLA computes."""
+    try:
+        yield
+    except Unsupported:
+        raise
+    except Exception as error:
+        raise failed(what, error, "") from error
+
+
+@cache
+def say(text: str) -> None:
+    """Warn once in a process."""
+    warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+
+def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Arrange nodes in row-major order as an array."""
+    flat = list(nodes)
+    array = np.empty(len(flat), dtype=object)
+    array[:] = flat
+    return array.reshape(shape)
+
+
+def keys_of(words: np.ndarray) -> np.ndarray:
+    """Return keys (...) from their words (..., 2)."""
+    flat = words.reshape(-1, 2)
+    return array_of((Key(*pair) for pair in flat), words.shape[:-1])
+
+
+def scalars(value: np.ndarray) -> list[Node]:
+    """Return the nodes of an array in row-major order, a key as its two words."""
+    flat: list[Any] = value.ravel().tolist()
+    return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
+
+
+def type_of(value: Any) -> Type:
+    """Return the type of a number, or of an array's numbers."""
+    dtype = value.dtype
+    if dtype not in NAMES:
+        NAMES[dtype] = np.dtype(dtype).name
+    name = NAMES[dtype]
+    if name not in TYPES:
+        raise Unsupported(f"numbers of type {name}")
+    return TYPES[name]
+
+
+def result_type(equation: JaxprEqn, index: int = 0) -> Type:
+    """Return the type of an operation's result."""
+    return type_of(equation.outvars[index].aval)
+
+
+def result_shape(equation: JaxprEqn, index: int = 0) -> tuple[int, ...]:
+    """Return the shape of an operation's result."""
+    aval: Any = equation.outvars[index].aval
+    return tuple(aval.shape)
+
+
+def like(shape: Sequence[int], dtype: Any) -> Any:
+    """Return a placeholder from which JAX traces an array of this shape and type."""
+    return jax.ShapeDtypeStruct(tuple(shape), dtype)  # type: ignore[no-untyped-call]
+
+
+def known_integers(value: np.ndarray) -> np.ndarray | None:
+    """Return an array of known integers, None if one of them depends on data."""
+    flat: list[Node] = value.ravel().tolist()
+    if any(x.op != "constant" for x in flat):
+        return None
+    return np.array([min(int(x.value), sys.maxsize) for x in flat], dtype=np.int64).reshape(value.shape)
+
+
+def code_line(equation: JaxprEqn) -> str:
+    """Return the line of a user's or the library's code that an operation comes from."""
+    traceback = equation.source_info.traceback
+    frames: list[Any] = [] if traceback is None else traceback.frames
+    inside = ("/jax/", "/equinox/", HERE)
+    outside = [f for f in frames if not any(folder in f.file_name for folder in inside)]
+    return f"{outside[0].file_name}:{outside[0].line_num}" if outside else ""
+
+
+class _Held(NamedTuple):
+    """A part of a result that is no array, such as a function: what is restored in its place is it itself."""
+
+    value: Any
+
+
+jax.tree_util.register_pytree_node(_Held, lambda held: ((), held.value), lambda value, _: value)
+ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float, complex)
+
+
+def traced(function: Callable[..., PyTree], *examples: PyTree) -> tuple[ClosedJaxpr, Any]:
+    """Trace a function of one run in double precision; return its program and the structure of its result.
+
+    What a result has beside arrays, as a filter its model's functions, is part of the structure.
+    """
+    structure: list[Any] = []
+
+    def call(*leaves: Any) -> list[Any]:
+        returned = function(*jax.tree.unflatten(tree, leaves))
+        arrays, form = jax.tree.flatten(jax.tree.map(lambda x: x if isinstance(x, ARRAYS) else _Held(x), returned))
+        structure[:] = [form]
+        return arrays
+
+    with jax.enable_x64(True):
+        flat, tree = jax.tree.flatten(examples)
+        program = jax.make_jaxpr(call)(*flat)
+    return program, structure[0]

@@ -1,0 +1,160 @@
+"""Code of this machine from text of LLVM IR: generated in haste at first, and with care once it is executed often."""
+
+import ctypes
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from threading import Lock, current_thread, main_thread
+
+import jax
+import llvmlite.binding as llvm
+
+from straightline.llvm.module import Source
+from straightline.lowering import refusing, say
+
+Function = Callable[[int, int, int, int, int], None]
+SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+
+# Executions of each operation of a program after which care pays: it takes LLVM 20 to 90 us an operation more, and
+# saves a seventh to a half of its time, 0.03 to 0.3 ns for a block of runs. Of thirteen filters of 180 to 42,000
+# operations, it pays after 160,000 to 1,600,000; of small ones it takes milliseconds, and comes sooner.
+OFTEN, SMALL, LARGE = 500_000, 1_000, 10_000  # executions of programs of LARGE operations; in proportion down to SMALL
+
+# Operations of a step of one plant above which care seldom pays: LLVM takes four to nine times as long (for 300
+# particles of two states, 77,000 operations, 41 s instead of 4) to save a third to half of its 0.25 ms.
+LONG = 20_000
+
+
+@cache
+def target() -> llvm.Target:
+    """Return the LLVM target of this machine."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple()
+
+
+@cache
+def features() -> tuple[str, str, bool]:
+    """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
+    flags = llvm.get_host_cpu_features()
+    arm = "aarch64" in target().triple or "arm64" in target().triple
+    return llvm.get_host_cpu_name(), flags.flatten(), bool(flags.get("fma")) or arm
+
+
+class Machine:
+    """Code of one text; its function `run` may be called as long as this object exists.
+
+    LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
+    `level` is that of the generation: 0 in haste, 1 with registers assigned with care; `width` is the count of runs of
+    a vector. Results have the same bits whatever both are.
+    """
+
+    def __init__(self, source: Source, level: int, width: int):
+        self.level, self.width = level, width
+        cpu, flags, *_ = features()
+        machine = target().create_target_machine(cpu=cpu, features=flags, opt=level)
+        module = llvm.parse_assembly(source.text(width))
+        module.verify()
+        code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
+        module.close()  # three times the memory of its code
+        # An engine that generates the code itself would verify the module again.
+        self.engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        self.engine.add_object_file(code)
+        self.engine.finalize_object()
+        self.run: Function = SIGNATURE(self.engine.get_function_address("run"))
+
+
+def often(operations: int) -> float:
+    """Return the executions after which care pays for a program of so many operations."""
+    return OFTEN * min(max(operations, SMALL), LARGE) / LARGE
+
+
+WIDEST = 8  # runs of a vector: one register of the widest processors, two of others; more only spill
+
+
+def narrow() -> int:
+    """Return the runs of one register, at most WIDEST: for code in haste, which is sooner generated so.
+
+    LLVM splits what does not fit one register: selections and comparisons of event filters take it three times as long.
+    """
+    return WIDEST if "+avx512f" in features()[1].split(",") else WIDEST // 2
+
+
+@cache
+def background() -> ThreadPoolExecutor:
+    """Return the thread that generates code with care while that in haste is executed."""
+    return ThreadPoolExecutor(1)
+
+
+@cache
+def _hasty() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1)
+
+
+@refusing("a program")
+def generated(source: Source, level: int, width: int) -> Machine:
+    """Generate code outside of the main thread, and wait for it.
+
+    Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
+    there could change its owner and nobody note it, and be freed twice.
+
+    Raises:
+        Unsupported: LLVM makes no code of it, which is said once.
+    """
+    if current_thread() is not main_thread():
+        return Machine(source, level, width)
+    return _hasty().submit(Machine, source, level, width).result()
+
+
+def _with_care(source: Source, width: int, hasty: Machine) -> Machine:
+    """Generate code with care; if that fails, that in haste goes on, and it is said once."""
+    try:
+        return Machine(source, 1, width)
+    except Exception as error:
+        say(f"native code: generated with care it failed ({type(error).__name__}: {error}); that in haste goes on")
+        return hasty
+
+
+class Tiers:
+    """Code of one text, generated again with care when its executions have cost as much as that.
+
+    A call that executes a program `often` waits for care; any other goes on in haste until care is done in the
+    background. Both have the same results, bit for bit, so that nothing but time depends on earlier calls. `widths` are
+    the runs of a vector in haste and with care.
+    """
+
+    def __init__(self, source: Source, widths: tuple[int, int]):
+        self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
+        self._machine: Machine | None = None
+        self._careful: Future[Machine] | None = None
+
+    def prepare(self, blocks: float) -> None:
+        """Generate code for a first execution for so many blocks, if there is none."""
+        with self._lock:
+            self._first(self._executions + self._of(blocks))
+
+    def machine(self, blocks: float) -> Machine:
+        """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
+        with self._lock:
+            executions = self._of(blocks)
+            self._executions += executions
+            machine = self._first(self._executions)
+            if machine.level < self._level(self._executions):
+                self._careful = self._careful or background().submit(_with_care, self._source, self._widths[1], machine)
+                if executions >= often(self._source.operations) or self._careful.done():
+                    self._machine = machine = self._careful.result()
+            return machine
+
+    def _first(self, executions: float) -> Machine:
+        if self._machine is None:
+            level = self._level(executions)
+            self._machine = generated(self._source, level, self._widths[level])
+        return self._machine
+
+    def _of(self, blocks: float) -> float:
+        """Return the executions of each operation, on average, for so many blocks."""
+        return blocks * self._source.work / max(self._source.operations, 1)
+
+    def _level(self, executions: float) -> int:
+        pays = executions >= often(self._source.operations)
+        return int(pays and not jax.config.values["jax_disable_most_optimizations"])

@@ -1,0 +1,253 @@
+"""Lowered programs: inputs, outputs, what these need, what differs between runs, fused products, and sums over runs.
+
+Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, W the
+most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning (`folded`).
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+from jaxtyping import PyTree
+
+from straightline.graph import MOST, Graph
+from straightline.lowering import Lowering, Value, keys_of, traced, type_of
+from straightline.memory import InMemory
+from straightline.nodes import Block, Buffer, Guard, Loop, Node, Store
+from straightline.rules import (  # noqa: F401  (they fill the rules)
+    arrived,
+    calls,
+    decompositions,
+    elementwise,
+    indexing,
+    loops,
+    matrices,
+    random_bits,
+    rows,
+    scatter,
+    shapes,
+    sorting,
+    special,
+    views,
+)
+
+
+class Program(NamedTuple):
+    """A graph, a buffer for each argument of the function and the value of each result, leaf by leaf; `tree` of these.
+
+    The words of a key of random numbers are the last axis, (2,), of its buffer.
+    """
+
+    graph: Graph
+    inputs: list[Buffer]
+    outputs: list[Value]
+    tree: Any
+
+
+def lower(function: Callable[..., PyTree], *examples: PyTree, most: int = MOST) -> Program:
+    """Lower a function of one run, for arguments of these shapes, to at most so many operations."""
+    return lower_traced(*traced(function, *examples), most)
+
+
+def lower_traced(traced: ClosedJaxpr, tree: Any, most: int = MOST) -> Program:
+    """Lower a program that is traced already."""
+    lowering = Lowering(most)
+    avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
+    inputs, values = [], []
+    for aval in avals:
+        is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
+        shape = (*aval.shape, 2) if is_key else aval.shape
+        buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
+        view = InMemory.whole(buffer)
+        inputs.append(buffer)
+        values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
+    with jax.enable_x64(True):
+        outputs = lowering.results(traced, values)
+    return Program(lowering.graph, inputs, outputs, tree)
+
+
+def needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
+    """Nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
+    results: dict[Any, None] = {}
+    waiting: list[Any] = list(roots)
+    while waiting:
+        node = waiting.pop()
+        if node not in results:
+            results[node] = None
+            waiting += node.args if is_plain(node) else _needs(node)
+    return results
+
+
+REFERRING = frozenset(("load", "parameter", "result", "counter", "guarded"))  # nodes that need more than arguments
+
+
+def is_plain(node: Any) -> bool:
+    """Return whether all that an item of a program needs is its arguments: an operation outside of loops and guards."""
+    return type(node) is Node and node.block.parent is None and node.op not in REFERRING
+
+
+def _needs(node: Any) -> list[Any]:
+    if isinstance(node, Buffer):
+        within = [] if node.inside is None else [node.inside[0]]
+        return [*node.stores, *node.parts, *within]
+    owner = node.block.owner
+    arguments = node.args if isinstance(node, Node) and node.op not in REFERRING else _arguments(node)
+    return [*arguments] if owner is None else [owner, *arguments]
+
+
+def _arguments(node: Any) -> list[Any]:
+    if isinstance(node, Store):
+        return [node.node, *node.indices]
+    if isinstance(node, Guard):
+        return [node.condition]
+    if isinstance(node, Loop):
+        return [] if node.condition is None else [node.condition]
+    # Nodes: a load needs its buffer, a result of a loop the loop and the carry.
+    if node.op == "load":
+        return [*node.args, node.value[0]]
+    if node.op in ("parameter", "result"):
+        loop, index = node.value
+        return [loop, loop.initial[index], loop.following[index]]
+    if node.op == "counter":
+        return [node.value]
+    if node.op == "guarded":
+        guard, index = node.value
+        return [guard, guard.values[index]]
+    return list(node.args)
+
+
+def fusable(node: Node, products: set[Node]) -> Node | None:
+    """Return the product that is computed with a sum or difference as one operation."""
+    for a in node.args:
+        if a.value is node and a in products:
+            return a
+    return None
+
+
+def products_of(items: Iterable[Any]) -> set[Node]:
+    """Find products used once, by a sum or difference; mark each with its user, of two the later one."""
+    users: dict[Node, Any] = {}
+    for statement in items:
+        for used in uses(statement):
+            if used.op == "mul" and used.type == "f64":
+                users[used] = None if used in users else statement
+    results: set[Node] = set()
+    taken: set[Node] = set()
+    for node in sorted(users, key=lambda n: -n.serial):
+        user = users[node]
+        single = isinstance(user, Node) and user.op in ("add", "sub")
+        if single and user.block is node.block and user not in taken:
+            node.value = user
+            results.add(node)
+            taken.add(user)
+    return results
+
+
+def uses(node: Any) -> Sequence[Node]:
+    """Return the nodes that an item of a program uses directly."""
+    if isinstance(node, Node):
+        return node.args
+    if isinstance(node, Store):
+        return [node.node, *node.indices]
+    if isinstance(node, Guard):
+        return [node.condition, *node.values]
+    if isinstance(node, Loop):
+        return [*node.initial, *node.following, *([] if node.condition is None else [node.condition])]
+    return []
+
+
+def in_order(items: Iterable[Any]) -> list[Any]:
+    """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
+
+    def position(x: Any) -> int:
+        if isinstance(x, Store):
+            return x.node.serial
+        if isinstance(x, Loop | Guard):
+            return -1 if x.condition is None else x.condition.serial
+        return -1 if isinstance(x, Buffer) else x.serial
+
+    return sorted(items, key=position)
+
+
+def varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
+    """Return which nodes, buffers, loops and guards of these, in order, differ if these input buffers do."""
+
+    @cache
+    def around(block: Block) -> list[Any]:
+        return [b.owner for b in block.inwards() if b.owner is not None]
+
+    results: set[Any] = set(inputs)
+    left, count = items, 0
+    # A turn finds all but what differs by a later number, as in loops.
+    while len(results) > count:
+        count, before, left = len(results), left, []
+        for x in before:
+            if results.isdisjoint(x.args if is_plain(x) else _sources(x, around)):
+                left.append(x)
+                continue
+            results.add(x)
+            if isinstance(x, Store):  # a store makes its buffer differ
+                results.add(x.buffer.owner[0])
+    return results
+
+
+def crossing(items: Iterable[Any], spread: set[Any]) -> set[Any]:
+    """Return which of the items are needed to compute those that differ between runs: these, and statements."""
+    results = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
+    left = list(results)
+    while left:
+        x = left.pop()
+        around = [] if isinstance(x, Buffer) else [x.block.owner]
+        around += [x.value[0]] if isinstance(x, Node) and x.op in ("parameter", "result", "guarded") else []
+        left += [s for s in around if s is not None and s not in results]
+        results.update(around)
+    return results - {None}
+
+
+def _sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
+    """Return all of which any makes a number or a statement differ: arguments, memory, what is around it."""
+    if isinstance(node, Buffer):
+        return [node.owner[0]]
+    # Statements: a loop differs by its condition.
+    if isinstance(node, Loop):
+        return [node.condition, *node.parameters] if node.length is None else []
+    if isinstance(node, Guard):
+        return [node.condition]
+    if isinstance(node, Store):
+        return [node.node, *around(node.block)]
+    # Nodes: by their block, by memory, by the carry, else by their arguments.
+    if node.op in ("constant", "counter"):
+        return list(node.args)
+    if node.op == "load":
+        return [*node.args, *around(node.block), node.value[0].owner[0]]
+    if node.op in ("parameter", "result"):
+        loop, index = node.value
+        return [*node.args, *around(node.block), loop, loop.initial[index], loop.following[index]]
+    if node.op == "guarded":
+        guard, index = node.value
+        return [*node.args, *around(node.block), guard, guard.values[index]]
+    return [*node.args, *around(node.block)]
+
+
+class Summed(NamedTuple):
+    """Outputs that are summed, leaf by leaf; into how many batches; which input is the run's number (u32)."""
+
+    outputs: tuple[bool, ...]
+    batches: int
+    number: int
+
+
+def row_length(width: int, batches: int) -> int:
+    """Return the length of a row of sums."""
+    return batches + width - 1
+
+
+def folded(sums: np.ndarray, batches: int) -> np.ndarray:
+    """Return sums (..., batch) from rows (..., `row_length`)."""
+    totals = sums[..., :batches].copy()
+    beyond = sums[..., batches:]
+    totals[..., : beyond.shape[-1]] += beyond
+    return totals

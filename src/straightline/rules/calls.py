@@ -1,0 +1,209 @@
+"""Rules of inner programs: called functions, and branches, known to be taken or selected in each run.
+
+An expensive branch is computed only if some run takes it (a guarded block).
+"""
+
+from itertools import pairwise
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, array_of, like
+from straightline.memory import LONG, InMemory
+from straightline.nodes import Block, Guard, Key, Node
+from straightline.rules.elementwise import select
+from straightline.rules.loops import in_memory, repeated, size_of
+from straightline.rules.shapes import FEW
+from straightline.rules.views import joined
+
+CALLS = (
+    "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+    "checkpoint", "remat", "remat2",
+)  # fmt: skip
+
+
+def _call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    params = equation.params
+    inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
+    return lowering.inline(inner, inputs)
+
+
+def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    return lowering.inline(equation.params["call"], inputs)
+
+
+def _expanded(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline a composed operation, such as frexp in JAX from 0.12 on, by its definition in others."""
+    primitive = equation.params["_prim"]
+
+    def function(*leaves: jax.Array) -> list[jax.Array]:
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
+
+    avals: list[Any] = [v.aval for v in equation.invars]
+    struct: Any = jax.ShapeDtypeStruct
+    program = jax.make_jaxpr(function)(*(struct(a.shape, a.dtype) for a in avals))
+    return lowering.inline(program, inputs)
+
+
+def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline a kernel over runs, traced for one run; several runs in one, such as modes, one after another."""
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    runs = equation.params["runs"]
+    shapes = [a.shape[: a.ndim - len(runs)] for a in avals]
+    return _over(lowering, equation, inputs, runs, shapes)
+
+
+def _over(
+    lowering: Lowering, equation: JaxprEqn, inputs: list[Value], runs: tuple[int, ...], shapes: list[tuple[int, ...]]
+) -> list[Value]:
+    """Repeat over the last axis, that of runs: few are written out, many become a loop."""
+    if not runs:
+        results = zip(_single(lowering, equation, inputs), shapes, strict=True)
+        return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
+    count, rest = runs[-1], runs[:-1]
+    # A few are written out.
+    if count <= FEW:
+        items = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
+        return [_together(lowering, list(results)) for results in zip(*items, strict=True)]
+    # Of many, a loop takes apart what differs between them; what they share stays whole.
+    differs = [x.shape[-1] > 1 for x in inputs]
+    rows = [in_memory(lowering, x) if d else _run(x, 0) for x, d in zip(inputs, differs, strict=True)]
+
+    def turn(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        row = [_run(x, index) if d else x for x, d in zip(rows, differs, strict=True)]
+        return [], [lowering.nodes(x) for x in _over(lowering, equation, row, rest, shapes)]
+
+    stacked = repeated(lowering, count, [], turn)[1]
+    return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
+
+
+def _together(lowering: Lowering, results: list[Value]) -> Value:
+    """Stack results of a few runs along the last axis; in memory if they are long."""
+    x = results[0]
+    if not isinstance(x, InMemory) or x.size <= LONG:
+        return np.stack([lowering.nodes(x) for x in results], axis=-1)
+    if len(results) == 1:
+        return x.view((*x.shape, 1), (*x.strides, 0))
+    whole = joined(lowering, results, (len(results), *x.shape))
+    return whole.view([*whole.shape[1:], len(results)], [*whole.strides[1:], whole.strides[0]])
+
+
+def _single(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    params = equation.params
+    numbers = [v.aval.dtype for v in equation.invars]  # type: ignore[attr-defined]
+    kinds = tuple((x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True))
+    tree, function = params["tree"], params["kernel"].written
+    key = (function, tree, kinds)
+    if key not in lowering.kernels:
+        lowering.kernels[key] = function.trace(*jax.tree.unflatten(tree, [like(*kind) for kind in kinds])).jaxpr
+    return lowering.inline(lowering.kernels[key], inputs)
+
+
+def _run(x: Value, index: Node | int) -> Value:
+    """Return one run's part of an argument whose last axis is that of runs, or a number shared by all."""
+    if isinstance(x, InMemory):
+        last = x.view([x.shape[-1], *x.shape[:-1]], [x.strides[-1], *x.strides[:-1]])
+        return last.row(0 if x.shape[-1] == 1 else index)
+    flat = x.reshape(-1, x.shape[-1])
+    return flat[:, min(int(index), x.shape[-1] - 1)].reshape(x.shape[:-1])  # type: ignore[arg-type]
+
+
+def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Select the branch of a program for CPUs."""
+    platforms = equation.params["platforms"]
+    number = next((i for i, names in enumerate(platforms) if names is not None and "cpu" in names), len(platforms) - 1)
+    return [lowering.known(np.int32(number))]
+
+
+IN_MEMORY |= dict.fromkeys(CALLS, _call)
+IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "call_hi_primitive": _expanded, "runs_last": _runs_last}
+RULES |= {"platform_index": _platform_index}
+
+
+DEAR = 100  # nodes: a branch that has fewer is computed in any case,
+SHARE = 4  # and one that is so many times smaller than the dearest, which often has its numbers within
+
+
+def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    branches = equation.params["branches"]
+    which = lowering.scalar(inputs[0])
+    if which.op == "constant":
+        taken = min(max(int(which.value), 0), len(branches) - 1)
+        return lowering.inline(branches[taken], inputs[1:])
+    if len(branches) == 1:
+        return lowering.inline(branches[0], inputs[1:])
+    # Small branches are computed in any case, large ones in guarded blocks.
+    conditions = _conditions(lowering, which, len(branches))
+    sizes = [size_of(lowering, branch.jaxpr) for branch in branches]
+    results: dict[int, list[np.ndarray]] = {}
+    for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
+        cheap = SHARE * sizes[k] <= max(sizes)
+        results[k] = _branch(lowering, conditions[k], branches[k], inputs[1:], cheap)
+    # Select the results of the branch that is taken.
+    chosen = results[len(branches) - 1]
+    for k in reversed(range(len(branches) - 1)):
+        chosen = [_where(lowering, conditions[k], a, b) for a, b in zip(results[k], chosen, strict=True)]
+    return chosen
+
+
+def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
+    """Return for each branch whether it is taken; indices out of range select the first or last."""
+    graph = lowering.graph
+    if which.op == "convert" and which.args[0].type == "bool":
+        which = which.args[0]
+    if which.type == "bool":
+        return [graph.node("not", "bool", which), which]
+    below = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
+    between = [graph.node("and", "bool", graph.node("not", "bool", a), b) for a, b in pairwise(below)]
+    return [below[0], *between, graph.node("not", "bool", below[-1])]
+
+
+def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value], cheap: bool) -> list[np.ndarray]:
+    """Compute a branch in the open block if it has few nodes, else in a guarded one."""
+    graph, outer = lowering.graph, lowering.graph.current
+    graph.current = block = Block(outer, pinned=True)
+    try:
+        results = [lowering.nodes(x) for x in lowering.inline(branch, inputs)]
+    finally:
+        graph.current = outer
+    if cheap or _size(block) <= DEAR:
+        _dissolve(block, outer)
+        return results
+    guard = Guard(block, condition)
+    outer.items.append(guard)
+    return [array_of([_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results]
+
+
+def _result(lowering: Lowering, guard: Guard, value: Any) -> Any:
+    if isinstance(value, Key):
+        return Key(_result(lowering, guard, value.first), _result(lowering, guard, value.second))
+    if value.block is not guard.body:
+        return value
+    if value in guard.values:
+        return guard.results[guard.values.index(value)]
+    guarded = lowering.graph.fresh("guarded", value.type, (), lowering.graph.current, (guard, len(guard.values)))
+    guard.values.append(value)
+    guard.results.append(guarded)
+    return guarded
+
+
+def _size(block: Block) -> int:
+    """Count the nodes of a block; a statement in it counts as many."""
+    return sum(1 if isinstance(statement, Node) else DEAR + 1 for statement in block.items)
+
+
+def _dissolve(block: Block, outer: Block) -> None:
+    for statement in block.items:
+        statement.block = outer  # type: ignore[union-attr]
+    outer.items += block.items
+    outer.seen |= block.seen
+
+
+def _where(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    pairs = zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
+    return array_of([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
+
+
+IN_MEMORY |= {"cond": _cond}

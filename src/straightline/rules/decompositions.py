@@ -1,0 +1,224 @@
+"""Rules of small matrices' decompositions: symmetric ones by Jacobi rotations until diagonal, others as L U."""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from itertools import combinations
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn
+
+from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, like, result_shape
+from straightline.nodes import Unsupported
+
+LARGEST = 20  # rows: of larger ones the straight line is long, and the library's method faster
+SWEEPS = 30  # at most; a handful is enough, more where sizes differ by many decades
+Numbers = dict[tuple[int, int], jax.Array]  # entries by row and column
+
+
+def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute eigenvectors (n, n), in columns, and eigenvalues (n,), ascending; all NaN if an entry is not finite.
+
+    Each rotation makes one off-diagonal entry zero; sweeps over all pairs end when the rest is below rounding. Pairs in
+    the order of a tournament: all turns of a sweep rotate the same places, and the rows move on, so that one turn is
+    the whole program, 6 n^2 operations.
+
+    Source: Jacobi, Ueber ein leichtes Verfahren (1846); Golub and Van Loan, Matrix computations, section 8.5; Luk and
+    Park, On parallel Jacobi orderings (1989), by which it converges as the order by rows does.
+    """
+    n, eps = len(a), float(np.finfo(np.float64).eps)
+    finite = jnp.all(jnp.isfinite(a))
+    unit = _unit(a)
+    entries = {(i, j): (a[i, j] / unit + a[j, i] / unit) / 2 for i in range(n) for j in range(i, n)}
+    # Off-diagonal entries below eps ||A||_F / n are rounding.
+    size = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
+    vectors = {(i, j): jnp.asarray(float(i == j)) for i in range(n) for j in range(n)}
+
+    def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
+        rest = [jnp.abs(state[0][pair]) > size for pair in combinations(range(n), 2)]
+        return jnp.any(jnp.stack(rest)) & (state[2] < SWEEPS)
+
+    turns, turn = _tournament(n)
+
+    # One sweep: after so many turns each pair was rotated once, and each row is in its place again.
+    def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
+        rotated, _ = jax.lax.scan(turn, state[:2], length=turns)
+        return *rotated, state[2] + 1
+
+    if n > 1:
+        entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
+
+    values, columns = _sorted([entries[i, i] for i in range(n)], [[vectors[i, j] for i in range(n)] for j in range(n)])
+    rows = jnp.stack([jnp.stack(column) for column in columns], axis=1)
+    return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values) * unit, jnp.nan)
+
+
+def _unit(a: jax.Array) -> jax.Array:
+    """Return a power of two in whose units squares of the matrix's entries neither overflow nor vanish, mostly 1."""
+    largest = jnp.max(jnp.abs(a))
+    return jnp.where(largest > 2.0**300, 2.0**600, jnp.where(largest < 2.0**-300, 2.0**-600, 1.0))
+
+
+def _tournament(n: int) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
+    """Return the count of turns of a sweep, and one turn: A <- J' A J, V <- V J for pairs (p, q), then rows move on."""
+    turns = n - 1 + n % 2
+    pairs = [(k, turns - k) for k in range(1, turns // 2 + 1)] + [(0, n - 1)] * (1 - n % 2)
+    moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]
+
+    def turn(state: tuple[Numbers, Numbers], _: None) -> tuple[tuple[Numbers, Numbers], None]:
+        entries, vectors = dict(state[0]), dict(state[1])
+        for p, q in pairs:
+            _rotate(entries, vectors, p, q, n)
+        entries = {(i, j): entries[min(moved[i], moved[j]), max(moved[i], moved[j])] for i, j in entries}
+        return (entries, {(i, j): vectors[i, moved[j]] for i, j in vectors}), None
+
+    return turns, turn
+
+
+def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
+    """Rotate rows and columns p and q so that a_pq = 0."""
+    off = a[p, q]
+    none = off == 0
+    half = (a[q, q] - a[p, p]) / jnp.where(none, 1.0, 2 * off)
+    tangent = jnp.where(half < 0, -1.0, 1.0) / (jnp.abs(half) + jnp.sqrt(half * half + 1))
+    t = jnp.where(none, 0.0, tangent)
+    c = 1 / jnp.sqrt(t * t + 1)
+    s = t * c
+    a[p, p], a[q, q], a[p, q] = a[p, p] - t * off, a[q, q] + t * off, jnp.zeros_like(off)
+    for k in range(n):
+        if k not in (p, q):
+            first, second = (min(k, p), max(k, p)), (min(k, q), max(k, q))
+            a[first], a[second] = c * a[first] - s * a[second], s * a[first] + c * a[second]
+        left, right = vectors[k, p], vectors[k, q]
+        vectors[k, p], vectors[k, q] = c * left - s * right, s * left + c * right
+
+
+def _sorted(values: list[jax.Array], columns: list[list[jax.Array]]) -> tuple[list[jax.Array], list[list[jax.Array]]]:
+    """Sort by odd-even transposition, which needs no branches."""
+    n = len(values)
+
+    def exchanges(state: tuple[list[jax.Array], list[list[jax.Array]]], _: None) -> tuple[Any, None]:
+        values, columns = list(state[0]), list(state[1])
+        for i in (*range(0, n - 1, 2), *range(1, n - 1, 2)):
+            _exchange(values, columns, i)
+        return (values, columns), None
+
+    after, _ = jax.lax.scan(exchanges, (values, columns), length=(n + 1) // 2)
+    return after
+
+
+def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
+    """Exchange places i and i + 1 unless they are in ascending order."""
+    wrong = values[i] > values[i + 1]
+    values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
+    low, high = columns[i], columns[i + 1]
+    columns[i] = [jnp.where(wrong, y, x) for x, y in zip(low, high, strict=True)]
+    columns[i + 1] = [jnp.where(wrong, x, y) for x, y in zip(low, high, strict=True)]
+
+
+def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    avals: list[Any] = [v.aval for v in equation.invars]
+    shape = avals[0].shape
+    if shape[-1] > LARGEST or equation.params.get("subset_by_index") is not None:
+        raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
+    return _of_each(lowering, _program(shape[-1]), equation, inputs[0])
+
+
+def _of_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
+    """Return the results of a program of one matrix for each of many, along leading axes, one after another."""
+    (one,) = program.in_avals
+    before = matrices.shape[: len(matrices.shape) - len(one.shape)]
+    flat = lowering.nodes(matrices).reshape(math.prod(before), *one.shape)
+    items = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in flat]
+    shapes = [result_shape(equation, k) for k in range(len(equation.outvars))]
+    return [array_of((x for item in items for x in item[k].ravel()), shape) for k, shape in enumerate(shapes)]
+
+
+@cache
+def _program(n: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(eigh)(like((n, n), np.float64))
+
+
+IN_MEMORY |= {"eigh": _eigh}
+
+
+def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Compute L below the diagonal and U (n, n), the pivot row of each step (n,), and the order of rows (n,).
+
+    Each step takes the largest entry of the rest of its column, and needs one reciprocal.
+
+    Source: Golub and Van Loan, Matrix computations, section 3.4.
+    """
+    n = len(a)
+    rows, order, pivots = list(a), list(jnp.arange(n, dtype=jnp.int32)), []
+    for j in range(n):
+        # Partial pivoting: the largest |a_ij|, i >= j.
+        column = jnp.abs(jnp.stack([row[j] for row in rows[j:]]))
+        taken = j + jnp.argmax(column).astype(jnp.int32)
+        pivots.append(taken)
+        for i in range(j + 1, n):  # exchange rows j and i where i is taken
+            _exchange_if(taken == i, rows, i, j)
+            _exchange_if(taken == i, order, i, j)
+        # Elimination: l_ij = a_ij / a_jj, a_i <- a_i - l_ij a_j; below a pivot of zero the column is zeros, and stays.
+        scale = 1 / jnp.where(rows[j][j] == 0, 1.0, rows[j][j])
+        for i in range(j + 1, n):
+            factor = rows[i][j] * scale
+            rest = rows[i][j + 1 :] - factor * rows[j][j + 1 :]
+            rows[i] = jnp.concatenate([rows[i][:j], factor[None], rest])
+    return jnp.stack(rows), jnp.stack(pivots), jnp.stack(order)
+
+
+def _exchange_if(condition: jax.Array, items: list[jax.Array], i: int, j: int) -> None:
+    """Exchange items i and j where the condition holds."""
+    a, b = items[i], items[j]
+    items[i], items[j] = jnp.where(condition, b, a), jnp.where(condition, a, b)
+
+
+def permutation(pivots: jax.Array, size: int) -> jax.Array:
+    """Return the order of `size` rows after the exchanges of row j with row pivots[j] >= j, one after another."""
+    order = list(jnp.arange(size, dtype=pivots.dtype))
+    for j in range(len(pivots)):
+        for i in range(j + 1, size):
+            _exchange_if(pivots[j] == i, order, i, j)
+    return jnp.stack(order)
+
+
+def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    avals: list[Any] = [v.aval for v in equation.invars]
+    shape = avals[0].shape
+    if shape[-2] != shape[-1] or shape[-1] > LARGEST:
+        raise Unsupported(f"factors of a matrix of shape {shape[-2:]}")
+    return _of_each(lowering, _lu_program(shape[-1]), equation, inputs[0])
+
+
+@cache
+def _lu_program(n: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(lu)(like((n, n), np.float64))
+
+
+def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    program = _permutation_program(inputs[0].shape[-1], equation.params["permutation_size"])
+    return _of_each(lowering, program, equation, inputs[0])
+
+
+@cache
+def _permutation_program(count: int, size: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(like((count,), np.int32))
+
+
+def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Solve a system by the solver that it comes with."""
+    programs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
+    before = lengths.matvec + lengths.vecmat
+    fixed = inputs[before : before + lengths.solve]
+    right = inputs[before + lengths.solve + lengths.transpose_solve :]
+    return lowering.inline(programs.solve, [*fixed, *right])
+
+
+IN_MEMORY |= {"lu": _lu, "lu_pivots_to_permutation": _permutation, "custom_linear_solve": _linear_solve}

@@ -1,0 +1,203 @@
+"""Rules of elementwise operations."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.graph import Graph
+from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+from straightline.nodes import Key, Node, Type, Unsupported
+
+# Operation of JAX -> the graph's.
+ELEMENTWISE = {name: name for name in (
+    "add", "sub", "mul", "div", "rem", "neg", "abs", "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan",
+    "tanh", "atan2", "floor", "ceil", "sign", "is_finite", "max", "min", "eq", "ne", "lt", "le", "gt", "ge",
+    "and", "or", "xor", "not", "shift_left", "erf", "erf_inv", "erfc", "lgamma", "asin", "acos", "atan",
+    "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2",
+)} | {"add_any": "add", "shift_right_logical": "shift_right"}  # fmt: skip
+
+
+def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
+    """Return the entries of several arrays in row-major order, axes of length 1 repeated."""
+    size = math.prod(shape)
+    return [
+        [a.item()] * size if a.size == 1 else (a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist()
+        for a in arrays
+    ]
+
+
+def _elementwise(op: str) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
+        return [array_of([node(op, type, *nodes) for nodes in zip(*broadcast(inputs, shape), strict=True)], shape)]
+
+    return rule
+
+
+def _composed(function: Any) -> Rule:
+    """Make a rule from one of entries: function(graph, type, parameters, *entries)."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
+        entries = zip(*broadcast(inputs, shape), strict=True)
+        return [array_of([function(graph, type, equation.params, *entry) for entry in entries], shape)]
+
+    return rule
+
+
+def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
+    """Select a where the condition holds, else b: of numbers or of keys."""
+    if isinstance(a, Key):
+        return Key(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
+    return graph.node("select", a.type, condition, a, b)
+
+
+def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -> Any:
+    if len(cases) == 2 and which.type == "bool":
+        return select(graph, which, cases[1], cases[0])
+    chosen = cases[-1]
+    for number, case in reversed(list(enumerate(cases[:-1]))):
+        chosen = select(graph, graph.node("eq", "bool", which, graph.constant(number, which.type)), case, chosen)
+    return chosen
+
+
+def _key_select(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    shape = result_shape(equation)
+    entries = zip(*broadcast(inputs, shape), strict=True)
+    return [array_of([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
+
+
+def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """Compute x^n by repeated squaring."""
+    exponent = abs(params["y"])
+    factors, square = [], x
+    while exponent:
+        if exponent % 2:
+            factors.append(square)
+        exponent //= 2
+        if exponent:
+            square = graph.node("mul", type, square, square)
+    unit = graph.constant(1.0 if type == "f64" else 1, type)
+    product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, unit)
+    return product if params["y"] >= 0 else graph.node("div", type, unit, product)
+
+
+def _power_of_number(graph: Graph, type: Type, params: Any, x: Node, exponent: Node) -> Node:
+    """Compute x^y of a real x, of an integer y too."""
+    return graph.node("pow", type, x, exponent if exponent.type == type else graph.node("convert", type, exponent))
+
+
+def _clamp(graph: Graph, type: Type, params: Any, low: Node, x: Node, high: Node) -> Node:
+    return graph.node("min", type, graph.node("max", type, low, x), high)
+
+
+def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("convert", type, x)
+
+
+def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Read numbers as others of as many bits, or each as two words, the low one first."""
+    (x,), type, shape, node = inputs, result_type(equation), result_shape(equation), lowering.graph.node
+    numbers = x.ravel().tolist()
+    kinds = {n.type for n in numbers}
+    if shape == x.shape and all(kind[1:] == type[1:] for kind in kinds):
+        return [array_of([n if n.type == type else node("bitcast", type, n) for n in numbers], shape)]
+    if shape == (*x.shape, 2) and kinds <= {"f64", "u64"} and type == "u32":
+        bits = [n if n.type == "u64" else node("bitcast", "u64", n) for n in numbers]
+        half = lowering.graph.constant(32, "u64")
+        words = [node("convert", "u32", w) for b in bits for w in (b, node("shift_right", "u64", b, half))]
+        return [array_of(words, shape)]
+    raise Unsupported(f"bitcast from {', '.join(sorted(kinds))} to {type}")
+
+
+def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    unit = graph.constant(1.0, type)
+    power = graph.node("exp", type, graph.node("neg", type, x))
+    return graph.node("div", type, unit, graph.node("add", type, unit, power))
+
+
+def _root_reciprocal(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("div", type, graph.constant(1.0, type), graph.node("sqrt", type, x))
+
+
+def _square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("mul", type, x, x)
+
+
+def _one_minus_square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("sub", type, graph.constant(1.0, type), graph.node("mul", type, x, x))
+
+
+def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("mul", type, graph.node("log", type, x), graph.constant(1 / math.log(2), type))
+
+
+def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: Node) -> Node:
+    """Evaluate a polynomial by Horner's rule, of coefficients from degree 0 up."""
+    value = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        value = graph.node("add", type, graph.node("mul", type, value, x), c)
+    return value
+
+
+def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("round_even" if int(params["rounding_method"]) else "round_away", type, x)
+
+
+def _as_it_is(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
+    return inputs
+
+
+def _total_order(op: str) -> Callable[..., Node]:
+    """Compare in the order of IEEE 754 that has all numbers: -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
+
+    def rank(graph: Graph, x: Node) -> Node:
+        # Bits as an integer without sign: all of a negative number's are turned round, of others the sign's.
+        if x.type != "f64":
+            return x
+        bits = graph.node("bitcast", "u64", x)
+        negative = graph.node("shift_right", "u64", bits, graph.constant(63, "u64"))
+        all_bits = graph.node("sub", "u64", graph.constant(0, "u64"), negative)
+        sign = graph.constant(1 << 63, "u64")
+        return graph.node("xor", "u64", bits, graph.node("or", "u64", all_bits, sign))
+
+    return lambda graph, type, params, x, y: graph.node(op, type, rank(graph, x), rank(graph, y))
+
+
+def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node:
+    """Return the number next to x towards y: its bits, as an integer, and one more or less; y of equal ones."""
+    node, zero, one = graph.node, graph.constant(0.0, type), graph.constant(1, "i64")
+    bits = node("bitcast", "i64", x)
+    # Away from zero one more: where x < y and x is positive, or x > y and it is negative.
+    away = node("eq", "bool", node("lt", "bool", x, y), node("lt", "bool", zero, x))
+    beside = node("select", "i64", away, node("add", "i64", bits, one), node("sub", "i64", bits, one))
+    tiny = node(
+        "select", type, node("lt", "bool", y, zero), graph.constant(-5e-324, type), graph.constant(5e-324, type)
+    )
+    moved = node("select", type, node("eq", "bool", x, zero), tiny, node("bitcast", type, beside))
+    moved = node("select", type, node("eq", "bool", x, y), y, moved)
+    known = node("and", "bool", node("eq", "bool", x, x), node("eq", "bool", y, y))
+    return node("select", type, known, moved, graph.constant(math.nan, type))
+
+
+def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: Node) -> Node:
+    return graph.node("shift_right_signed", type, x, by)
+
+
+RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
+RULES |= {
+    "select_n": _key_select, "integer_pow": _composed(_power), "square": _composed(_square),
+    "pow": _composed(_power_of_number),
+    "rsqrt": _composed(_root_reciprocal), "logistic": _composed(_logistic), "clamp": _composed(_clamp),
+    "convert_element_type": _composed(_convert), "bitcast_convert_type": _bitcast,
+    "one_minus_square": _composed(_one_minus_square), "log2": _composed(_log2), "polynomial": _composed(_polynomial),
+    "eq_to": _composed(_total_order("eq")), "le_to": _composed(_total_order("le")),
+    "lt_to": _composed(_total_order("lt")), "round": _composed(_round),
+    "nextafter": _composed(_next_after), "shift_right_arithmetic": _composed(_shift_right_arithmetic),
+}  # fmt: skip
+PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
+RULES |= dict.fromkeys(PASSED_ON, _as_it_is)

@@ -1,0 +1,115 @@
+"""Rule of gather at known places, or at places that data select."""
+
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.lowering import RULES, Lowering, known_integers
+from straightline.memory import contiguous
+from straightline.nodes import Unsupported
+from straightline.rules.elementwise import select
+from straightline.rules.loops import in_memory
+from straightline.rules.places import clamped, fill_of, fills, inside, narrowed, places_of
+from straightline.rules.shapes import FEW, chosen
+
+
+def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Gather at clipped indices; where they fill, a window that is not inside is filled with a value."""
+    x, indices = inputs
+    if not fills(equation):
+        return [_clipped(equation, lowering, x, indices)]
+    indices = narrowed(lowering, indices)
+    flags, missing = _inside(lowering, equation, x.shape, indices), fill_of(lowering, equation)
+    gathered, numbers = _clipped(equation, lowering, x, indices), equation.params["dimension_numbers"]
+    for entry in np.ndindex(*gathered.shape):
+        gathered[entry] = select(lowering.graph, flags[_row(entry, numbers)], gathered[entry], missing)
+    return [gathered]
+
+
+def _inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
+    """Return for each row of indices whether its window is inside an array of this shape."""
+    axes, sizes = equation.params["dimension_numbers"].start_index_map, equation.params["slice_sizes"]
+    flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
+    for row in np.ndindex(*flags.shape):
+        for axis, start in zip(axes, indices[row], strict=True):
+            here = inside(lowering.graph, start, shape[axis] - sizes[axis])
+            before: Any = flags[row]
+            flags[row] = lowering.graph.node("and", "bool", before, here)
+    return flags
+
+
+def _clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Gather at indices that are clipped to the array."""
+    at = known_integers(indices)
+    if at is None:
+        return _by_cases(lowering, equation, x, indices)
+    # Places in the flat array, with the axes of windows where the result has them.
+    params, numbers = equation.params, equation.params["dimension_numbers"]
+    batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
+    removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    places = places_of(x.shape, params["slice_sizes"], at, numbers.start_index_map, batching, removed, True)
+    first = at.ndim - 1
+    places = np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
+    gathered: np.ndarray = x.ravel()[places.ravel()].reshape(places.shape)
+    return gathered
+
+
+def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Gather at indices (..., axis) that depend on data: one gather for each possible value, then a selection.
+
+    Each entry is selected by the index of its own row alone, so that rows of many nodes need no more cases than one.
+    """
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    column = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
+    axis = numbers.start_index_map[column]
+    last = x.shape[axis] - sizes[axis]
+    if last >= FEW:
+        return _from_memory(lowering, equation, x, indices, column)
+    cases = [_clipped(equation, lowering, x, _with(lowering, indices, column, n)) for n in range(last + 1)]
+    selected = cases[-1].copy()
+    for entry in np.ndindex(*selected.shape):
+        which = indices[(*_row(entry, numbers), column)]
+        if which.op != "constant":
+            here = [np.array(case[entry], dtype=object) for case in cases]
+            selected[entry] = chosen(lowering.graph, which, here)[()]
+    return selected
+
+
+def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, column: int) -> np.ndarray:
+    """Gather from memory if there are many places: each entry is loaded at an offset by its row's index."""
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    axis = numbers.start_index_map[column]
+    last = x.shape[axis] - sizes[axis]
+    begin = _with(lowering, indices, column, 0)
+    if known_integers(begin) is None:
+        raise Unsupported("gather at two places that data decide")
+    starts = _clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), begin)
+    buffer, stride = in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
+    loaded = np.empty(starts.shape, dtype=object)
+    for entry in np.ndindex(*loaded.shape):
+        start = indices[(*_row(entry, numbers), column)]
+        if start.op == "constant":
+            loaded[entry] = x.ravel()[starts[entry]]
+        else:
+            first: Any = clamped(lowering, start, last)
+            loaded[entry] = lowering.graph.load(buffer, int(starts[entry]), (stride,), (first,))
+    return loaded
+
+
+def _with(lowering: Lowering, indices: np.ndarray, column: int, number: int) -> np.ndarray:
+    """Replace the indices that depend on data by a number."""
+    replaced = indices.copy()
+    for row in np.ndindex(*indices.shape[:-1]):
+        node = indices[(*row, column)]
+        if node.op != "constant":
+            replaced[(*row, column)] = lowering.graph.constant(number, node.type)
+    return replaced
+
+
+def _row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
+    """Return the row of indices from which an entry of the result is gathered."""
+    return tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
+
+
+RULES |= {"gather": _gather}

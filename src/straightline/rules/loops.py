@@ -1,0 +1,260 @@
+"""Rules of loops: short ones are written out; long ones stay loops with stacked results in memory, as does `while`."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.graph import Graph
+from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
+from straightline.memory import InMemory
+from straightline.nodes import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
+from straightline.rules.elementwise import select
+
+WRITTEN_OUT = 2000  # numbers computed by all turns of a loop that is written out
+KERNEL = 300  # numbers that a kernel over runs is taken to compute
+Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
+
+
+def repeated(
+    lowering: Lowering, length: int, carry: Sequence[np.ndarray], turn: Turn, backwards: bool = False
+) -> tuple[list[np.ndarray], list[InMemory]]:
+    """Repeat `turn` for `length` turns; return the carry after them, and the stacked results in memory.
+
+    turn(row, carry) returns the next carry, and what is stacked in that row; rows run from 0 up, or down to 0.
+    """
+    graph, outer = lowering.graph, lowering.graph.current
+
+    def body(loop: Loop, now: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[InMemory]]:
+        loop.counter = counter = graph.fresh("counter", "i64", (), loop.body, loop)
+        row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
+        following, stacked = turn(row, now)
+        return following, [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
+
+    return _looped(lowering, length, carry, body)
+
+
+def _looped(
+    lowering: Lowering, length: int | None, carry: Sequence[np.ndarray], body: Callable[[Loop, list[np.ndarray]], Any]
+) -> tuple[list[np.ndarray], Any]:
+    """Lower a loop; return the carry after it, and what body(loop, carry) returns beside the following carry.
+
+    A matrix that is symmetric before the loop is taken for one within it, of which the loop carries a triangle; where
+    the body does not keep it so, the body is lowered once more for all entries.
+    """
+    graph, outer = lowering.graph, lowering.graph.current
+    halves = [is_symmetric(x) for x in carry]
+    while True:
+        begun = graph.serial
+        loop = Loop(Block(outer), length, _entries(carry, halves))
+        # In the body the carry is a parameter; the turn is traced once.
+        loop.parameters = _stand_ins(graph, "parameter", loop, loop.body)
+        graph.current = loop.body
+        following, rest = body(loop, _like(carry, loop.parameters, halves))
+        graph.current = outer
+        kept = [half and is_symmetric(x) for half, x in zip(halves, following, strict=True)]
+        if kept == halves:
+            break
+        halves = kept
+        graph.most += graph.serial - begun
+    loop.following = _entries(following, halves)
+    outer.items.append(loop)
+    # After the loop the carry is a result.
+    loop.results = _stand_ins(graph, "result", loop, outer)
+    return _like(carry, loop.results, halves), rest
+
+
+def _stand_ins(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
+    """Make nodes that stand for the carry in the body or after the loop."""
+    return [graph.fresh(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
+
+
+def is_symmetric(x: np.ndarray) -> bool:
+    """Return whether the entries of matrices (..., n, n), n > 1, are the same nodes across the diagonal."""
+    if x.ndim < 2 or x.shape[-1] != x.shape[-2] or not x.size or x.shape[-1] == 1:
+        return False
+    return all(a is b for a, b in zip(x.ravel().tolist(), np.swapaxes(x, -1, -2).ravel().tolist(), strict=True))
+
+
+def _entries(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list[Node]:
+    """Return the nodes of arrays, of those marked the upper triangles alone."""
+    parts = [x[..., *np.triu_indices(x.shape[-1])] if h else x for x, h in zip(arrays, halves, strict=True)]
+    return [n for x in parts for n in scalars(x)]
+
+
+def _stack(
+    lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
+) -> InMemory:
+    """Store one turn's array as one row of memory."""
+    flat = _numbers(value)
+    type: Type = flat[0].type if flat else "f64"
+    buffer = Buffer("scratch", type, (length, *value.shape), outer)
+    size, places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
+    buffer.first = [places[node] for node in flat] if len(places) < size else []
+    start, stride = ((length - 1) * size, -size) if backwards else (0, size)
+    for entry, node in enumerate(flat):
+        lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
+    return InMemory.whole(buffer)
+
+
+def _numbers(value: np.ndarray) -> list[Node]:
+    flat: list[Node] = value.ravel().tolist()
+    if any(isinstance(x, Key) for x in flat):
+        raise Unsupported("keys of random numbers in memory")
+    return flat
+
+
+def _like(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves: Sequence[bool]) -> list[np.ndarray]:
+    """Restore arrays of the same shapes, and keys, from nodes as `_entries` returns them."""
+    rest = iter(nodes)
+    results = []
+    for a, half in zip(arrays, halves, strict=True):
+        n = a.shape[-1] if half else 0
+        shape = (*a.shape[:-2], n * (n + 1) // 2) if half else a.shape
+        kinds = a[..., *np.triu_indices(n)] if half else a
+        x = array_of(
+            [Key(next(rest), next(rest)) if isinstance(k, Key) else next(rest) for k in kinds.ravel().tolist()], shape
+        )
+        results.append(_mirrored(x, n) if half else x)
+    return results
+
+
+def _mirrored(upper: np.ndarray, n: int) -> np.ndarray:
+    """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
+    places = np.zeros((n, n), dtype=int)
+    places[np.triu_indices(n)] = np.arange(upper.shape[-1])
+    return upper[..., np.maximum(places, places.T)]
+
+
+def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    params = equation.params
+    (consts, carried), length = _counts(params), params["length"]
+    fixed, rows = inputs[:consts], inputs[consts + carried :]
+    carry = [lowering.nodes(x) for x in inputs[consts : consts + carried]]
+    # Short loops are written out.
+    if length * size_of(lowering, params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
+        return _written_out(lowering, equation, fixed, carry, rows)
+    jaxpr = params["jaxpr"].jaxpr
+    # A carried number that the body returns unchanged is a constant of the loop.
+    same = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
+    rows = [in_memory(lowering, x) for x in rows]
+
+    # One turn: the body for one row of the stacked arguments.
+    def turn(row: Node, moving: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        items = iter(moving)
+        now = [x if s else next(items) for x, s in zip(carry, same, strict=True)]
+        results = lowering.inline(params["jaxpr"], [*fixed, *now, *(x.row(row) for x in rows)])
+        nodes = [lowering.nodes(x) for x in results]
+        return [x for x, s in zip(nodes[:carried], same, strict=True) if not s], nodes[carried:]
+
+    moving, stacked = repeated(
+        lowering, length, [x for x, s in zip(carry, same, strict=True) if not s], turn, params["reverse"]
+    )
+    after = iter(moving)
+    return [*(x if s else next(after) for x, s in zip(carry, same, strict=True)), *stacked]
+
+
+def _counts(params: dict[str, Any]) -> tuple[int, int]:
+    """Return how many arguments of a scan are constants, and how many are carried: numbers in JAX 0.10, trees later."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carried, _ = params["ft_in"].unpack()
+    return len(list(consts)), len(list(carried))
+
+
+def _written_out(
+    lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
+) -> list[Value]:
+    params = equation.params
+    stacked: list[list[Value]] = []
+    turns = range(params["length"])
+    for turn in reversed(turns) if params["reverse"] else turns:
+        items = [x.row(turn) if isinstance(x, InMemory) else _entry(x, turn) for x in rows]
+        results = lowering.inline(params["jaxpr"], [*fixed, *carry, *items])
+        carry = results[: len(carry)]
+        stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
+    if not stacked:
+        avals: list[Any] = [v.aval for v in equation.outvars[len(carry) :]]
+        return [*carry, *(np.empty(a.shape, dtype=object) for a in avals)]
+    if params["reverse"]:
+        stacked.reverse()
+    return [*carry, *(np.stack(leaves) for leaves in zip(*stacked, strict=True))]
+
+
+def _entry(x: np.ndarray, turn: int) -> np.ndarray:
+    """Return x[turn] as an array, also for one axis."""
+    return x[turn : turn + 1].reshape(x.shape[1:])
+
+
+def in_memory(lowering: Lowering, value: Value) -> InMemory:
+    """Store an array of nodes in memory."""
+    if isinstance(value, InMemory):
+        return value
+    flat = _numbers(value)
+    graph = lowering.graph
+    type: Type = flat[0].type if flat else "f64"
+    if all(n.op == "constant" for n in flat):
+        table = np.array([n.value for n in flat]).reshape(value.shape)
+        return InMemory.whole(Buffer("table", type, value.shape, graph.top, table))
+    buffer = Buffer("scratch", type, value.shape, graph.current)
+    for index, node in enumerate(flat):
+        graph.store(buffer, node, index, (), ())
+    return InMemory.whole(buffer)
+
+
+def copied(lowering: Lowering, x: InMemory) -> InMemory:
+    """Copy a long array to new memory."""
+    return repeated(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
+
+
+def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Lower a loop that ends when no run's condition holds; a run whose condition is false keeps its carry.
+
+    Under `vmap` the condition has axes, the leading ones of the carry, and each entry keeps its carry likewise.
+    """
+    params, graph = equation.params, lowering.graph
+    conditional, fixed = params["cond_nconsts"], params["body_nconsts"]
+    of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
+
+    def body(loop: Loop, now: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
+        # The check comes before the body; there the carry is selected by each run's condition.
+        active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
+        loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
+        loop.body.items.append(Check(loop))
+        moved = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
+        return [_where_active(graph, active, new, old) for new, old in zip(moved, now, strict=True)], None
+
+    return _looped(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]
+
+
+def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    going = np.repeat(active.ravel(), new.size // active.size).tolist()
+    return array_of(
+        [select(graph, a, x, y) for a, x, y in zip(going, new.ravel().tolist(), old.ravel().tolist(), strict=True)],
+        old.shape,
+    )
+
+
+def size_of(lowering: Lowering, jaxpr: Any) -> int:
+    """Estimate the count of numbers that a traced program computes, once for each that is lowered."""
+    if jaxpr in lowering.sizes:
+        return lowering.sizes[jaxpr]
+    total = 0
+    for equation in jaxpr.eqns:
+        inner = [size_of(lowering, getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
+        turns = equation.params["length"] if equation.primitive.name == "scan" else 1
+        inner += [KERNEL] if equation.primitive.name == "runs_last" else []
+        total += turns * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
+    lowering.sizes[jaxpr] = total
+    return total
+
+
+def _programs(params: dict[str, Any]) -> list[Any]:
+    values = [x for p in params.values() for x in (p if isinstance(p, tuple) else (p,))]
+    return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
+
+
+IN_MEMORY |= {"scan": _scan, "while": _while}

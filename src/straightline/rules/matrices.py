@@ -1,0 +1,249 @@
+"""Rules of sums, products and decompositions: written out, entry by entry."""
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.folding import DTYPES
+from straightline.graph import Graph
+from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+from straightline.nodes import Node, Type, Unsupported
+
+
+def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
+    """Combine nodes one by one; return `empty` if there are none."""
+    if not nodes:
+        return graph.constant(empty, type)
+    return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
+
+
+def _reduction(op: str, empty: float) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
+        terms = math.prod(inputs[0].shape[axis] for axis in axes)  # none of a sum over nothing
+        x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
+        return [array_of([total(lowering.graph, op, type, row, _within(type, empty)) for row in x.tolist()], shape)]
+
+    return rule
+
+
+ALL_BITS = np.nan  # of "and": true, -1, or the greatest unsigned integer
+
+
+def _within(type: Type, number: float) -> float:
+    """Return the number of this type that is nearest to one: infinity is no integer. ALL_BITS: that of all bits."""
+    if type == "f64" or np.isfinite(number):
+        return number
+    greatest = number > 0 or number is ALL_BITS
+    if type == "bool":
+        return greatest
+    limits = np.iinfo(DTYPES[type])
+    if number is ALL_BITS and limits.min < 0:
+        return -1
+    return limits.max if greatest else limits.min
+
+
+def _cumulative(op: str) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        axis, type = equation.params["axis"], result_type(equation)
+        if not inputs[0].size:
+            return inputs
+        x = np.moveaxis(inputs[0], axis, 0)
+        x = (x[::-1] if equation.params["reverse"] else x).reshape(len(x), -1)
+        rows = [x[0].tolist()]
+        for row in x[1:].tolist():
+            rows.append([lowering.graph.node(op, type, a, b) for a, b in zip(rows[-1], row, strict=True)])
+        cumulated = array_of([n for row in rows for n in row], np.moveaxis(inputs[0], axis, 0).shape)
+        return [np.moveaxis(cumulated[::-1] if equation.params["reverse"] else cumulated, 0, axis)]
+
+    return rule
+
+
+def _arg(op: str) -> Rule:
+    """Make a rule for the first index of the greatest or least entry; as in JAX, of the first NaN if there is one."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        graph, type = lowering.graph, result_type(equation)
+        x = np.moveaxis(inputs[0], equation.params["axes"][0], -1).reshape(
+            -1, inputs[0].shape[equation.params["axes"][0]]
+        )
+        results = []
+        for row in x.tolist():
+            best, index = row[0], graph.constant(0, type)
+            for number, entry in enumerate(row[1:], 1):
+                # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN.
+                known = graph.node("eq", "bool", best, best)
+                beyond = graph.node(op, "bool", entry, best)
+                is_nan = graph.node("ne", "bool", entry, entry)
+                better = graph.node("and", "bool", known, graph.node("or", "bool", beyond, is_nan))
+                best = graph.node("select", entry.type, better, entry, best)
+                index = graph.node("select", type, better, graph.constant(number, type), index)
+            results.append(index)
+        return [array_of(results, result_shape(equation))]
+
+    return rule
+
+
+def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Sum products over the contracted axes, with batch axes first."""
+    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    type = result_type(equation)
+    x, y = (_of_type(lowering.graph, type, x) for x in inputs)
+    a, b = _batched(x, left, left_batch), _batched(y, right, right_batch)
+    products = [_product(lowering, type, rows, columns) for rows, columns in zip(a, b, strict=True)]
+    return [array_of([n for product in products for n in product.ravel().tolist()], result_shape(equation))]
+
+
+def _product(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Compute A B' of A (n, k) and B (m, k). Of a congruence C P C' both triangles are the upper one.
+
+    A = C P and B = C with a symmetric P, or A = C and B = C P. That A A' is symmetric needs no rule, since equal
+    expressions are one node.
+    """
+    mirrored = any(_is_weighted(x, y) or _is_congruence(lowering, x, y) for x, y in ((a, b), (b, a)))
+    places = [(i, j) for i in range(len(a)) for j in range(i if mirrored else 0, len(b))]
+    product = np.empty((len(a), len(b)), dtype=object)
+    sums = _sums_of_products(lowering.graph, type, [(a[i], b[j]) for i, j in places])
+    for (i, j), entry in zip(places, sums, strict=True):
+        product[i, j] = entry
+        if mirrored:
+            product[j, i] = entry
+    for entries, factors in ((product, (a, b)), (product.T, (b, a))):
+        lowering.products[_key(entries)] = factors
+    return product
+
+
+def _sums_of_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Node]:
+    """Sum the products of pairs of vectors, all sums term by term at once, so that none waits for the last of another.
+
+    A term of data that is multiplied by a known zero is none, whatever the data: a zero in a matrix of a model says
+    what does not depend on what, and NaN passes only to what does.
+    """
+    product, sum_ = ("and", "or") if type == "bool" else ("mul", "add")
+    sums: list[Node | None] = [None] * len(pairs)
+    for k in range(len(pairs[0][0]) if pairs else 0):
+        for place, (a, b) in enumerate(pairs):
+            if _leaves_out(a[k], b[k]) or _leaves_out(b[k], a[k]):
+                continue
+            term, before = graph.node(product, type, a[k], b[k]), sums[place]
+            sums[place] = term if before is None else graph.node(sum_, type, before, term)
+    return [graph.constant(0.0 if type == "f64" else 0, type) if s is None else s for s in sums]
+
+
+def _leaves_out(x: Node, y: Node) -> bool:
+    return x.op == "constant" and not x.value and y.op != "constant"
+
+
+def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether A = B diag(w)."""
+    if a.shape != b.shape:
+        return False
+    weights = [[_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
+    return all(w is not None and w is column[0] for column in weights for w in column)
+
+
+def _weight(x: Node, y: Node) -> Node | None:
+    """Return w of a number x = w y."""
+    if y.op == "constant" and y.value == 1:
+        return x
+    return x.args[x.args[0] is y] if x.op == "mul" and any(a is y for a in x.args) else None
+
+
+def _is_congruence(lowering: Lowering, a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether A = B P of a symmetric P."""
+    factor, p = lowering.products.get(_key(a), (a[:0], a[:0]))
+    return _is_same(factor, b) and _is_same(p, p.T)
+
+
+def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.shape == b.shape and all(x is y for x, y in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True))
+
+
+def _key(matrix: np.ndarray) -> Any:
+    return matrix.shape, *matrix.ravel().tolist()
+
+
+def _of_type(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
+    """Convert integers and truth values, with which numbers may be multiplied."""
+    return array_of((n if n.type == type else graph.node("convert", type, n) for n in x.ravel().tolist()), x.shape)
+
+
+def _batched(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
+    """Arrange as (batch, free, contracted)."""
+    free = [d for d in range(x.ndim) if d not in contracted and d not in batch]
+    sizes = [math.prod(x.shape[d] for d in axes) for axes in (batch, free, contracted)]
+    return np.transpose(x, [*batch, *free, *contracted]).reshape(sizes)
+
+
+def _each_matrix(function: Any) -> Rule:
+    """Make a rule of the last two axes: function(graph, parameters, *matrices) for each index of the others."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        flat = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
+        items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
+        return [array_of((x for item in items for x in item.ravel().tolist()), result_shape(equation))]
+
+    return rule
+
+
+def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
+    """Compute A = L L' column by column, one reciprocal each; all NaN if the matrix is not positive definite."""
+    n = len(a)
+    zero, missing = graph.constant(0.0, "f64"), graph.constant(float("nan"), "f64")
+    definite = graph.constant(True, "bool")
+    lower = np.full((n, n), zero, dtype=object)
+    for j in range(n):
+        # a_ij - sum_k l_ik l_jk for the rows i >= j.
+        rests = []
+        for i in range(j, n):
+            rest = a[i, j]
+            for k in range(j):
+                rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", lower[i, k], lower[j, k]))
+            rests.append(rest)
+        # l_jj = sqrt(rest), l_ij = rest / l_jj.
+        root = graph.node("sqrt", "f64", rests[0])
+        negative = graph.node("le", "bool", rests[0], zero)  # NaN is not, and stays where it leads to
+        definite = graph.node("and", "bool", definite, graph.node("not", "bool", negative))
+        scale = graph.node("div", "f64", graph.constant(1.0, "f64"), root)
+        lower[j, j] = root
+        for i in range(j + 1, n):
+            lower[i, j] = graph.node("mul", "f64", rests[i - j], scale)
+    numbers = [graph.node("select", "f64", definite, x, missing) for x in lower.ravel().tolist()]
+    return array_of(numbers, lower.shape)
+
+
+def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Solve A X = B (or X A = B, or with A') by substitution, one reciprocal for each diagonal entry."""
+    if params["conjugate_a"]:
+        raise Unsupported("complex numbers")
+    lower, transposed = params["lower"], params["transpose_a"]
+    if not params["left_side"]:  # A' X' = B'
+        transposed, b = not transposed, b.T
+    if transposed:
+        a, lower = a.T, not lower
+    # x_i = (b_i - sum_j a_ij x_j) / a_ii, in the order of substitution.
+    n, unit = len(a), graph.constant(1.0, "f64")
+    scales = [unit if params["unit_diagonal"] else graph.node("div", "f64", unit, a[i, i]) for i in range(n)]
+    x = np.empty(b.shape, dtype=object)
+    order = list(range(n)) if lower else list(range(n))[::-1]
+    for step, i in enumerate(order):
+        for column in range(b.shape[1]):
+            rest = b[i, column]
+            for j in order[:step]:
+                rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", a[i, j], x[j, column]))
+            x[i, column] = graph.node("mul", "f64", rest, scales[i])
+    return x if params["left_side"] else x.T
+
+
+RULES |= {
+    "reduce_sum": _reduction("add", 0), "reduce_prod": _reduction("mul", 1), "reduce_or": _reduction("or", 0),
+    "reduce_and": _reduction("and", ALL_BITS), "reduce_xor": _reduction("xor", 0),
+    "reduce_max": _reduction("max", -np.inf), "reduce_min": _reduction("min", np.inf),
+    "cumsum": _cumulative("add"), "cumprod": _cumulative("mul"), "cummax": _cumulative("max"),
+    "cummin": _cumulative("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": _dot_general,
+    "cholesky": _each_matrix(_cholesky), "triangular_solve": _each_matrix(_triangular_solve),
+}  # fmt: skip

@@ -1,0 +1,178 @@
+"""Random numbers of JAX bit for bit: rules of operations on keys, and the hash as text of LLVM IR.
+
+A key is two words, and every draw and every new key is the hash of a counter by a key. In the graph the hash is one
+operation, "threefry" of the key's words and the counter's, whose result (u64) is the first word above the second.
+
+Source: Salmon, Moraes, Dror, Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011), section 5.2; JAX counts as with
+its flag jax_threefry_partitionable.
+"""
+
+import math
+from functools import cache
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.graph import Graph
+from straightline.lowering import RULES, Lowering, array_of, keys_of, result_shape
+from straightline.nodes import Key, Node, Unsupported
+from straightline.rules.elementwise import broadcast
+
+Word = Any  # of 32 bits, in an integer or an array of wider ones
+ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
+PARITY = 0x1BD11BDA
+
+
+def threefry(graph: Graph, key: Key, high: Node, low: Node) -> Node:
+    """Hash a counter's two words, the first word above the second; a constant if all words are."""
+    words = (key.first, key.second, high, low)
+    if all(word.op == "constant" for word in words):
+        return graph.constant(hashed(*(int(word.value) for word in words)), "u64")
+    return graph.node("threefry", "u64", *words)
+
+
+def _new_key(graph: Graph, key: Key, high: Node, low: Node) -> Key:
+    both = threefry(graph, key, high, low)
+    shifted = graph.node("shift_right", "u64", both, graph.constant(32, "u64"))
+    return Key(graph.node("convert", "u32", shifted), graph.node("convert", "u32", both))
+
+
+def _wrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    _check(equation.outvars[0])
+    return [keys_of(inputs[0])]
+
+
+def _unwrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    _check(equation.invars[0])
+    words = [word for key in inputs[0].ravel().tolist() for word in (key.first, key.second)]
+    return [array_of(words, result_shape(equation))]
+
+
+def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the key that is the hash of (0, number)."""
+    _check(equation.invars[0])
+    shape, zero = result_shape(equation), lowering.graph.constant(0, "u32")
+    pairs = zip(*broadcast(inputs, shape), strict=True)
+    return [array_of([_new_key(lowering.graph, key, zero, number) for key, number in pairs], shape)]
+
+
+def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return for each key the keys that are the hashes of 0, 1, 2, ..."""
+    _check(equation.invars[0])
+    graph, counters = lowering.graph, _counters(lowering.graph, equation.params["shape"])
+    keys = [_new_key(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
+    return [array_of(keys, result_shape(equation))]
+
+
+def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return for each key the hashes of 0, 1, 2, ...; 32 bits are the exclusive or of both words."""
+    _check(equation.invars[0])
+    graph, width = lowering.graph, equation.params["bit_width"]
+    counters = _counters(graph, equation.params["shape"])
+    drawn = [threefry(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
+    if width == 32:
+        shift = graph.constant(32, "u64")
+        mixed = [graph.node("xor", "u64", x, graph.node("shift_right", "u64", x, shift)) for x in drawn]
+        drawn = [graph.node("convert", "u32", x) for x in mixed]
+    elif width != 64:
+        raise Unsupported(f"random numbers of {width} bits")
+    return [array_of(drawn, result_shape(equation))]
+
+
+def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the key whose words are those of the number."""
+    _check(equation.outvars[0])
+    graph = lowering.graph
+
+    def words(number: Node) -> Key:
+        if number.type[1:] == "32":
+            return Key(graph.constant(0, "u32"), graph.node("convert", "u32", number))
+        whole = graph.node("convert", "u64", number)
+        shifted = graph.node("shift_right", "u64", whole, graph.constant(32, "u64"))
+        return Key(graph.node("convert", "u32", shifted), graph.node("convert", "u32", whole))
+
+    return [array_of(map(words, inputs[0].ravel().tolist()), result_shape(equation))]
+
+
+def _hash(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Hash words (...)."""
+    shape = result_shape(equation)
+    items = zip(*broadcast(inputs, shape), strict=True)
+    keys = [_new_key(lowering.graph, Key(first, second), high, low) for first, second, high, low in items]
+    return [array_of([key.first for key in keys], shape), array_of([key.second for key in keys], shape)]
+
+
+def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Any:
+    """Lower JAX's program for gamma variables, a loop until a proposal is accepted."""
+    gamma: Any = equation.primitive.impl
+    avals: list[Any] = [v.aval for v in equation.invars]
+    program = jax.make_jaxpr(lambda *args: gamma(*args, **equation.params))(*avals)
+    return [lowering.nodes(x) for x in lowering.inline(program, inputs)]
+
+
+def _same(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    return inputs
+
+
+def _counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
+    """Return 0, 1, 2, ... as two words each."""
+    return [(graph.constant(i >> 32, "u32"), graph.constant(i & 0xFFFFFFFF, "u32")) for i in range(math.prod(shape))]
+
+
+def _check(variable: Any) -> None:
+    """Raise unless keys are of JAX's default hash, counted as its newer releases do."""
+    if str(variable.aval.dtype) != "key<fry>":
+        raise Unsupported(f"keys of type {variable.aval.dtype}")
+    if not jax.threefry_partitionable.value:
+        raise Unsupported("draws counted as without jax_threefry_partitionable")
+
+
+RULES |= {
+    "random_wrap": _wrap, "random_unwrap": _unwrap, "random_fold_in": _fold_in, "random_split": _split,
+    "random_bits": _bits, "random_seed": _seed, "random_clone": _same, "threefry2x32": _hash, "random_gamma": _gamma,
+}  # fmt: skip
+
+
+def hashed(first: Word, second: Word, high: Word, low: Word) -> Word:
+    """Hash words: 20 rounds of addition, rotation and exclusive or; key words are added every four rounds."""
+    keys = (first, second, first ^ second ^ PARITY)
+    x, y, mask = (high + first) & 0xFFFFFFFF, (low + second) & 0xFFFFFFFF, 0xFFFFFFFF
+    for four in range(5):
+        for bits in ROTATIONS[four % 2]:
+            x = (x + y) & mask
+            y = ((y << bits | y >> (32 - bits)) & mask) ^ x
+        x, y = (x + keys[(four + 1) % 3]) & mask, (y + keys[(four + 2) % 3] + four + 1) & mask
+    return x << 32 | y
+
+
+@cache
+def hash_function() -> str:
+    """Write `define internal %i64 @hg_threefry(%i32 ...)` of a key's and a counter's two words."""
+    vector, wide = "%i32", "%i64"
+    lines: list[str] = []
+
+    def op(text: str) -> str:
+        lines.append(f"  %t{len(lines)} = {text}")
+        return f"%t{len(lines) - 1}"
+
+    # Key schedule: k_2 = k_0 ^ k_1 ^ parity.
+    both = op(f"xor {vector} %a, %b")
+    keys = ("%a", "%b", op(f"xor {vector} {both}, splat (i32 {PARITY})"))
+    x, y = op(f"add {vector} %x, %a"), op(f"add {vector} %y, %b")
+    # Five times four rounds, each with the next two key words.
+    for four in range(5):
+        for bits in ROTATIONS[four % 2]:
+            x = op(f"add {vector} {x}, {y}")
+            y = op(f"call {vector} @llvm.fshl({vector} {y}, {vector} {y}, {vector} splat (i32 {bits}))")
+            y = op(f"xor {vector} {y}, {x}")
+        x = op(f"add {vector} {x}, {keys[(four + 1) % 3]}")
+        y = op(f"add {vector} {y}, {keys[(four + 2) % 3]}")
+        y = op(f"add {vector} {y}, splat (i32 {four + 1})")
+    # Both words as one of 64 bits.
+    high, low = op(f"zext {vector} {x} to {wide}"), op(f"zext {vector} {y} to {wide}")
+    word = op(f"or {wide} {op(f'shl {wide} {high}, splat (i64 32)')}, {low}")
+    words = ", ".join(f"{vector} %{name}" for name in "abxy")
+    body = "\n".join(lines)
+    return f"define internal {wide} @hg_threefry({words}) noinline nounwind {{\n{body}\n  ret {wide} {word}\n}}\n"

@@ -1,0 +1,178 @@
+"""Rules of arithmetic on long arrays in memory: a loop over their rows.
+
+What `vmap` made of a step, for all rows of a record at once, becomes that step in a loop again.
+"""
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
+from straightline.memory import LARGE, LONG, InMemory
+from straightline.nodes import Node, Unsupported
+from straightline.rules.elementwise import ELEMENTWISE
+from straightline.rules.loops import in_memory, repeated
+
+OF_ENTRIES = (
+    *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
+    "bitcast_convert_type", "round",
+)  # fmt: skip
+
+
+FEW_TERMS = 256  # of a product with a known matrix, which are written out rather than looped over
+
+
+def is_long(inputs: list[Value]) -> bool:
+    """Return whether nodes for all entries of an argument would be too many.
+
+    Those of tables are constants: they are no more where the other arguments are known too, or are as many nodes.
+    """
+    longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
+    known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
+    return longest > LARGE or (longest > LONG and not (known and _are_written_out(inputs, longest)))
+
+
+def _are_written_out(inputs: list[Value], count: int) -> bool:
+    arrays = [x for x in inputs if not isinstance(x, InMemory)]
+    return any(x.size >= count for x in arrays) or all(
+        isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist()
+    )
+
+
+def _of_entries(name: str) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
+        if not is_long(inputs):
+            return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
+        items = [x if len(x.shape) < ndim or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
+        row_equation = like_row(equation)
+
+        def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            rows = [row_of(lowering, x, row, ndim) for x in items]
+            return [], list(lowering.equation(row_equation, rows))
+
+        return list(repeated(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
+
+    return rule
+
+
+def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Load carried and stacked arrays."""
+    carried, stacked = results
+    return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
+
+
+def row_of(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
+    """Return the part of an argument that a row of the result needs: its only row, or all where it has fewer axes."""
+    if x.ndim < ndim:
+        return x
+    if isinstance(x, InMemory):
+        return x.row(0 if x.shape[0] == 1 else row)
+    return x[:1].reshape(x.shape[1:])
+
+
+def like_row(equation: JaxprEqn, **params: Any) -> Any:
+    """Return the same operation for one row."""
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    rows = [SimpleNamespace(aval=like(a.shape[1:], a.dtype)) for a in avals]
+    return SimpleNamespace(
+        primitive=equation.primitive, params=equation.params | params, outvars=rows, invars=equation.invars,
+        source_info=equation.source_info,
+    )  # fmt: skip
+
+
+def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Loop over the first batch axis, else the first free axis of the left argument, else that of the right one."""
+    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    to_number = not result_shape(equation) and all(x.size <= LARGE for x in inputs)
+    if to_number or not is_long(inputs) or _has_few_terms(lowering, equation, inputs):
+        return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
+    a, b = (in_memory(lowering, x) for x in inputs)
+    free_left, free_right = (
+        next((d for d in range(x.ndim) if d not in axes), None) for x, axes in ((a, left), (b, right))
+    )
+    in_left, in_right = (left_batch[0], right_batch[0]) if left_batch else (free_left, None)
+    if in_left is None:
+        in_right = free_right
+    if in_left is None and in_right is None:
+        raise Unsupported("a sum of products over a long array")
+    # Dimension numbers of one row: without the axis that is looped over.
+    numbers = tuple(
+        tuple(
+            axes if gone is None else _without(axes, gone) for axes, gone in zip(pair, (in_left, in_right), strict=True)
+        )
+        for pair in ((left, right), (left_batch[1:], right_batch[1:]))
+    )
+    a, b = (x if axis is None else _first(x, axis) for x, axis in ((a, in_left), (b, in_right)))
+    # The operation on one row, in a loop.
+    row_equation = like_row(equation, dimension_numbers=numbers)
+
+    def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        rows: list[Value] = [x if axis is None else x.row(row) for x, axis in ((a, in_left), (b, in_right))]
+        return as_nodes(lowering, ([], list(lowering.equation(row_equation, rows))))
+
+    count = (b if in_left is None else a).shape[0]
+    return list(repeated(lowering, count, [], turn)[1])
+
+
+def _has_few_terms(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> bool:
+    """Return whether the known zeros of a factor, which leave terms out, leave few of them."""
+    terms = math.prod(result_shape(equation))
+    terms *= math.prod(inputs[0].shape[d] for d in equation.params["dimension_numbers"][0][0])
+    if any(x.size > LARGE for x in inputs):
+        return False
+    tables = [x for x in inputs if isinstance(x, InMemory) and x.buffer.kind == "table" and not x.moves]
+    shares = [sum(n.value != 0 for n in x.nodes(lowering.graph).ravel().tolist()) / x.size for x in tables if x.size]
+    return any(terms * share <= FEW_TERMS for share in shares)
+
+
+def _first(x: InMemory, axis: int) -> InMemory:
+    """Move an axis to the front."""
+    order = [axis, *(a for a in range(x.ndim) if a != axis)]
+    return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])
+
+
+def _without(axes: tuple[int, ...], removed: int) -> tuple[int, ...]:
+    return tuple(a - (a > removed) for a in axes)
+
+
+def _reduction(name: str) -> Rule:
+    """Make a rule that reduces the first axis row after row, and other axes within each row."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        x, axes = inputs[0], equation.params["axes"]
+        if not is_long(inputs):
+            return list(RULES[name](lowering, equation, [lowering.nodes(x)]))
+        # The reduction within a row, and that of two rows.
+        inner = tuple(a - 1 for a in axes if a)
+        shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in inner)
+        dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
+        row = SimpleNamespace(aval=like(shape, dtype))
+        params = equation.params | {"axes": inner}
+        within: Any = SimpleNamespace(params=params, outvars=[row])
+        pair: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])
+
+        def reduced(row_index: Node) -> np.ndarray:
+            return np.asarray(RULES[name](lowering, within, [lowering.nodes(x.row(row_index))])[0])
+
+        # Rows stay apart, or are accumulated from the neutral element.
+        if 0 not in axes:
+            return list(repeated(lowering, x.shape[0], [], lambda row_index, _: ([], [reduced(row_index)]))[1])
+        nothing = np.empty((0, *shape), dtype=object)
+        start = RULES[name](lowering, pair, [nothing])[0]
+
+        def turn(row_index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            return [np.asarray(RULES[name](lowering, pair, [np.stack([carry[0], reduced(row_index)])])[0])], []
+
+        return list(repeated(lowering, x.shape[0], [start], turn)[0])
+
+    return rule
+
+
+REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")
+IN_MEMORY |= {name: _of_entries(name) for name in OF_ENTRIES}
+IN_MEMORY |= {name: _reduction(name) for name in REDUCTIONS}
+IN_MEMORY |= {"dot_general": _dot_general}

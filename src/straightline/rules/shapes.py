@@ -1,0 +1,133 @@
+"""Rules of operations that move entries: they rearrange references and make no nodes."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.graph import Graph
+from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape
+from straightline.nodes import Node, Unsupported
+
+FEW = 16  # places that a number found in the data may choose among, one comparison each
+
+
+def _moved(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
+    """Make a rule of one array: function(array, parameters, shape of the result)."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        return [function(inputs[0], equation.params, result_shape(equation))]
+
+    return rule
+
+
+def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
+    placed = [1] * len(shape)
+    for size, axis in zip(x.shape, params["broadcast_dimensions"], strict=True):
+        placed[axis] = size
+    return np.broadcast_to(x.reshape(placed), shape)
+
+
+def _slice(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
+    steps = params["strides"] or (1,) * x.ndim
+    return x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
+
+
+def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    ends = np.cumsum(equation.params["sizes"])[:-1]
+    return np.split(inputs[0], ends, axis=equation.params["axis"])
+
+
+def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    return [np.concatenate(inputs, axis=equation.params["dimension"])]
+
+
+def _stack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    return [np.stack(inputs, axis=equation.params["axis"])]
+
+
+def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    rows = np.moveaxis(inputs[0], equation.params["axis"], 0)
+    return [rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows))]
+
+
+def _pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    x, filling = inputs
+    padded = np.empty(result_shape(equation), dtype=object)
+    padded[...] = filling[()]
+    sources, targets = [], []
+    for size, bound, (low, _, inner) in zip(x.shape, padded.shape, equation.params["padding_config"], strict=True):
+        at = low + np.arange(size) * (1 + inner)
+        inside = (at >= 0) & (at < bound)
+        sources.append(np.flatnonzero(inside))
+        targets.append(at[inside])
+    padded[np.ix_(*targets)] = x[np.ix_(*sources)]
+    return [padded]
+
+
+def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
+    shape, axis = result_shape(equation), equation.params["dimension"]
+    along = np.arange(shape[axis]).astype(equation.params["dtype"])
+    return [lowering.known(np.broadcast_to(along.reshape([-1 if d == axis else 1 for d in range(len(shape))]), shape))]
+
+
+def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
+    """Memory that a loop fills, as the transpose of a scan begins with: zeros."""
+    return [lowering.known(np.zeros(result_shape(equation), equation.params["dtype"]))]
+
+
+def chosen(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
+    """One of several arrays, the first for numbers below 0 and the last for numbers beyond."""
+    from straightline.rules.elementwise import select
+
+    selected = cases[-1]
+    for number, case in reversed(list(enumerate(cases[:-1]))):
+        here = graph.node("le", "bool", which, graph.constant(number, which.type))
+        pairs = zip(case.ravel().tolist(), selected.ravel().tolist(), strict=True)
+        selected = array_of([select(graph, here, a, b) for a, b in pairs], case.shape)
+    return selected
+
+
+def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    x, update, starts = inputs[0], inputs[1], [lowering.scalar(s) for s in inputs[2:]]
+    for axis, start in enumerate(starts):
+        last = x.shape[axis] - update.shape[axis]
+        if last and start.op != "constant":
+            if last >= FEW:
+                raise Unsupported(f"one of {last + 1} places that data decide")
+            known = [s if a != axis else None for a, s in enumerate(starts)]
+            cases = [_updated(lowering, x, update, known, first) for first in range(last + 1)]
+            return [chosen(lowering.graph, start, cases)]
+    return [_updated(lowering, x, update, starts, 0)]
+
+
+def _updated(
+    lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: Sequence[Node | None], here: int
+) -> np.ndarray:
+    """Apply an update at known starts, `here` along the axis whose start is not known."""
+    at = []
+    for size, whole, start in zip(update.shape, x.shape, starts, strict=True):
+        if start is not None and start.op != "constant" and whole > size:
+            raise Unsupported("two places that data decide")
+        first = here if start is None else 0 if whole == size else int(start.value)
+        first = min(max(first, 0), whole - size)
+        at.append(slice(first, first + size))
+    updated = x.copy()
+    updated[tuple(at)] = update
+    return updated
+
+
+RULES |= {
+    "broadcast_in_dim": _moved(_broadcast_in_dim),
+    "reshape": _moved(lambda x, params, shape: x.reshape(shape)),
+    "squeeze": _moved(lambda x, params, shape: x.reshape(shape)),
+    "expand_dims": _moved(lambda x, params, shape: x.reshape(shape)),
+    "transpose": _moved(lambda x, params, shape: np.transpose(x, params["permutation"])),
+    "rev": _moved(lambda x, params, shape: np.flip(x, params["dimensions"])),
+    "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
+    "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
+    "unstack": _unstack, "pad": _pad,
+    "iota": _iota, "empty": _empty, "empty2": _empty,
+    "dynamic_update_slice": _dynamic_update_slice,
+}  # fmt: skip

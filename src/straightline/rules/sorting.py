@@ -1,0 +1,41 @@
+"""Rule of sort: few numbers by odd-even transposition, without branches."""
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.graph import Graph
+from straightline.lowering import RULES, Lowering, type_of
+from straightline.nodes import Node, Unsupported
+from straightline.rules.elementwise import select
+
+SORTED = 20  # numbers: more are many comparisons
+
+
+def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Sort along an axis by the first array, and what comes with it; equal numbers keep their order, NaN is last."""
+    axis, graph = equation.params["dimension"], lowering.graph
+    count, kind = inputs[0].shape[axis], type_of(equation.invars[0].aval)
+    if equation.params["num_keys"] != 1 or kind == "bool" or count > SORTED:
+        raise Unsupported("sort")
+    moved = [np.moveaxis(x, axis, -1).copy() for x in inputs]
+    for index in np.ndindex(*moved[0].shape[:-1]):
+        rows = [x[index] for x in moved]
+        for turn in range(count):
+            for i in range(turn % 2, count - 1, 2):
+                wrong = _wrong(graph, rows[0][i], rows[0][i + 1])
+                for row in rows:
+                    a, b = row[i], row[i + 1]
+                    row[i], row[i + 1] = select(graph, wrong, b, a), select(graph, wrong, a, b)
+    return [np.moveaxis(x, -1, axis) for x in moved]
+
+
+def _wrong(graph: Graph, a: Node, b: Node) -> Node:
+    """Return whether a belongs behind b."""
+    larger = graph.node("gt", "bool", a, b)
+    if a.type != "f64":
+        return larger
+    number, missing = graph.node("eq", "bool", b, b), graph.node("ne", "bool", a, a)
+    return graph.node("or", "bool", larger, graph.node("and", "bool", missing, number))
+
+
+RULES |= {"sort": _sort}

@@ -1,0 +1,202 @@
+"""Rules of special functions by their series: incomplete gamma functions, Bessel functions, the digamma function."""
+
+from collections.abc import Callable
+from fractions import Fraction
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn
+
+from straightline.lowering import IN_MEMORY, Lowering, Value, like
+from straightline.nodes import Unsupported
+
+EPSILON = float(np.finfo(np.float64).eps)
+FAR = 30.0  # the argument of a Bessel function from which its asymptotic series has all digits
+BERNOULLI = [1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160]  # B_2n / (2 n)
+TINY = float(np.finfo(np.float64).tiny) / EPSILON
+LARGE, TERMS = 2000.0, 20  # the shape from which gamma masses are expanded, to a^-3, and the terms of a coefficient
+TURNS = 5000  # of a series or a fraction, several times as many as it takes
+Quotients = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # turn, Lentz's C and D, value, last change
+
+
+def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P; NaN below zero.
+
+    P = x^a e^-x / Gamma(a) sum_n x^n / (a (a + 1) ... (a + n)) converges fast below a + 1; above it Q's fraction does,
+    x^a e^-x / Gamma(a) / (x + 1 - a - 1 (1 - a) / (x + 3 - a - ...)), evaluated from the front.
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31; Lentz, Generating Bessel
+    functions in Mie scattering calculations using continued fractions (1976).
+    """
+    valid = (a > 0) & (x >= 0)
+    large, whole, at_zero = a > LARGE, x, (a == 0) & (x > 0)
+    by_expansion = large_masses(a, x)
+    a, x = jnp.where(large | ~valid, 1.0, a), jnp.where(large | ~valid, 1.0, x)
+    above = x > a + 1
+    density = jnp.exp(a * jnp.log(x) - x - jax.lax.lgamma(a))
+
+    # Below the mean the series; each loop ends at once where the other serves.
+    def add(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        shape, term, total = state
+        term = term * x / (shape + 1)
+        return shape + 1, term, total + term
+
+    first = jnp.where(above, 0.0, 1 / a)
+    lower = (
+        density * jax.lax.while_loop(lambda s: (s[1] > EPSILON * s[2]) & (s[0] < a + TURNS), add, (a, first, first))[2]
+    )
+
+    # Above it the continued fraction by Lentz's two quotients C and D.
+    def continue_fraction(state: Quotients) -> Quotients:
+        n, c, d, fraction, _ = state
+        numerator, b = n * (a - n), x + 2 * n + 1 - a
+        c, d = b + numerator / c, 1 / _apart(b + numerator * d)
+        return n + 1, _apart(c), d, fraction * c * d, jnp.abs(c * d - 1)
+
+    start = 1 / jnp.where(above, x + 1 - a, 1.0)
+    state = (jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
+    upper = density * jax.lax.while_loop(lambda s: (s[4] > EPSILON) & (s[0] < TURNS), continue_fraction, state)[3]
+
+    # Both masses, the smaller one to all its digits.
+    below = jnp.where(x == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
+    beyond = jnp.where(above & (x < jnp.inf), upper, 1 - below)
+    p, q = (jnp.where(large & (whole < jnp.inf), e, y) for e, y in zip(by_expansion, (below, beyond), strict=True))
+    p, q = jnp.where(whole == jnp.inf, 1.0, p), jnp.where(whole == jnp.inf, 0.0, q)
+    # A law of shape 0 is all at 0.
+    p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
+    return jnp.where(valid | at_zero, p, jnp.nan), jnp.where(valid | at_zero, q, jnp.nan)
+
+
+def large_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute P(a, x) and Q(a, x) of a large shape a, in which the series above would take many terms.
+
+    With y^2 / 2 = m - log(1 + m), m = x / a - 1, y of the sign of m,
+    Q = erfc(y root(a / 2)) / 2 + e^(-a y^2 / 2) / root(2 pi a) (c_0(y) + c_1(y) / a + c_2(y) / a^2), P = 1 - Q.
+
+    Source: Temme, The asymptotic expansion of the incomplete gamma functions (1979); DLMF 8.12.3, 8.12.4.
+    """
+    m = jnp.clip((x - a) / a, -0.9, 3.0)  # beyond, the smaller mass is below all numbers
+    # m - log(1 + m) = m s - 2 (s^3 / 3 + s^5 / 5 + ...), s = m / (2 + m).
+    s = m / (2 + m)
+    tail = jnp.zeros_like(m)
+    for n in range(27, 1, -2):
+        tail = (tail + 1 / n) * s * s
+    half = jnp.where(jnp.abs(m) < 0.4, m * s - 2 * s * tail, m - jnp.log1p(m))
+    y = jnp.where(m < 0, -1.0, 1.0) * jnp.sqrt(2 * half)
+    # The three coefficients as power series of y.
+    rest = jnp.zeros_like(y)
+    for series in expansion()[::-1]:
+        value = jnp.zeros_like(y)
+        for c in series[::-1]:
+            value = value * y + c
+        rest = rest / a + value
+    rest = rest * jnp.exp(-a * half) / jnp.sqrt(2 * np.pi * a)
+    z = y * jnp.sqrt(a / 2)
+    return jax.lax.erfc(-z) / 2 - rest, jax.lax.erfc(z) / 2 + rest
+
+
+@cache
+def expansion() -> list[list[float]]:
+    """Compute the power series in y of c_0, c_1 and c_2, of `TERMS` terms.
+
+    c_0 = 1 / m - 1 / y, c_k = c_(k-1)' / y + (-1)^k g_k / m with g_1 = 1 / 12, g_2 = 1 / 288, and y (1 + m) = m m'.
+    """
+    count = TERMS + 5
+    # m = y (1 + b_1 y + b_2 y^2 + ...), and 1 / m = (1 + r_1 y + ...) / y.
+    b = [Fraction(1)]
+    for n in range(1, count):
+        known = sum((b[k] * b[n - k] * (n - k + 1) for k in range(1, n)), Fraction(0))
+        b.append((b[n - 1] - known) / (n + 2))
+    r = [Fraction(1)]
+    for n in range(1, count):
+        r.append(-sum((b[k] * r[n - k] for k in range(1, n + 1)), Fraction(0)))
+    # The poles at y = 0 cancel.
+    series = [r[1:]]
+    for sign_g in (Fraction(-1, 12), Fraction(1, 288)):
+        before = series[-1]
+        series.append([(n + 2) * before[n + 2] + sign_g * r[n + 1] for n in range(len(before) - 2)])
+    return [[float(c) for c in one[:TERMS]] for one in series]
+
+
+def _apart(x: jax.Array) -> jax.Array:
+    """Return x, a tiny number for zero."""
+    return jnp.where(x == 0, TINY, x)
+
+
+def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
+    """Compute e^-|x| I_0(x) or e^-|x| I_1(x): a power series up to |x| = 30, beyond it the asymptotic one.
+
+    I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!); of v = 0 and 1 it is e^x / root(2 pi x) (1 + sum_k a_k) with
+    a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), terms that fall to 1e-26 at 30.
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
+    """
+    size = jnp.abs(x)
+    large = size > FAR
+
+    def add(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        k, term, total = state
+        near = size * size / (4 * k * (k + order))
+        ratio = jnp.where(large, ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(large, size, 1.0)), near)
+        return k + 1, term * ratio, total + term * ratio
+
+    first = jnp.where(large | (order == 0), 1.0, size / 2)
+    total = jax.lax.while_loop(lambda s: jnp.abs(s[1]) > EPSILON / 8 * s[2], add, (jnp.ones_like(x), first, first))[2]
+    scale = jnp.where(large, 1 / jnp.sqrt(2 * np.pi * jnp.where(large, size, 1.0)), jnp.exp(-size))
+    value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
+    return jnp.where(x < 0, -value, jnp.where(x == 0, x, value)) if order else value
+
+
+def digamma(x: jax.Array) -> jax.Array:
+    """Compute the derivative of log Gamma(x): at 10 and more from its asymptotic series, to which a recurrence leads.
+
+    psi(x) = psi(x + 1) - 1 / x = log x - 1 / (2 x) - sum_n B_2n / (2 n x^2n), psi(x) = psi(1 - x) - pi / tan(pi x).
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.3.5, 6.3.7 and 6.3.18.
+    """
+    mirrored = x <= 0
+    at = jnp.where(mirrored, 1 - x, x)
+    passed = jnp.zeros_like(x)
+    for _ in range(10):
+        low = at < 10
+        passed, at = passed + jnp.where(low, 1 / at, 0.0), jnp.where(low, at + 1, at)
+    square, tail = 1 / (at * at), jnp.zeros_like(x)
+    for coefficient in BERNOULLI[::-1]:
+        tail = (tail + coefficient) * square
+    value = jnp.log(at) - 0.5 / at - tail - passed
+    nearest = x - jnp.round(x)
+    turned = np.pi / jnp.tan(np.pi * jnp.where(nearest == 0, 1.0, nearest))
+    return jnp.where(mirrored, jnp.where(nearest == 0, jnp.nan, value - turned), value)
+
+
+def _masses(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    both = _inlined(gamma_masses, lowering, equation, inputs)
+    return [both[equation.primitive.name == "igammac"]]
+
+
+def _inlined(function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    avals: list[Any] = [v.aval for v in equation.invars]
+    if avals[0].dtype != np.float64:
+        raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
+    return lowering.inline(_program(function, len(avals), avals[0].shape), inputs)
+
+
+@cache
+def _program(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
+    over = function
+    for _ in shape:
+        over = jax.vmap(over)
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(over)(*[like(shape, np.float64)] * count)
+
+
+OF_ONE: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "bessel_i0e": partial(scaled_bessel, 0),
+    "bessel_i1e": partial(scaled_bessel, 1),
+    "digamma": digamma,
+}
+IN_MEMORY |= {"igamma": _masses, "igammac": _masses}
+IN_MEMORY |= {name: partial(_inlined, function) for name, function in OF_ONE.items()}

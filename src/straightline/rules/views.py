@@ -1,0 +1,199 @@
+"""Rules of operations on arrays in memory that return another view of the same memory."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, result_shape
+from straightline.memory import LONG, InMemory, contiguous
+from straightline.nodes import Buffer, Key, Node
+from straightline.rules.elementwise import PASSED_ON, select
+from straightline.rules.loops import copied, in_memory, repeated
+from straightline.rules.places import clamped, fill_of, fills, inside, narrowed
+from straightline.rules.shapes import FEW, chosen
+
+View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
+
+
+def _viewed(name: str, view: View) -> Rule:
+    """Make a rule of one array: its view, or the rearranged nodes if there is none."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        viewed = view(inputs[0], equation.params, result_shape(equation))
+        return [viewed] if viewed is not None else list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
+
+    return rule
+
+
+def _slice(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    steps = params["strides"] or (1,) * x.ndim
+    offset = sum(s * first for s, first in zip(x.strides, params["start_indices"], strict=True))
+    return x.view(shape, [s * step for s, step in zip(x.strides, steps, strict=True)], offset)
+
+
+def _reverse(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    axes = params["dimensions"]
+    offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
+    return x.view(shape, [-s if a in axes else s for a, s in enumerate(x.strides)], offset)
+
+
+def _transpose(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    return x.view(shape, [x.strides[a] for a in params["permutation"]])
+
+
+def _reshape(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory | None:
+    return x.reshaped(shape)
+
+
+def _broadcast(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    strides = [0] * len(shape)
+    for size, stride, axis in zip(x.shape, x.strides, params["broadcast_dimensions"], strict=True):
+        strides[axis] = 0 if size == 1 else stride
+    return x.view(shape, strides)
+
+
+def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    x, axis, parts, start = inputs[0], equation.params["axis"], [], 0
+    for size in equation.params["sizes"]:
+        shape = [size if a == axis else n for a, n in enumerate(x.shape)]
+        parts.append(x.view(shape, x.strides, x.strides[axis] * start))
+        start += size
+    return parts
+
+
+def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    sizes = equation.params["slice_sizes"]
+    x = indexable(lowering, inputs[0], inputs[1:])
+    if not isinstance(x, InMemory):
+        return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
+    offset, moves = 0, []
+    for axis, start in enumerate(inputs[1:]):
+        first = clamped(lowering, lowering.scalar(start), x.shape[axis] - sizes[axis])
+        if isinstance(first, int):
+            offset += x.strides[axis] * first
+        else:
+            moves.append((x.strides[axis], first))
+    return [x.view(sizes, x.strides, offset, *moves)]
+
+
+def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Value]:
+    """Slice one axis after another, each start clamped so that the slice lies inside; from memory if it may be many."""
+    x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.scalar(x) for x in inputs[1:]]
+    for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
+        last = x.shape[axis] - size
+        if start.op != "constant" and last >= FEW:
+            return _dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
+        x = _window(lowering, x, axis, start, size) if last else x
+    return [x]
+
+
+def _window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
+    """Return `size` entries along an axis from a start that may depend on data."""
+    last = x.shape[axis] - size
+    cases = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
+    return (
+        cases[min(max(int(start.value), 0), last)] if start.op == "constant" else chosen(lowering.graph, start, cases)
+    )
+
+
+def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
+    """Place a table, or a long array, in memory, since data or a loop's counter select its entries."""
+    nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
+    if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
+        return x
+    flat = x.ravel().tolist()
+    if any(isinstance(n, Key) for n in flat) or not (len(flat) > FEW or all(n.op == "constant" for n in flat)):
+        return x
+    return in_memory(lowering, x)
+
+
+def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Gather x[i, j, ...] of whole rows as a view, where no other value fills what is outside; others use nodes."""
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
+    indices = narrowed(lowering, indices) if fills(equation) else indices
+    x = indexable(lowering, inputs[0], [indices])
+    if not isinstance(x, InMemory) or indices.size != len(axes) or numbers.operand_batching_dims:
+        return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
+    offset, moves, flag = 0, [], lowering.graph.constant(True, "bool")
+    for axis, start in zip(axes, indices.ravel().tolist(), strict=True):
+        last = x.shape[axis] - sizes[axis]
+        first = clamped(lowering, start, last)
+        flag = lowering.graph.node("and", "bool", flag, inside(lowering.graph, start, last))
+        if isinstance(first, int):
+            offset += x.strides[axis] * first
+        else:
+            moves.append((x.strides[axis], first))
+    left = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
+    view = x.view([sizes[a] for a in left], [x.strides[a] for a in left], offset, *moves)
+    row = view.view(result_shape(equation), _matched(view, result_shape(equation)))
+    if not fills(equation) or (flag.op == "constant" and flag.value):
+        return [row]
+    # A row that is not inside is filled with a value.
+    missing, nodes = fill_of(lowering, equation), lowering.nodes(row)
+    return [array_of([select(lowering.graph, flag, n, missing) for n in nodes.ravel().tolist()], nodes.shape)]
+
+
+def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
+    """Return strides of the same entries with axes of length 1 added."""
+    rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
+    items = iter(rest)
+    return [next(items) if n != 1 else 0 for n in shape]
+
+
+def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Concatenate along the first axis in new memory, along another axis row by row."""
+    shape, axis = result_shape(equation), equation.params["dimension"]
+    if math.prod(shape) <= LONG or not any(isinstance(x, InMemory) for x in inputs):
+        return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
+    if axis != 0:
+        parts = [in_memory(lowering, x) for x in inputs]
+
+        def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            return [], [np.concatenate([lowering.nodes(x.row(row)) for x in parts], axis=axis - 1)]
+
+        return list(repeated(lowering, shape[0], [], turn)[1])
+    return [joined(lowering, inputs, shape)]
+
+
+def joined(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
+    """Join arrays into one in memory: an array that fills its own memory is written there directly."""
+    graph = lowering.graph
+    type = next(x for x in parts if isinstance(x, InMemory)).type
+    buffer, start = Buffer("scratch", type, shape, graph.current), 0
+    for x in parts:
+        if isinstance(x, InMemory) and _is_alone(x, graph.current):
+            buffer.take_in(x.buffer, start)
+        else:
+            _copy(lowering, x, buffer, start)
+        start += x.size
+    return InMemory.whole(buffer)
+
+
+def _is_alone(x: InMemory, block: Any) -> bool:
+    """Return whether an array is all of a buffer that this block fills and that has no place in another buffer."""
+    buffer = x.buffer
+    whole = not x.moves and x.offset == 0 and x.size == buffer.size and x.strides == contiguous(x.shape)
+    return whole and buffer.kind == "scratch" and buffer.inside is None and buffer.block is block
+
+
+def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
+    graph = lowering.graph
+    if x.size <= LONG or not isinstance(x, InMemory):
+        for index, node in enumerate(lowering.nodes(x).ravel().tolist()):
+            graph.store(buffer, node, start + index, (), ())
+    else:
+        buffer.take_in(copied(lowering, x).buffer, start)
+
+
+VIEWS: dict[str, View] = {
+    "slice": _slice, "rev": _reverse, "transpose": _transpose, "reshape": _reshape, "squeeze": _reshape,
+    "expand_dims": _reshape, "broadcast_in_dim": _broadcast,
+}  # fmt: skip
+IN_MEMORY |= {name: _viewed(name, view) for name, view in VIEWS.items()}
+RULES |= {"dynamic_slice": _dynamic_slice_of_nodes}
+IN_MEMORY |= {"split": _split, "dynamic_slice": _dynamic_slice, "gather": _gather, "concatenate": _concatenate}
+IN_MEMORY |= {name: RULES[name] for name in PASSED_ON}

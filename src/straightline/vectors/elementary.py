@@ -1,0 +1,73 @@
+"""Elementary functions of vectors of doubles as text of LLVM IR, each one straight line of operations.
+
+LLVM's own intrinsics call the scalar library once for each number of a vector; these compute all numbers of a vector at
+once. Each is within 2 units of rounding of the true value over its whole range, with NaN, infinities, zeros of both
+signs and denormal numbers as in IEEE 754 and JAX. Square root and absolute value need no function.
+
+Source: the reductions and minimax polynomials of Sun's fdlibm, https://www.netlib.org/fdlibm (exp's is a Taylor series
+of one degree more than needed).
+"""
+
+from collections.abc import Callable, Iterable
+
+from straightline.vectors import error_function as error
+from straightline.vectors import exponential as exponential
+from straightline.vectors import trigonometry as trigonometry
+from straightline.vectors.formulas import Vector, function
+
+FUNCTIONS: dict[str, tuple[Callable[..., Vector], int]] = {
+    "exp": (exponential.exp, 1),
+    "expm1": (exponential.expm1, 1),
+    "log": (exponential.log, 1),
+    "log1p": (exponential.log1p, 1),
+    "tanh": (exponential.tanh, 1),
+    "sin": (trigonometry.sin, 1),
+    "cos": (trigonometry.cos, 1),
+    "atan": (trigonometry.atan, 1),
+    "atan2": (trigonometry.atan2, 2),
+    "erf": (error.erf, 1),
+    "erfc": (error.erfc, 1),
+    "erf_inv": (error.erf_inv, 1),
+}
+ATTRIBUTES = "attributes #9 = { noinline nounwind }\n"
+
+# Called for each number of a vector: seldom used, or hard to get right.
+SCALAR = {
+    "pow": 2,
+    "exp2": 1,
+    "tan": 1,
+    "asin": 1,
+    "acos": 1,
+    "sinh": 1,
+    "cosh": 1,
+    "asinh": 1,
+    "acosh": 1,
+    "atanh": 1,
+    "cbrt": 1,
+    "lgamma": 1,
+}
+
+
+def functions(names: Iterable[str], width: int) -> str:
+    """Return the text of `define internal %double @hg_NAME(%double ...)` for each name, with declarations."""
+    names = sorted(set(names))
+    scalar = [name for name in names if name in SCALAR]
+    declared = [f"declare double @{name}({', '.join(['double'] * SCALAR[name])})\n" for name in scalar]
+    texts = [_by_number(name, width) if name in SCALAR else function(name, *FUNCTIONS[name]) for name in names]
+    return "\n".join([*declared, *texts, ATTRIBUTES])
+
+
+def _by_number(name: str, width: int) -> str:
+    """Write a function that calls the scalar library for each number."""
+    double, count = "%double", SCALAR[name]
+    lines, total = [], "poison"
+    for lane in range(width):
+        for i in range(count):
+            lines.append(f"%a{lane}_{i} = extractelement {double} %x{i}, i64 {lane}")
+        args = ", ".join(f"double %a{lane}_{i}" for i in range(count))
+        lines.append(f"%b{lane} = call double @{name}({args})")
+        lines.append(f"%r{lane} = insertelement {double} {total}, double %b{lane}, i64 {lane}")
+        total = f"%r{lane}"
+    signature = ", ".join(f"{double} %x{i}" for i in range(count))
+    body = "".join(f"  {line}\n" for line in lines)
+    return f"define internal {double} @hg_{name}({signature}) #9 {{\n{body}  ret {double} {total}\n}}\n"

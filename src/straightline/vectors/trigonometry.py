@@ -1,0 +1,134 @@
+"""Sine, cosine and the angle of a vector, on vectors of numbers."""
+
+import math
+
+from straightline.vectors.exponential import _nearest
+from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select
+
+HALF_PI = 1.57079632679489661923, 6.12323399573676603587e-17, -1.4973849048591833e-33  # pi / 2 as a sum
+LARGEST = 2.0**20  # up to which the sum above is long enough; beyond, the scalar library is called
+
+SIN = [
+    -1.66666666666666324348e-01,
+    8.33333333332248946124e-03,
+    -1.98412698298579493134e-04,
+    2.75573137070700676789e-06,
+    -2.50507602534068634195e-08,
+    1.58969099521155010221e-10,
+]
+COS = [
+    4.16666666666666019037e-02,
+    -1.38888888888741095749e-03,
+    2.48015872894767294178e-05,
+    -2.75573143513906633035e-07,
+    2.08757232129817482790e-09,
+    -1.13596475577881948265e-11,
+]
+ATAN = [
+    3.33333333333329318027e-01,
+    -1.99999999998764832476e-01,
+    1.42857142725034663711e-01,
+    -1.11111104054623557880e-01,
+    9.09088713343650656196e-02,
+    -7.69187620504482999495e-02,
+    6.66107313738753120669e-02,
+    -5.83357013379057348645e-02,
+    4.97687799461593236017e-02,
+    -3.65315727442169155270e-02,
+    1.62858201153657823623e-02,
+]
+# Where atan turns by a known angle: from, (numerator and denominator of (a x + b) / (c x + d)), the angle as a sum.
+TURNS = [
+    (7 / 16, (2.0, -1.0, 1.0, 2.0), 4.63647609000806093515e-01, 2.26987774529616870924e-17),
+    (11 / 16, (1.0, -1.0, 1.0, 1.0), 7.85398163397448278999e-01, 3.06161699786838301793e-17),
+    (19 / 16, (1.0, -1.5, 1.5, 1.0), 9.82793723247329054082e-01, 1.39033110312309984516e-17),
+    (39 / 16, (0.0, -1.0, 1.0, 0.0), 1.57079632679489655800e00, 6.12323399573676603587e-17),
+]
+
+
+def sin(x: Vector) -> Vector:
+    """Sine: that or the cosine of what is left of x beyond the nearest multiple of pi / 2."""
+    quarter, r, low = _turned(x)
+    value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
+    value = select((quarter & 2).equals(0), value, -value)
+    return _of_any_size(x, select(abs(x) < 2.0**-27, x, value), "sin")
+
+
+def cos(x: Vector) -> Vector:
+    """Cosine: the sine a quarter further."""
+    quarter, r, low = _turned(x)
+    value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
+    value = select(((quarter + 1) & 2).equals(0), value, -value)
+    return _of_any_size(x, value, "cos")
+
+
+def _turned(x: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return the number of quarter turns in x, and the rest as a sum; the first difference is exact."""
+    quarter, n = _nearest(x * (2 / math.pi))
+    first = fma(n, -HALF_PI[0], x)
+    # first - n HALF_PI[1] as a sum: the product and the difference each with what rounding takes from it.
+    product = n * HALF_PI[1]
+    second = first - product
+    taken = second - first
+    lost = (first - (second - taken)) - (product + taken)
+    rest = lost - fma(n, HALF_PI[1], -product) - n * HALF_PI[2]
+    r = second + rest
+    return quarter, r, (second - r) + rest
+
+
+def _sin(x: Vector, low: Vector) -> Vector:
+    """sin(x + low), |x| <= pi / 4."""
+    z = x * x
+    v = z * x
+    r = polynomial(z, SIN[1:])
+    return x - ((z * (0.5 * low - v * r) - low) - v * SIN[0])
+
+
+def _cos(x: Vector, low: Vector) -> Vector:
+    """cos(x + low), |x| <= pi / 4."""
+    z = x * x
+    half = 0.5 * z
+    w = 1 - half
+    return w + (((1 - w) - half) + (z * (z * polynomial(z, COS)) - x * low))
+
+
+def _of_any_size(x: Vector, value: Vector, name: str) -> Vector:
+    """Return the value where |x| is small enough for it, else that of the scalar library, if a lane needs it."""
+    return x.body.where_any(abs(x) >= LARGEST, lambda: x.body.call(name, x), value)
+
+
+def atan(x: Vector) -> Vector:
+    """Arcus tangent: a known angle and that of (x - tan angle) / (1 + x tan angle)."""
+    return copy_sign(_positive_atan(abs(x)), x)
+
+
+def _positive_atan(x: Vector) -> Vector:
+    # A large x takes the place of infinity, which times 0 is none.
+    x = select(x > 2.0**66, 2.0**66, x)
+    over: tuple[Vector | float, ...] = (1.0, 0.0, 0.0, 1.0)
+    high: Vector | float = 0.0
+    low: Vector | float = 0.0
+    for start, turned, angle, rest in TURNS:
+        beyond = x >= start
+        over = tuple(select(beyond, new, old) for new, old in zip(turned, over, strict=True))
+        high, low = select(beyond, angle, high), select(beyond, rest, low)
+    a, b, c, d = over
+    t = fma(x, a, b) / fma(x, c, d)
+    z = t * t
+    return high - ((t * (z * polynomial(z, ATAN)) - low) - t)
+
+
+def atan2(y: Vector, x: Vector) -> Vector:
+    """The angle of (x, y) in (-pi, pi]."""
+    ratio = abs(y / x)
+    both = abs(x).equals(abs(y))
+    # 0/0 and infinity/infinity: along an axis, or a diagonal.
+    ratio = select(both, select(y.equals(0.0), 0.0, 1.0), ratio)
+    angle = _positive_atan(ratio)
+    behind = x.as_type("i64") < 0
+    angle = select(behind, math.pi - (angle - 1.2246467991473531772e-16), angle)
+    return copy_sign(select(_is_number(x) & _is_number(y), angle, math.nan), y)
+
+
+def _is_number(x: Vector) -> Vector:
+    return x.equals(x)

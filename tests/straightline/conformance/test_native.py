@@ -1,0 +1,202 @@
+"""Native code means what JAX means: every operation that it takes, on edge values, against XLA.
+
+The cases are made of the table of rules, so that a new rule is covered by being there. What may differ, and why:
+
+* Subnormal numbers, which XLA's code takes for zeros, and native code computes with (`difference`): arguments of the
+  table and results are held against NumPy instead (`test_subnormal.py`).
+* Eigenvectors, of which any sign, and of equal eigenvalues any basis, is right: V diag(w) V', V'V and v v' of separate
+  eigenvalues are compared (`matrices.py`).
+* Bits of NaN.
+* Units of rounding of functions, which both compute in their own way, and of sums and products, in their own order
+  and with a product and a sum rounded once (`Case.units`). XLA's cosh, sinh and exp2 of large numbers have 14 digits,
+  its cbrt of powers of two 14, and its lgamma is off beside its zeros.
+* A term of a matrix product in which data meet a known zero. Native code has no such term, so that NaN and infinity
+  pass only to what depends on them; XLA makes 0 NaN = NaN (`PRODUCTS`; `rules/test_matrices.py` says what is right).
+* The sign of a sum that is zero: XLA drops a known 0 that is added to -0, as native code does, and begins some sums
+  with a 0 that others do not have (`ADDED`).
+"""
+
+import sys
+import warnings
+from itertools import product
+from typing import Any
+
+import jax.extend.core
+import numpy as np
+import pytest
+
+from straightline.compiled import Compiled
+from straightline.lowering import IN_MEMORY, RULES, traced
+from straightline.nodes import Unsupported
+from tests.straightline.conformance import arrays, elementwise, matrices, programs
+from tests.straightline.conformance.case import Case
+from tests.straightline.conformance.engines import by_known, by_lanes, by_xla, difference, program_of
+
+CASES = arrays.CASES | elementwise.CASES | matrices.CASES | programs.CASES
+ADDED = {"add", "sub", "add_any", "reduce_sum", "cumsum", "dot_general", "scatter-add", "scatter_add", "scatter-sub"}
+PRODUCTS = {"dot_general"}
+RULES_OF_ALL = sorted({*RULES, *IN_MEMORY})
+MOST = 12  # cases of an operation
+ONE_AT_A_TIME = {
+    "scan",
+    "while",
+    "cond",
+    "random_gamma",
+    "eigh",
+    "igamma",
+    "igammac",
+}  # loops, of which a lane is one run
+# Of other releases of JAX, or without a function of its own.
+LATER = {
+    "closed_call",
+    "eq_to",
+    "polynomial",
+    "one_minus_square",
+    "log2",
+    "empty",
+    "empty2",
+    "call_hi_primitive",
+    "copy_p",
+    "pjit",
+    "core_call",
+}
+
+
+def primitives() -> set[str]:
+    """The operations of this release of JAX, and the library's own."""
+    modules = [m for name, m in list(sys.modules.items()) if name.startswith(("jax", "heliograph.")) and m is not None]
+    return {v.name for m in modules for v in vars(m).values() if isinstance(v, jax.extend.core.Primitive)}
+
+
+def operations(jaxpr: Any) -> set[str]:
+    """The operations of a traced program and of those inside it."""
+    names = set()
+    for equation in jaxpr.eqns:
+        names.add(equation.primitive.name)
+        for param in equation.params.values():
+            for inner in param if isinstance(param, tuple | list) else (param,):
+                inner = getattr(inner, "jaxpr", inner)
+                names |= operations(inner) if hasattr(inner, "eqns") else set()
+    return names
+
+
+def some(cases: list[Case], most: int) -> list[Case]:
+    """So many of the cases at most, spread over the table."""
+    return cases[:: -(-len(cases) // most)] if cases else []
+
+
+def thinned(case: Case, most: int) -> Case:
+    """So many runs of a case at most, spread over its runs."""
+    step = -(-case.runs // most)
+    return case._replace(arguments=tuple(a[::step] for a in case.arguments))
+
+
+def finite(case: Case) -> Case:
+    """A case with halves in place of NaN and infinities."""
+    return case._replace(
+        arguments=tuple(np.where(np.isfinite(a), a, 0.5) if a.dtype == np.float64 else a for a in case.arguments)
+    )
+
+
+def compare(
+    name: str, cases: list[Case], results: list[np.ndarray], expected: list[list[np.ndarray]], how: str
+) -> None:
+    """All leaves of all cases."""
+    leaves = [(case, e) for case, one in zip(cases, expected, strict=True) for e in one]
+    for (case, e), result in zip(leaves, results, strict=True):
+        if name in ADDED and e.dtype == np.float64:
+            result, e = result + 0.0, e + 0.0
+        differs = difference(result, e, case.units)
+        runs = np.unique(np.nonzero(differs)[0]) if differs.ndim else []
+        shown = [([a[r] for a in case.arguments], result[r], e[r]) for r in runs[:2]]
+        assert not np.any(differs), f"{name} {case.label} {how}: {shown}"
+
+
+def taken(name: str, cases: list[Case]) -> list[Case]:
+    """The cases that native code takes; no rule may fail in any other way than by refusing."""
+    kept = []
+    for case in cases:
+        try:
+            Compiled(program_of([thinned(case, 1)]), [True] * len(case.arguments))
+        except Unsupported:
+            continue
+        kept.append(case)
+    return kept
+
+
+@pytest.mark.parametrize("name", RULES_OF_ALL)
+def test_every_rule_has_cases_in_which_it_is_used(name):
+    if name not in primitives():
+        pytest.skip("an operation of other releases of JAX")
+    assert CASES.get(name), f"cases of {name}"
+    if name not in LATER:
+        seen = set[str]()
+        for case in CASES[name]:
+            seen |= operations(traced(case.function, *case.row(0))[0].jaxpr)
+            if name in seen:
+                return
+        raise AssertionError(f"{name} in its cases: {sorted(seen)}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RULES_OF_ALL)
+def test_a_rule_computes_what_xla_computes(name):
+    """Of data, each run a lane and all in one program; of known numbers; and of both."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        cases = taken(name, some(CASES.get(name, []), MOST))
+        expected = by_xla(cases)
+        for case, e in zip(cases, expected, strict=True):
+            compare(name, [case], by_lanes(case), [e], "in lanes")
+        if name in ONE_AT_A_TIME:
+            return
+        arity = max((len(case.arguments) for case in cases), default=0)
+        few = [thinned(case, 30) for case in cases]
+        tables = {False: few, True: [finite(case) for case in few]}
+        expected = {only_finite: by_xla(tables[only_finite]) for only_finite in {False, name in PRODUCTS}}
+        for known in product((False, True), repeat=arity):
+            meets_zeros = name in PRODUCTS and len(set(known)) == 2
+            try:
+                compare(
+                    name,
+                    tables[meets_zeros],
+                    by_known(tables[meets_zeros], known),
+                    expected[meets_zeros],
+                    f"known: {known}",
+                )
+            except Unsupported:
+                continue
+
+
+DAILY = (
+    "add",
+    "sub",
+    "neg",
+    "max",
+    "min",
+    "sign",
+    "div",
+    "rem",
+    "convert_element_type",
+    "cholesky",
+    "lu",
+    "dot_general",
+)
+
+
+@pytest.mark.parametrize("name", DAILY)
+def test_the_commonest_rules_compute_what_xla_computes(name):
+    """Some runs of some cases, of data and of known numbers."""
+    cases = [thinned(case, 12) for case in some(CASES[name], 6)]
+    cases, expected = taken(name, cases), by_xla(cases)
+    for known in ((False,) * 4, (True,) * 4):
+        compare(name, cases, by_known(cases, known), expected, f"known: {known[0]}")
+
+
+@pytest.mark.parametrize("name", [name for name in elementwise.FOURTEEN_DIGITS if name != "lgamma"])
+def test_native_code_has_all_digits_where_xla_has_fourteen(name):
+    (case,) = (case for case in CASES[name] if case.arguments[0].dtype == np.float64)
+    with np.errstate(all="ignore"):
+        exact = getattr(np, name)(case.arguments[0])
+    compare(name, [case], by_lanes(case), [[exact]], "beside NumPy")
+    assert not np.any(difference(by_lanes(case)[0], exact, 4.0))

@@ -1,0 +1,38 @@
+"""Arithmetic on long arrays in memory, row by row."""
+
+import jax
+import numpy as np
+import pytest
+
+from heliograph.engine.choice import chosen, engine_of
+
+RANDOM = np.random.default_rng(0)
+RUNS = 3
+COVARIANCES, APART = RANDOM.normal(size=(RUNS, 2, 9, 9)), RANDOM.normal(size=(RUNS, 2, 2, 9, 9))
+FUNCTIONS = {
+    "one row for all": lambda p, a: jax.lax.add(a, p[:, None]).sum(0),
+    "the only one": lambda p, a: p[:1] - a[0],
+    "a number for all": lambda p, a: p[0, 1, 1] * p[1] + a[0, 0],
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_what_has_one_row_or_fewer_axes_is_that_of_each_row(name):
+    """As of JAX, to rounding of sums of two numbers of size 10: 1e-14."""
+    function = FUNCTIONS[name]
+    with jax.enable_x64(True):
+        computed = chosen(function, [COVARIANCES, APART], [True, True]).results()
+        expected = np.stack(
+            [function(p, a) for p, a in zip(*map(jax.numpy.asarray, (COVARIANCES, APART)), strict=True)]
+        )
+    assert np.max(np.abs(computed - expected)) < 1e-14
+
+
+def test_a_table_with_numbers_that_are_written_out_is_written_out_too():
+    """Of the upper triangle of x x', mirrored, only that is computed: of 9 numbers, 45 products and sums."""
+
+    def mirrored(x):
+        square = x[:, None] * x[None]
+        return jax.numpy.where(np.triu(np.ones((9, 9), bool)), square + x[0], (square + x[0]).T)
+
+    assert engine_of(mirrored, RANDOM.normal(size=(RUNS, 9))) == "native: 99 operations"

@@ -1,0 +1,41 @@
+"""The package stands alone: it imports nothing of heliograph, and whoever uses it needs its public names alone."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import straightline
+
+SOURCE = Path(straightline.__file__).parent
+
+
+def imported(path: Path) -> set[str]:
+    """First parts of the modules that a file imports."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+def test_it_imports_nothing_of_heliograph():
+    files = sorted(SOURCE.rglob("*.py"))
+    assert len(files) > 30
+    others = {path.name: sorted(n for n in imported(path) if n.startswith("heliograph")) for path in files}
+    assert not {name: found for name, found in others.items() if found}
+
+
+def test_it_compiles_where_there_is_no_heliograph():
+    program = """
+import sys
+sys.modules["heliograph"] = None  # importing it fails
+import jax.numpy as jnp, numpy as np, straightline
+code = straightline.compile(lambda x: jnp.sin(x) @ x, np.ones(2))
+print(float(code(np.ones((3, 2)))[2]))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert abs(float(done.stdout) - 1.682941969615793) < 1e-15
