@@ -6,6 +6,7 @@ A model's moments are plain numbers in ordinary use, and functions of traced par
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import Any
 
 import jax
@@ -27,34 +28,62 @@ def is_traced(*values: object) -> bool:
     )
 
 
-def warn_of_single(name: str, value: object) -> None:
-    """Warn of an array of single precision with an entry that was rounded to it, as JAX makes 0.1 by default.
+DOUBLE = "with np.asarray, or after jax.config.update('jax_enable_x64', True)"
+MEANT_BITS = 12  # of a number of fewer, such as 2^-30, all are meant, whatever its shortest decimal is
 
-    The double that the shortest decimal of an entry means, which the user will have written, is another number then.
+
+def rounded_to_single(value: object) -> tuple[float, float] | None:
+    """Return the first number of an array that was rounded to single precision, as it was meant and as it is.
+
+    Known by its value, in double precision too: it is a number of single precision of many bits, and the shortest
+    decimal that single precision takes for it, which a user will have written, is another double. None if none is.
     """
+    numbers: np.ndarray = np.asarray(value)
+    if numbers.dtype.kind != "f":
+        return None
+    finite = numbers[np.isfinite(numbers)].astype(float)
+    with np.errstate(over="ignore", under="ignore"):
+        single = finite.astype(np.float32)
+    meant = single.astype(str).astype(float)
+    bits = np.frexp(finite)[0] * 2.0**MEANT_BITS
+    (rounded,) = np.nonzero((single == finite) & (meant != finite) & (bits != np.floor(bits)))
+    return (float(meant[rounded[0]]), float(finite[rounded[0]])) if len(rounded) else None
+
+
+def warn_of_single(name: str, value: object) -> None:
+    """Warn, once in a process, of an array of single precision with a number that was rounded, as JAX makes 0.1."""
     if isinstance(value, jax.core.Tracer) or getattr(value, "dtype", None) != np.float32:
         return
-    numbers: np.ndarray = np.asarray(value)
-    finite = numbers[np.isfinite(numbers)]
-    meant = finite.astype(str).astype(float)
-    rounded = np.flatnonzero(meant != finite)
-    if len(rounded):
-        example = f"{meant[rounded[0]]:g} in it is {float(finite[rounded[0]]):.10g}"
-        warnings.warn(
-            f"{name}: expected double precision, got a JAX array of single precision of shape {numbers.shape}, "
-            f"{example}; make it with np.asarray, or after jax.config.update('jax_enable_x64', True)",
-            stacklevel=2,
-        )
+    rounded = rounded_to_single(value)
+    if rounded is not None:
+        got = f"a JAX array of single precision of shape {np.asarray(value).shape}"
+        _say(f"{name}: expected double precision, got {got}, {in_single(rounded)}; make it {DOUBLE}")
+
+
+def in_single(rounded: tuple[float, float]) -> str:
+    """Return in words which number was meant, and which it is."""
+    return f"{rounded[0]:g} is {rounded[1]:.10g}"
+
+
+@cache
+def _say(text: str) -> None:
+    warnings.warn(text, stacklevel=4)
+
+
+def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[Any], tuple[int, ...]]:
+    """Trace a function in double precision; return the arrays that it holds, and the shape of its result."""
+    with jax.enable_x64(True):
+        made = jax.make_jaxpr(lambda *values: jnp.asarray(function(*values)))(*arguments)
+    shape: tuple[int, ...] = made.out_avals[0].shape
+    return list(made.consts), shape
 
 
 def traced_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
     """Return the shape of a function's result, traced in double precision; warn of arrays in it that have less."""
-    with jax.enable_x64(True):
-        made = jax.make_jaxpr(lambda *values: jnp.asarray(function(*values)))(*arguments)
-    for constant in made.consts:
+    held, shape = constants(function, *arguments)
+    for constant in held:
         if isinstance(constant, jax.Array):
             warn_of_single(name, constant)
-    shape: tuple[int, ...] = made.out_avals[0].shape
     return shape
 
 

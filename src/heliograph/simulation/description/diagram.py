@@ -12,7 +12,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import in_single, is_traced
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, fold, memories
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine
@@ -20,6 +20,7 @@ from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes
 from heliograph.simulation.claims import beliefs
+from heliograph.simulation.description.single import rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
 from heliograph.simulation.shared_fading import memory_places
 
@@ -53,6 +54,7 @@ def diagram(network: HasNodes) -> list[Part]:
             words = f"{type(fusion.rule).__name__} of {fusion.filter!r} of {listed(network.nodes_with(fusion.filter))}"
         parts.append(Part(f"fused {name}", f"{words} ({claims[FUSED][name]})"))
     parts += [Part("shared", words) for words in shared(network)]
+    parts += [Part("digits", words) for words in rounded_in_words(network)]
     return [Part(visible(line.name), visible(line.words)) for line in parts]
 
 
@@ -95,6 +97,14 @@ def shared(network: HasNodes) -> list[str]:
             nodes.setdefault(row, []).append(name)
             names[row] = type(memory).__name__ if memory.name is None else repr(memory.name)
     return [f"fading {names[row]}: {listed(of)}" for row, of in nodes.items() if len(of) > 1]
+
+
+def rounded_in_words(network: HasNodes) -> list[str]:
+    """Return which numbers came in rounded to single precision, with the parts that hold them."""
+    return [
+        f"rounded to single precision before they came in: {in_single(rounded)} ({listed(names)})"
+        for rounded, names in rounded_parts(network).items()
+    ]
 
 
 def listed(names: Sequence[str]) -> str:

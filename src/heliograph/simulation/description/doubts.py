@@ -16,10 +16,11 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import InputError
+from heliograph.numerics.traced import DOUBLE
 from heliograph.numerics.types import Float
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
-from heliograph.simulation.description.diagram import listed, shared
+from heliograph.simulation.description.diagram import listed, rounded_in_words, shared
 from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import wide_at_the_start
 from heliograph.simulation.network import Network
@@ -45,6 +46,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     """
     lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network), *_other_worlds(network)]
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]
+    lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in rounded_in_words(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
     parts = separate_nodes(network)
     if len(parts) > 1:
