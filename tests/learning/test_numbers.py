@@ -7,7 +7,7 @@ from scipy import optimize
 from heliograph.learning.intervals import bartlett, block_sums, cosines, of_model, told_by_few, white
 from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.learning.ridges import confounded, product_text, rank_of, sum_text
+from heliograph.learning.unidentified import confounded, product_text, rank_of, sum_text
 from heliograph.numerics.check import POSITIVE, REAL
 
 RNG = np.random.default_rng(0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.simulation.judging import plausible_step
+from heliograph.simulation.plausible_step import plausible_step
 from heliograph.simulation.stepping import AllFilters
 from tests.live.worlds import FADING, PLANT, SENSOR, events, forgetful, moving
 

@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.lanes import Lanes
-from heliograph.simulation.side_by_side import Alike
+from heliograph.simulation.side_by_side import StackedFilters
 from tests.live import worlds
 
 SEEN = 1  # program, of the test: the filters begin by native code; there were 136
@@ -27,8 +27,8 @@ def test_a_timeline_begins_with_no_program_of_xla(caplog):
 
 def test_a_step_is_traced_once_for_its_outputs_its_code_and_its_text(monkeypatch):
     """With all measurements, and without those that are implausible: tracing is most of what beginning costs."""
-    calls, step = [], Alike.step  # of the one group of filters
-    monkeypatch.setattr(Alike, "step", lambda filters, *data: calls.append(data) or step(filters, *data))
+    calls, step = [], StackedFilters.step  # of the one group of filters
+    monkeypatch.setattr(StackedFilters, "step", lambda filters, *data: calls.append(data) or step(filters, *data))
     plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5, states=["traced here alone"])
     item = hg.kalman_filter(plant, worlds.SENSOR)
     made = Lanes(hg.Network(plant, {"a": hg.Node(worlds.SENSOR, hg.perfect(), {"f": item})})).step_rows

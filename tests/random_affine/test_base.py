@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.base import AbstractRandomAffine, fold, held_maps, holding
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack, opened
+from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, with_inner_maps
+from heliograph.random_affine.combine import GainAndNoise, Series, Stack, maps_in_series
 
 HOP = hg.hop(hg.Rayleigh(0.8), 0.1)
 RELAYED = hg.amplify_and_forward([HOP, hg.erasure(hg.hop(1.0, 0.2), 0.9)])
@@ -28,14 +28,14 @@ def test_a_map_of_another_kind_is_refused_in_one_line():
 
 
 def test_a_map_holds_others_in_place_of_its_own():
-    first, second = held_maps(RELAYED)
-    assert holding(RELAYED, [first, second]) is RELAYED
+    first, second = inner_maps(RELAYED)
+    assert with_inner_maps(RELAYED, [first, second]) is RELAYED
     louder = hg.hop(1.0, 0.5)
-    changed = holding(RELAYED, [louder, second])
-    assert type(changed) is Series and held_maps(changed) == [louder, second]
-    np.testing.assert_array_equal(holding(second, [louder]).arrival, second.arrival)
+    changed = with_inner_maps(RELAYED, [louder, second])
+    assert type(changed) is Series and inner_maps(changed) == [louder, second]
+    np.testing.assert_array_equal(with_inner_maps(second, [louder]).arrival, second.arrival)
 
 
 def test_series_are_opened_at_any_depth():
     nested = Series([HOP, Series([HOP, Series([RELAYED.maps[1]])])])
-    assert opened(nested) == [HOP, HOP, RELAYED.maps[1]] and opened(HOP) == [HOP]
+    assert maps_in_series(nested) == [HOP, HOP, RELAYED.maps[1]] and maps_in_series(HOP) == [HOP]

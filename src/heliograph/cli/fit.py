@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
-    from heliograph.learning.losses.stretches import Fates
+    from heliograph.learning.losses.fates import Fates
     from heliograph.report.fit_page import Learned
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
@@ -122,7 +122,7 @@ def _fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
 
     None of a node that nobody knows to be due: where rows are messages, of one without a rate of its own.
     """
-    from heliograph.learning.losses.stretches import fates_of_measurements, fates_of_sequence
+    from heliograph.learning.losses.fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.health import arrivals_of
 
     fates = fates_of_measurements(recording.measurements)

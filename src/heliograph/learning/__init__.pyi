@@ -22,7 +22,7 @@ from .losses.losses import (
 from .losses.shares import (
     Share as Share,
 )
-from .losses.stretches import (
+from .losses.fates import (
     fates_by_hop as fates_by_hop,
     fates_by_node as fates_by_node,
     fates_of_measurements as fates_of_measurements,

@@ -13,7 +13,7 @@ from heliograph.learning.likelihood.data import Data
 from heliograph.learning.likelihood.objective import Objective, joint_world, objectives
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
-from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
+from heliograph.learning.unidentified import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import quickly_compiled

@@ -24,7 +24,7 @@ from heliograph.learning.likelihood.search import FURTHER, Top
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.likelihood.transforms import link, unlink, unlink_slope
 from heliograph.learning.parameters import Entry, Parameters
-from heliograph.learning.ridges import Rank, rank_of
+from heliograph.learning.unidentified import Rank, rank_of
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Bool, Float
 

@@ -19,9 +19,9 @@ from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.gathering import Fused
-from heliograph.simulation.judging import reasons
+from heliograph.simulation.centres.fusions import Fused
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.plausible_step import reasons
 from heliograph.simulation.rows.row_step import NetworkStep
 from heliograph.simulation.stepping import AllFilters
 

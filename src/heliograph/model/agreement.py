@@ -21,9 +21,9 @@ from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.module import same
 from heliograph.numerics.traced import is_traced
-from heliograph.random_affine.base import AbstractRandomAffine, anonymous
+from heliograph.random_affine.base import AbstractRandomAffine, without_names
 from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known, opened
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known, maps_in_series
 from heliograph.random_affine.erasure import arrived, outcomes, second_moments
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import Modes, joint_modes
@@ -198,8 +198,8 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
     if a is b:
         return True
     if isinstance(a, AbstractRandomAffine) and isinstance(b, AbstractRandomAffine):
-        return _same_map(anonymous(a), anonymous(b), order, loses)
-    if same(anonymous(a), anonymous(b)):
+        return _same_map(without_names(a), without_names(b), order, loses)
+    if same(without_names(a), without_names(b)):
         return True
     if first(a).remembers or first(b).remembers:
         return False
@@ -229,7 +229,7 @@ def _covers(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None)
     """Test whether a channel is written like the one that is believed, its laws within the believed radius."""
     if same(a, b):
         return True
-    believed, own = opened(a), opened(b)
+    believed, own = maps_in_series(a), maps_in_series(b)
     if len(believed) != len(own) or len(own) > 1:
         return len(believed) == len(own) and all(_covers(x, y, order) for x, y in zip(believed, own, strict=True))
     match believed[0], own[0]:
@@ -322,7 +322,7 @@ def _same_observation(
     maps = [whole for observation in (a, b) if (whole := _of_state(*observation)) is not None]
     if len(maps) < 2 or is_bounded(a) != is_bounded(b):
         return False
-    return _same_map(anonymous(maps[0]), anonymous(maps[1]), order, True)
+    return _same_map(without_names(maps[0]), without_names(maps[1]), order, True)
 
 
 def _of_state(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:

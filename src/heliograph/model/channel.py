@@ -13,9 +13,9 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, held_maps, independent
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, independent, inner_maps
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
-from heliograph.random_affine.delay import Delay, Delayed, OfLine, Relayed, in_series, of_part, sent
+from heliograph.random_affine.delay import Delay, Delayed, DelayLine, Relayed, in_series, of_part, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate
@@ -188,7 +188,7 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     """
     both = independent(as_maps("stack", [relayed, direct]))
     past = max(c.past for c in both)
-    return Stack([c if c.past == past else of_part(c, sent(c), 0, past) for c in both])
+    return Stack([c if c.past == past else of_part(c, signal_size(c), 0, past) for c in both])
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
@@ -201,10 +201,10 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
         ValueError: no channels.
     """
     channels = independent(as_maps("parallel channels", channels))
-    parts, start, total, past = [], 0, sum(sent(c) for c in channels), max(c.past for c in channels)
+    parts, start, total, past = [], 0, sum(signal_size(c) for c in channels), max(c.past for c in channels)
     for c in channels:
         parts.append(of_part(c, total, start, past))
-        start += sent(c)
+        start += signal_size(c)
     return Stack(parts)
 
 
@@ -245,10 +245,10 @@ def check_link(
 
 def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
     """Raise ValueError unless a channel takes as many numbers as the sensor sends."""
-    if sent(channel) != len(sensor.outputs):
+    if signal_size(channel) != len(sensor.outputs):
         outputs = len(sensor.outputs)
         expected = f"one for the sensor's {outputs} output{'s' * (outputs > 1)}, such as perfect({outputs})"
-        raise fail("channel", expected, f"one that takes {sent(channel)}")
+        raise fail("channel", expected, f"one that takes {signal_size(channel)}")
 
 
 def received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
@@ -282,8 +282,8 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             items = zip(starts, channel.maps, strict=False)
             return tuple(int(start) + i for start, affine in items for i in carried(affine, sent))
         case Erasure() | OneStepLate() | Delayed():  # a time stamp of what is late stands after it
-            return carried(held_maps(channel)[0], sent)
-        case OfLine():  # of what was sent at each of the steps that may arrive
+            return carried(inner_maps(channel)[0], sent)
+        case DelayLine():  # of what was sent at each of the steps that may arrive
             size = channel.inputs // (1 + channel.past)
             return carried(channel.line, tuple(t * size + i for t in range(1 + channel.past) for i in sent))
         case ModeOutput():  # a class, of whatever is sent

@@ -18,7 +18,7 @@ from heliograph.numerics.check import array, fail, function, instance, names, sc
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float, renamed
-from heliograph.random_affine.delay import of_line
+from heliograph.random_affine.delay import on_delay_line
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Shaped
 
 
@@ -43,7 +43,7 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     moved: AnyPlant = at_each_step(partial(_with_line, past=first(channel).past), plant, sensor)
     n, total = len(first(plant).states), len(first(moved).states)
     everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
-    return moved, everything, of_line(channel)
+    return moved, everything, on_delay_line(channel)
 
 
 def _with_line(plant: Any, sensor: Any, past: int) -> LinearPlant:

@@ -16,10 +16,10 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
-from heliograph.random_affine.base import AbstractRandomAffine, fold, held_maps, holding
+from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, with_inner_maps
 from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Series, Stack
-from heliograph.random_affine.delay import Delayed, OfLine, sent
+from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
@@ -78,7 +78,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
 
 def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
     """The changed channel, and the position behind it; its signal is set by the series that the channel is in."""
-    inside = held_maps(channel)
+    inside = inner_maps(channel)
     match channel:
         # A hop that transmits is visited; a wire is not.
         case AbstractHop():
@@ -100,16 +100,16 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
         case ModeOutput():
             return channel, position
         # What wraps a link: inside it; the line of past signals goes into a map of the line.
-        case Erasure() | OneStepLate() | Delayed() | OfLine():
-            if isinstance(channel, OfLine) and position.signal is not None:
-                line = _line(position.signal.second, channel.inputs // sent(channel))
+        case Erasure() | OneStepLate() | Delayed() | DelayLine():
+            if isinstance(channel, DelayLine) and position.signal is not None:
+                line = _line(position.signal.second, channel.inputs // signal_size(channel))
                 position = position._replace(signal=position.signal._replace(second=line))
             link, position = _visit(inside[0], visit, position)
             visited = [link, *inside[1:]]
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
-    return holding(channel, visited), position
+    return with_inner_maps(channel, visited), position
 
 
 def _numbered(

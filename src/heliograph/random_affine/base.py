@@ -53,17 +53,17 @@ class AbstractRandomAffine(Module):
     @property
     def erases(self) -> bool:
         """True if outputs can be NaN: lost, and the receiver knows; by default, if a map among the fields erases."""
-        return any(affine.erases for affine in held_maps(self))
+        return any(affine.erases for affine in inner_maps(self))
 
     @property
     def past(self) -> int:
         """Largest delay in steps: the inputs are y_k, y_{k-1}, ..., y_{k-past}, stacked."""
-        return max((affine.past for affine in held_maps(self)), default=0)
+        return max((affine.past for affine in inner_maps(self)), default=0)
 
     @property
     def remembers(self) -> bool:
         """True if a draw depends on earlier draws; by default, if a map among the fields remembers."""
-        return any(affine.remembers for affine in held_maps(self))
+        return any(affine.remembers for affine in inner_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
         """Draw the state before the first draw; () where the map forgets."""
@@ -153,17 +153,17 @@ def _with_sizes(written: Callable[[Any, int], object]) -> Callable[[Any, int], M
     return moments
 
 
-class AbstractOfParts(AbstractRandomAffine):
+class AbstractComposite(AbstractRandomAffine):
     """Random affine map made of independent others, whose moments are linear in the law of each."""
 
     @property
     def parts(self) -> Sequence[AbstractRandomAffine]:
         """The maps that this one is made of: those among its fields."""
-        return held_maps(self)
+        return inner_maps(self)
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the same map made of others."""
-        return holding(self, parts)
+        return with_inner_maps(self, parts)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return the same map made of each combination of the parts' extremes."""
@@ -178,7 +178,7 @@ class AbstractOfParts(AbstractRandomAffine):
         return self.rebuilt(*(affine.mean_gain() for affine in self.parts))
 
 
-class AbstractOfOne(AbstractOfParts):
+class AbstractWrapper(AbstractComposite):
     """Random affine map made of one other, with its shapes and state unless it says otherwise."""
 
     @property
@@ -196,7 +196,7 @@ class AbstractOfOne(AbstractOfParts):
         return self.parts[0].init(key)
 
 
-class AbstractOfOneShape(AbstractRandomAffine):
+class AbstractUniform(AbstractRandomAffine):
     """Random affine map that is at each step one of several maps of one shape."""
 
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
@@ -218,13 +218,13 @@ class AbstractOfOneShape(AbstractRandomAffine):
             raise fail(name, "maps of one shape", shapes)
 
 
-def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+def inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the maps among a map's fields, at any depth of containers and modules, but not those inside other maps."""
     return [leaf for leaf in _fields(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
 
 
-def holding(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
-    """Return the map with these in place of its `held_maps`; itself where they are the same ones."""
+def with_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
+    """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
     leaves, tree = _fields(channel)
     among, new = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
     changed = [next(new) if is_map else leaf for is_map, leaf in zip(among, leaves, strict=True)]
@@ -243,7 +243,7 @@ def fold(
     name: str = "channel",
     expected: str = "a map of a known kind",
 ) -> T:
-    """Return the value of a channel from the values of its `held_maps`, one case for each kind of map.
+    """Return the value of a channel from the values of its `inner_maps`, one case for each kind of map.
 
     Args:
         channel: a tree of maps.
@@ -256,7 +256,7 @@ def fold(
     """
     for kind, case in cases.items():
         if isinstance(channel, kind):
-            return case(channel, [fold(affine, cases, name, expected) for affine in held_maps(channel)])
+            return case(channel, [fold(affine, cases, name, expected) for affine in inner_maps(channel)])
     raise fail(name, expected, type(channel).__name__)
 
 
@@ -325,7 +325,7 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
     return memoryless
 
 
-def anonymous(channel: T) -> T:
+def without_names(channel: T) -> T:
     """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
     held = memories(channel)
     return with_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})

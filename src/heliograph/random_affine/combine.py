@@ -15,9 +15,9 @@ from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.traced import library, placed, stacked
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import (
-    AbstractOfOneShape,
-    AbstractOfParts,
+    AbstractComposite,
     AbstractRandomAffine,
+    AbstractUniform,
     as_maps,
     check_forgets,
 )
@@ -162,7 +162,7 @@ def known(matrix: "Float[ArrayLike, 'm p']", offset: "Float[ArrayLike, ' m'] | N
 Corners = Float[jax.Array | np.ndarray, "corner rows columns"]
 
 
-class AbstractOfMaps(AbstractOfParts):
+class AbstractCombination(AbstractComposite):
     """Map made of several maps: its state is the tuple of theirs, and all of them move at each draw."""
 
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
@@ -186,7 +186,7 @@ class AbstractOfMaps(AbstractOfParts):
         return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
 
 
-class Series(AbstractOfMaps):
+class Series(AbstractCombination):
     """Series of independent maps, z = H_last ... H_2 H_1 y; E[Sym^k] is the product of the E[Sym^k].
 
     Args:
@@ -230,9 +230,9 @@ class Series(AbstractOfMaps):
         return first
 
 
-def opened(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+def maps_in_series(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the maps of a channel in series, those of series within it too; itself alone where it is none."""
-    return [m for affine in channel.maps for m in opened(affine)] if isinstance(channel, Series) else [channel]
+    return [m for affine in channel.maps for m in maps_in_series(affine)] if isinstance(channel, Series) else [channel]
 
 
 def _after(second: jax.Array, first: jax.Array) -> jax.Array:
@@ -242,7 +242,7 @@ def _after(second: jax.Array, first: jax.Array) -> jax.Array:
     return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
 
 
-class Mixture(AbstractOfOneShape, AbstractOfMaps):
+class Mixture(AbstractUniform, AbstractCombination):
     """Mixture of maps, one of them drawn at each step; moments are linear in the (possibly uncertain) weights.
 
     Args:
@@ -311,7 +311,7 @@ class Mixture(AbstractOfOneShape, AbstractOfMaps):
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)
 
 
-class Stack(AbstractOfMaps):
+class Stack(AbstractCombination):
     """Stack of independent maps of the same y, outputs one above the other; moments are products of polynomials."""
 
     maps: tuple[AbstractRandomAffine, ...]

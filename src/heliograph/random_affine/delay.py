@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, as_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
 from heliograph.random_affine.law import Discrete
@@ -24,7 +24,7 @@ Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)
 T = TypeVar("T")
 
 
-class AbstractOfLine(AbstractOfOne):
+class AbstractDelayLine(AbstractWrapper):
     """Map of the tapped delay line (y_k, y_{k-1}, ..., y_{k-past}), stacked."""
 
     @property
@@ -39,7 +39,7 @@ class AbstractOfLine(AbstractOfOne):
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return another map of the line, as late."""
-        return OfLine(parts[0], self.past)
+        return DelayLine(parts[0], self.past)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw the map of the line."""
@@ -50,7 +50,7 @@ class AbstractOfLine(AbstractOfOne):
         return self.line.moments(order)
 
 
-class OfLine(AbstractOfLine):
+class DelayLine(AbstractDelayLine):
     """A map that is given as one of the line."""
 
     plain: AbstractRandomAffine
@@ -67,7 +67,7 @@ class OfLine(AbstractOfLine):
         return self.steps
 
 
-class Delayed(AbstractOfLine):
+class Delayed(AbstractDelayLine):
     """Delayed link z_k = G_k y_{k-d} + n_k: at step k arrives what was sent d steps before.
 
     As a map of the line its mean gain is E[G] sum_d p_d S_d, where S_d selects y_{k-d}, and its spread that of the
@@ -143,30 +143,30 @@ def _chosen(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
     return known(np.pad(rows, ((0, 1), (0, 0))), np.append(np.zeros(size), float(d)))
 
 
-def of_line(channel: T) -> T:
+def on_delay_line(channel: T) -> T:
     """The channel (or all channels in a tree) as a plain map of the line."""
 
     def plain(leaf: object) -> object:
-        return leaf.line if isinstance(leaf, AbstractOfLine) else leaf
+        return leaf.line if isinstance(leaf, AbstractDelayLine) else leaf
 
-    without_line: T = jax.tree.map(plain, channel, is_leaf=lambda leaf: isinstance(leaf, AbstractOfLine))
+    without_line: T = jax.tree.map(plain, channel, is_leaf=lambda leaf: isinstance(leaf, AbstractDelayLine))
     return without_line
 
 
-def sent(channel: AbstractRandomAffine) -> int:
+def signal_size(channel: AbstractRandomAffine) -> int:
     """Numbers that are sent to a channel at each step."""
     return channel.inputs // (1 + channel.past)
 
 
 def of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
     """The channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
-    longest, size = channel.past, sent(channel)
+    longest, size = channel.past, signal_size(channel)
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
-    chosen = Series([known(np.eye((1 + past) * total)[rows]), of_line(channel) if longest else channel])
-    return OfLine(chosen, past) if past else chosen
+    chosen = Series([known(np.eye((1 + past) * total)[rows]), on_delay_line(channel) if longest else channel])
+    return DelayLine(chosen, past) if past else chosen
 
 
-class Held(AbstractOfOne):
+class DelayedLine(AbstractWrapper):
     """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
 
     A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.
@@ -214,7 +214,7 @@ class Held(AbstractOfOne):
         return (inner, receptions[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
 
-class Relayed(AbstractOfLine):
+class Relayed(AbstractDelayLine):
     """Links in series, each but the first with a random delay of what the one before delivered."""
 
     stages: tuple[AbstractRandomAffine, ...]
@@ -227,9 +227,9 @@ class Relayed(AbstractOfLine):
     @property
     def line(self) -> AbstractRandomAffine:
         """Return the stages in series, each fed by the storage of the one before."""
-        size, whole = sent(self.stages[0]), of_line(self.stages[0])
+        size, whole = signal_size(self.stages[0]), on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
-            whole = Series([Held(whole, size, stage.past), of_line(stage)])
+            whole = Series([DelayedLine(whole, size, stage.past), on_delay_line(stage)])
         return whole
 
     @property

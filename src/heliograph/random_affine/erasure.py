@@ -11,13 +11,13 @@ import numpy as np
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.traced import is_traced, plain
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
-from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, as_maps, check_forgets
 from heliograph.random_affine.combine import Series, Stack, known
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 
-class Erasure(AbstractOfOne):
+class Erasure(AbstractWrapper):
     """A map whose outputs are all lost with probability 1 - arrival, and the receiver knows: it reads NaN."""
 
     base: AbstractRandomAffine

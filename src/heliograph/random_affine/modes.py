@@ -16,13 +16,13 @@ from heliograph.numerics.traced import library, stacked
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import (
     AbstractModal,
-    AbstractOfOne,
-    AbstractOfOneShape,
     AbstractRandomAffine,
+    AbstractUniform,
+    AbstractWrapper,
     as_maps,
     check_forgets,
     given,
-    held_maps,
+    inner_maps,
     memories,
 )
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
@@ -35,7 +35,7 @@ from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
 
 
-class Modes(AbstractOfOneShape, AbstractModal):
+class Modes(AbstractUniform, AbstractModal):
     """One map for each mode of a chain: at each step it is drawn from the map of the present mode.
 
     Links that name one chain are in one mode at a time; everything else in them is independent. In series, stacked,
@@ -71,7 +71,7 @@ class Modes(AbstractOfOneShape, AbstractModal):
         return present
 
 
-class _Chosen(AbstractOfOneShape):
+class _Chosen(AbstractUniform):
     """One of several maps, by a traced index."""
 
     maps: tuple[AbstractRandomAffine, ...]
@@ -106,7 +106,7 @@ class ModeOutput(AbstractModal):
         return known(np.zeros((1, self.sent)), library(state).stack([state]))
 
 
-class OneStepLate(AbstractOfOne):
+class OneStepLate(AbstractWrapper):
     """Map of which each step receives what was drawn at the step before; NaN at the first."""
 
     base: AbstractRandomAffine
@@ -244,7 +244,7 @@ def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
             return max(degree_in(affine, identity) for affine in channel.maps)
         case Lift():
             return channel.degree * degree_in(channel.base, identity)
-    return sum(degree_in(affine, identity) for affine in held_maps(channel))
+    return sum(degree_in(affine, identity) for affine in inner_maps(channel))
 
 
 ROUNDING = 1e-12  # relative: of sums over modes that cancel

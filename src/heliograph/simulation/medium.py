@@ -22,7 +22,7 @@ from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import anonymous
+from heliograph.random_affine.base import without_names
 from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
@@ -338,4 +338,4 @@ def medium_of(network: Network) -> AbstractMedium:
 
 
 def _unnamed(channel: Channel, places: np.ndarray) -> Channel:
-    return anonymous(channel) if len(places) else channel
+    return without_names(channel) if len(places) else channel

@@ -21,7 +21,7 @@ from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.module import Module, readable
-from heliograph.random_affine.base import anonymous, check_forgets, memories
+from heliograph.random_affine.base import check_forgets, memories, without_names
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.claims import (
@@ -385,7 +385,7 @@ Network._repr_html_ = table_of  # type: ignore[attr-defined]
 def _world(node: Node | ReceivingNode) -> object:
     """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
-        return node.sensor, anonymous(node.channel), node.informed_by, node.trigger, node.predictor
+        return node.sensor, without_names(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
 
 

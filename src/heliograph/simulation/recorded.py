@@ -19,7 +19,9 @@ from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refused_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.description.wide_angles import beyond_a_turn, wide_in_rows
-from heliograph.simulation.judging import (
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node, ReceivingNode
+from heliograph.simulation.plausible_step import (
     Judges,
     any_implausible,
     doubts,
@@ -27,11 +29,9 @@ from heliograph.simulation.judging import (
     plausible_step,
     refused_rows,
 )
-from heliograph.simulation.network import Network
-from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.smoothed import Smoother, record_of, smoothed_part, with_truth
-from heliograph.simulation.stepping import AllFilters, begun
+from heliograph.simulation.stepping import AllFilters, initial_states
 from heliograph.smoothing.modes import AbstractSmoothing
 
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
@@ -223,7 +223,7 @@ def _in_parts(
     """Scan over some rows at a time, with the weights between neighbours of these computed ahead."""
     count = -(-len(u) // ROWS)
     size = -(-len(u) // count)
-    rows, states, parts = (np.arange(len(u)), u, z, arrivals), begun(filters), []
+    rows, states, parts = (np.arange(len(u)), u, z, arrivals), initial_states(filters), []
     for start in range(0, len(u), size):
         # The last row again until the part is full.
         now = np.minimum(np.arange(start, start + size), len(u) - 1)

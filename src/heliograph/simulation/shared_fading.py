@@ -12,8 +12,8 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, advance, anonymous, apply, begin, distinct, memories
-from heliograph.random_affine.delay import sent
+from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, memories, without_names
+from heliograph.random_affine.delay import signal_size
 from heliograph.simulation.draws import (
     CHANNEL,
     CHANNEL_START,
@@ -63,7 +63,7 @@ def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     """Stack channels by structure; each is looked at once, however many names have it."""
     items, memories = list(channels.values()), list(memory_places(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
-    kinds = {id(channel): anonymous(channel) for channel in {id(c): c for c in items}.values()}
+    kinds = {id(channel): without_names(channel) for channel in {id(c): c for c in items}.values()}
     alike: dict[object, dict[int, int]] = {}
     for which, kind in kinds.items():
         same = alike.setdefault(structure(kind), {})
@@ -90,7 +90,7 @@ def start(channel: Channel, key: jax.Array, source: Number, shared: Places) -> P
     now, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
     state = begin(now, link_key, keys) if len(shared) else now.init(link_key)
-    return Late(state, jnp.zeros(now.past * sent(now))) if now.past else state
+    return Late(state, jnp.zeros(now.past * signal_size(now))) if now.past else state
 
 
 def deliver(

@@ -72,7 +72,7 @@ def weighed_in(innovation: Innovation) -> Weighed | None:
     return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
 
 
-class Alike(Module):
+class StackedFilters(Module):
     """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
 
     `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes. `smooths`: each step returns its
@@ -88,7 +88,7 @@ class Alike(Module):
 
     def init(self) -> PyTree:
         """Return states before the first step, (filter and node, ...)."""
-        return over_all(started, self.count * self.nodes)(self.filters)
+        return over_all(initial_state, self.count * self.nodes)(self.filters)
 
     def step(
         self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, skip: jax.Array | None = None
@@ -117,7 +117,7 @@ class Alike(Module):
         return over_all(lambda node, state, z: read(node, state, z, u, k), self.nodes)(filters, states, z)
 
 
-def started(filter: AbstractFilter) -> PyTree:
+def initial_state(filter: AbstractFilter) -> PyTree:
     """State of a filter before the first step, on the device."""
     return jax.tree.map(jnp.asarray, filter.init())
 

@@ -20,7 +20,7 @@ from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.gathering import Fused
+from heliograph.simulation.centres.fusions import Fused
 from heliograph.simulation.network import FUSED, Claims, Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import (

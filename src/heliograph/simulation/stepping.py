@@ -27,13 +27,13 @@ from heliograph.simulation.centres.centre import (
     CentreState,
 )
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, fused_innovations
-from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of, fusions_of, gathering
+from heliograph.simulation.centres.fusions import Fused, Reporting, centres_of, fusions_of, sources_of
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
 from heliograph.simulation.centres.mesh import Mesh, meshes_of
 from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
+from heliograph.simulation.side_by_side import StackedFilters, filter_step, initial_state, over_all
 from heliograph.smoothing.backward_pass import planned_with_past
 
 
@@ -44,7 +44,7 @@ class AllFilters(Module):
     smoother steps, as do those of the kinds that do.
     """
 
-    alike: tuple[Alike, ...]
+    alike: tuple[StackedFilters, ...]
     fusions: tuple[Fused, ...]
     centres: tuple[Centre | LinearisedCentre, ...]
     reporting: dict[str, Reporting]
@@ -73,7 +73,7 @@ class AllFilters(Module):
         self.smooths, self.judges = smoothed_groups is not None, judges
         # Filters of the nodes, by kind.
         self.alike = tuple(
-            Alike(
+            StackedFilters(
                 stack(
                     [without_output_names(network.nodes[name].filters[f]) for f in names for name in network.groups[g]]
                 ),
@@ -100,7 +100,7 @@ class AllFilters(Module):
 
     def init(self) -> PyTree:
         """Return states before the first step: of filters, central ones, quantizers, centres, reports, tests."""
-        central = {name: started(filter) for name, filter in self.central.items()}
+        central = {name: initial_state(filter) for name, filter in self.central.items()}
         states = tuple(stacked.init() for stacked in self.alike)
         sent = tuple(fusion.init(self.n) for fusion in self.fusions)
         reporting: dict[str, PyTree] = {name: link.init() for name, link in self.reporting.items()}
@@ -249,7 +249,7 @@ class AllFilters(Module):
 
 
 @compiled
-def begun(filters: AllFilters) -> PyTree:
+def initial_states(filters: AllFilters) -> PyTree:
     """Return states before the first step, by one program: otherwise each operation is a program of its own."""
     return jax.tree.map(jnp.asarray, filters.init())
 
@@ -266,7 +266,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     return cast(AllFilters, to_numpy(changed))
 
 
-def _planned(alike: Alike, u: Array) -> Alike:
+def _planned(alike: StackedFilters, u: Array) -> StackedFilters:
     """Plan filters that differ in numbers alone by one program, by native code where it supports the filter."""
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):
@@ -304,7 +304,7 @@ def _reporting(network: Network) -> dict[str, Reporting]:
         if isinstance(fusion, Fusion) and fusion.by_report:
             centre = centre_filter(network, name)
             places, mine = network.places(), network.nodes_with(fusion.filter)
-            sources, order = gathering(network, places, mine, fusion.filter)
+            sources, order = sources_of(network, places, mine, fusion.filter)
             uplinks = uplinks_of(fusion, mine, len(network.states))
             results[name] = Reporting(uplinks, centre, order, sources, tuple(mine))
     return results

@@ -25,7 +25,7 @@ from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, opened
+from heliograph.random_affine.combine import GainAndNoise, maps_in_series
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,
@@ -233,7 +233,7 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
 
     `variance` is the bound on var g of a hop.
     """
-    hops = [_hop_range(hop) for hop in opened(channel)]
+    hops = [_hop_range(hop) for hop in maps_in_series(channel)]
     # The recursion over the hops.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:

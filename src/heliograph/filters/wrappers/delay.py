@@ -38,7 +38,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series, known
-from heliograph.random_affine.delay import Delayed, Relayed, of_line, sent
+from heliograph.random_affine.delay import Delayed, Relayed, on_delay_line, signal_size
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 
@@ -180,7 +180,7 @@ def with_relays(
         moved = at_each_step(partial(_holding, relay=i, size=stage.outputs, steps=later.past), moved)
     # The receiver sees the line of the last relay.
     last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
-    return moved, last, of_line(channel.stages[-1]), tuple(lines)
+    return moved, last, on_delay_line(channel.stages[-1]), tuple(lines)
 
 
 def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
@@ -195,7 +195,7 @@ def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | 
 def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:
     """Build the filter behind relays from `base`, the filter of all lines."""
     # Only the moments under known probabilities make the filter optimal.
-    links = tuple(second_order(of_line(stage)) for stage in channel.stages[:-1])
+    links = tuple(second_order(on_delay_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
     start = first(plant)
@@ -370,4 +370,4 @@ def _at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     as_maps("channel", [channel])
     if isinstance(channel, Relayed):
         return Series([_at_once(stage) for stage in channel.stages])
-    return Series([known(np.tile(np.eye(sent(channel)), (1 + channel.past, 1))), of_line(channel)])
+    return Series([known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1))), on_delay_line(channel)])

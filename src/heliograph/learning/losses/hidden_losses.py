@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from heliograph.learning.losses.fates import CHOSEN, Fates, as_fates, as_history, ends_alone
 from heliograph.learning.losses.loss_law import AbstractLossLaw, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
-from heliograph.learning.losses.stretches import CHOSEN, Fates, as_fates, as_history, ends_alone
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine

@@ -4,8 +4,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from heliograph.learning.losses.fates import CHOSEN, Fates, as_fates, as_history, is_trial
 from heliograph.learning.losses.shares import logits, maximum
-from heliograph.learning.losses.stretches import CHOSEN, Fates, as_fates, as_history, is_trial
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail

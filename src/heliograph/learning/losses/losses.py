@@ -8,10 +8,10 @@ import scipy
 from scipy.special import expit, xlogy
 
 from heliograph.learning.intervals import mean_and_error
+from heliograph.learning.losses.fates import CheckedFates, Fates, as_fates, as_history, is_trial
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
-from heliograph.learning.losses.stretches import CheckedFates, Fates, as_fates, as_history, is_trial
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine

@@ -14,7 +14,7 @@ from heliograph.planning.moments import check_design_plant, measurement_moment, 
 from heliograph.planning.paths.model import Paths, Plants
 from heliograph.planning.transmitters import sent_powers, transmits
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Stack, opened
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Stack, maps_in_series
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -77,7 +77,7 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
     Raises:
         ValueError: a channel that is not made of independent chains, each for one number.
     """
-    head, *rest = opened(channel)
+    head, *rest = maps_in_series(channel)
     # Wires multiply what is carried.
     while isinstance(head, GainAndNoise) and not transmits(head):
         rows = np.asarray(head.matrix) @ rows
@@ -103,7 +103,7 @@ def _chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], p
         # An unobserved loss is fading.
         if isinstance(affine, Mixture):
             inner, lost = _loss(affine)
-            parts, fading = [*opened(inner), *parts], fading * lost
+            parts, fading = [*maps_in_series(inner), *parts], fading * lost
             continue
         if not isinstance(affine, GainAndNoise):
             raise _unfit(type(affine).__name__)

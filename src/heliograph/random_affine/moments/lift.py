@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, as_maps, check_forgets
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count,
@@ -19,7 +19,7 @@ from heliograph.random_affine.moments.monomials import (
 )
 
 
-class Lift(AbstractOfOne):
+class Lift(AbstractWrapper):
     """Lift of a map to monomials: from those of y of degree 1 to `degree` to those of z; degree 2 is the square.
 
     Its order-k moments are the order-(degree k) moments of the map. A lifted input has repeated products, so a row of

@@ -16,8 +16,8 @@ from heliograph.numerics.check import array, fail, instance, of_each
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, plain
 from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree, Scalar
-from heliograph.random_affine.base import AbstractRandomAffine, held_maps
-from heliograph.random_affine.delay import Delayed, sent
+from heliograph.random_affine.base import AbstractRandomAffine, inner_maps
+from heliograph.random_affine.delay import Delayed, signal_size
 from heliograph.random_affine.erasure import Erasure, arrived
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
@@ -58,7 +58,7 @@ class Edges(Module):
 
                 def single(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
                     channel = at(edge.channel, k)
-                    state, z = deliver(channel, state, jnp.zeros(sent(channel)), key, count, edge.checksums,
+                    state, z = deliver(channel, state, jnp.zeros(signal_size(channel)), key, count, edge.checksums,
                                        edge.memories)  # fmt: skip
                     arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
                     if not self.past:
@@ -164,7 +164,7 @@ def _opened(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) ->
     arrival: Scalar = 1.0
     while isinstance(channel, kinds):
         arrival = arrival * plain(channel.arrival) if isinstance(channel, Erasure) else arrival
-        channel = held_maps(channel)[0]
+        channel = inner_maps(channel)[0]
     return arrival, channel
 
 

@@ -18,9 +18,9 @@ from heliograph.model.over_time import at
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.gathering import gathering
+from heliograph.simulation.centres.fusions import sources_of
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.side_by_side import Alike
+from heliograph.simulation.side_by_side import StackedFilters
 
 UNROLLED = 16  # nodes of a kind whose corrections are written out: more are a loop
 WHOLE = Gaussian, LinearBelief, AdaptiveBelief  # states whose mean and covariance are all that is known of x
@@ -52,8 +52,8 @@ class FusedInnovation(Module):
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     def step(
-        self, before: Gaussian, alike: Sequence[Alike], states: Sequence[PyTree], z: Sequence[jax.Array], u: jax.Array,
-        k: jax.Array, skip: Sequence[jax.Array | None],
+        self, before: Gaussian, alike: Sequence[StackedFilters], states: Sequence[PyTree], z: Sequence[jax.Array],
+        u: jax.Array, k: jax.Array, skip: Sequence[jax.Array | None],
     ) -> FusedDistance:  # fmt: skip
         """Test the prediction from the fused estimate `before`, with the filters' states before step k.
 
@@ -104,7 +104,7 @@ def following_prior(estimate: Estimate) -> Gaussian:
     return given(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
 
 
-def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, FusedInnovation]:
+def fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
     """Tests of the network's fusions of estimates, by name, where there is one.
 
     There is none where a filter's state is more than a mean and a covariance of the plant's states, such as a mixture,
@@ -120,7 +120,7 @@ def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, Fus
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
-            sources, _ = gathering(network, places, network.nodes_with(fusion.filter), fusion.filter)
+            sources, _ = sources_of(network, places, network.nodes_with(fusion.filter), fusion.filter)
             beliefs = [eqx.filter_eval_shape(alike[kind].init) for kind, _ in sources]
             if all(isinstance(b, WHOLE) and b.mean.shape[-1] == len(network.states) for b in beliefs):
                 tests[name] = FusedInnovation(start, sources)

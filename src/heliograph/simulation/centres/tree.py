@@ -24,7 +24,7 @@ from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, described
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.side_by_side import Alike
+from heliograph.simulation.side_by_side import StackedFilters
 
 BLOCK = 1000  # nodes that are followed together
 
@@ -145,7 +145,7 @@ def _followed(
     nodes = eqx.filter_vmap(node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
     channels = eqx.filter_vmap(lambda values: described(node(values).channel))(numbers)
-    alike = Alike(nodes.filters[name], 0, 1, count)
+    alike = StackedFilters(nodes.filters[name], 0, 1, count)
     size = nodes.filters[name].received
     observe = Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size)
     centre = Centre(plant, observe, {}, np.arange(count), ((0, 0),), size, "exact")

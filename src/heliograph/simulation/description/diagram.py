@@ -15,7 +15,7 @@ from heliograph.numerics.module import LINES, cut
 from heliograph.numerics.traced import in_single, is_traced
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, fold, memories
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
-from heliograph.random_affine.delay import Delayed, OfLine
+from heliograph.random_affine.delay import Delayed, DelayLine
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes
@@ -168,7 +168,7 @@ def _words(channel: AbstractRandomAffine) -> str:
         # Links that deliver late, and those whose modes remember.
         Delayed: lambda late, parts: f"{parts[0] or DIRECT}, {'/'.join(map(str, late.times))} steps late"
                                      f"{', timestamped' if late.timestamped else ''}",
-        OfLine: lambda _, parts: parts[0],
+        DelayLine: lambda _, parts: parts[0],
         Modes: lambda modes, parts: f"{_memory(modes)}modes ({' or '.join(words or DIRECT for words in parts)})",
         Faded: lambda faded, _: f"{_memory(faded)}drifting hop",
         AbstractRandomAffine: lambda other, _: type(other).__name__,

@@ -16,10 +16,10 @@ from heliograph.numerics.trees.flat import Flat, flat_like, row_of
 from heliograph.numerics.trees.program_text import text_of
 from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.judging import plausible_step
 from heliograph.simulation.network import Network
+from heliograph.simulation.plausible_step import plausible_step
 from heliograph.simulation.rows.columns import columns_of
-from heliograph.simulation.stepping import AllFilters, begun
+from heliograph.simulation.stepping import AllFilters, initial_states
 from straightline.lowering import like
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
@@ -94,7 +94,7 @@ class RowStep:
         # All filters, their states before the first step, and the layouts of both.
         filters = AllFilters(network, judges=True, tests=True)
         _check_reports(filters)
-        start = begun(filters)
+        start = initial_states(filters)
         numbers, static = cast(NetworkStep(network, filters))
         self._like = tuple(like(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)

@@ -28,7 +28,7 @@ from heliograph.simulation.centres.linearised import LinearisedCentre
 from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.side_by_side import over_all, started
+from heliograph.simulation.side_by_side import initial_state, over_all
 
 
 class Fused(Module):
@@ -99,7 +99,7 @@ class Reporting(Module):
 
     def init(self) -> tuple[InFlight, PyTree]:
         """Return the state before any report is sent."""
-        return self.uplinks.init(), started(self.centre)
+        return self.uplinks.init(), initial_state(self.centre)
 
     def step(
         self, state: tuple[InFlight, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
@@ -133,7 +133,7 @@ def _fused(
     sources, order = [], []
     # Kinds and filters of the sources, and the order of the nodes in them.
     for fusion, mine in zip(fusions, nodes, strict=True):
-        source, which = gathering(network, places, mine, fusion.filter)
+        source, which = sources_of(network, places, mine, fusion.filter)
         sources.append(source)
         order.append(which)
     # Numbers of all fusions along a leading axis.
@@ -157,7 +157,7 @@ def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion
     places, claims = network.places(), network.claims()[FUSED]
     mine = network.nodes_with(name)
     # Places of the nodes' filters, and the longest measurement.
-    sources, order = gathering(network, places, mine, name)
+    sources, order = sources_of(network, places, mine, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     size = max(network.nodes[node].received for node in mine)
     claim = claims[next(iter(rules))]
@@ -175,7 +175,7 @@ def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion
     )
 
 
-def gathering(
+def sources_of(
     network: Network, places: Mapping[tuple[str, str], tuple[int, int, int]], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
     """Kinds and filters that hold the nodes' estimates, and the permutation of these into the order of the nodes."""
