@@ -8,18 +8,21 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from heliograph.factors.columns import Columns, columns_of, nothing, rounding_of
+from heliograph.factors.columns import Columns, columns_of, nothing, rounding_of, triangular
 from heliograph.factors.gaussian import (
     Gaussian,
     Image,
     backwards,
     given,
+    leading,
     merge,
     move,
     observe,
     of_sum,
+    revise,
     smoothed,
     transform,
+    with_rows,
 )
 from tests.factors.exact import after, congruence, exactly, total
 
@@ -207,3 +210,43 @@ def test_several_at_once_are_each_alone():
     for i in range(4):
         np.testing.assert_allclose(many.covariance[i], spreads[i], **EXACT)
     assert of_sum(jnp.zeros(3), columns_of(spreads[0])).root.shape == (3, 3)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 1e-9, 0.3, 1.0, 7.0])
+@pytest.mark.parametrize("n", [1, 3, 5])
+def test_revising_a_scalar_changes_its_law_and_not_that_of_x_given_it(n, ratio):
+    """P - (1 - ratio) K V K' and mean + K shift; no variance is negative, whether t is known better then or worse."""
+    mean, p, rows, _, _ = problem(n, 1)
+    x, h = given(mean, p), rows[0]
+    v = h @ p @ h
+    gain = p @ h / v
+    after = revise(x, h @ x.root, 0.7, ratio)
+    np.testing.assert_allclose(after.mean, mean + 0.7 * gain, **EXACT)
+    np.testing.assert_allclose(after.covariance, p - (1 - ratio) * v * np.outer(gain, gain), rtol=1e-11, atol=1e-11)
+    # To the last digits: after a ratio of 1e-9 too, where the difference has half of its digits.
+    assert h @ after.covariance @ h == pytest.approx(ratio * v, rel=1e-6 if ratio else 0, abs=1e-14)
+    assert np.all(np.asarray(after.variances) >= 0)
+
+
+def test_revising_a_scalar_keeps_the_digits_of_a_small_ratio():
+    """Against fractions: relative errors of a few eps of a variance that becomes 1e-20 of what it was."""
+    x, h, ratio = given(np.zeros(2), np.diag([1e8, 1.0])), np.array([1.0, 0.0]), 1e-20
+    after = revise(x, h @ x.root, 0.0, ratio)
+    np.testing.assert_allclose(np.diagonal(after.covariance), [1e-12, 1.0], rtol=1e-14)
+
+
+def test_revising_what_has_no_variance_leaves_all_as_it_is():
+    x = given(np.ones(2), np.diag([0.0, 2.0]))
+    after = revise(x, np.array([1.0, 0.0]), 3.0, 0.5)
+    for before, now in zip(x, after, strict=True):
+        np.testing.assert_array_equal(now, before)
+
+
+def test_rows_below_a_gaussian_are_the_joint_law_and_its_first_components_the_same_again():
+    mean, p, h, r, _ = problem(3, 2)
+    x = given(mean, p)
+    both = with_rows(x, h @ x.mean, h @ x.root, triangular(columns_of(r)))
+    np.testing.assert_allclose(both.covariance[3:, 3:], h @ p @ h.T + r, **EXACT)
+    np.testing.assert_allclose(both.covariance[3:, :3], h @ p, **EXACT)
+    for before, now in zip(x, leading(both, 3), strict=True):
+        np.testing.assert_array_equal(now, before)

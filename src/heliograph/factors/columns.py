@@ -40,6 +40,12 @@ class Columns(NamedTuple):
         matrix = jnp.asarray(self.matrix)
         return symmetric((matrix * self.weights) @ matrix.T)
 
+    @property
+    def diagonal(self) -> jax.Array:
+        """Variances (n,)."""
+        variances: jax.Array = jnp.asarray(self.matrix) ** 2 @ self.weights
+        return variances
+
     def through(self, matrix: Array) -> "Columns":
         """Return the covariance of A v for a v with this one."""
         return Columns(matrix @ self.matrix, self.weights)

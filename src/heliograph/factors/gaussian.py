@@ -111,6 +111,21 @@ class Image(NamedTuple):
         return joined(Columns(self.slopes, x.variances), self.curvature)
 
 
+def with_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns) -> Gaussian:
+    """Law of (x, t) with t = mean + slopes xi + v, of the factors N diag(r) N' of Cov v: [[L, 0], [slopes, N]], (d, r).
+
+    Shapes: mean (m,), slopes (m, n), noise (m, m).
+    """
+    root = jnp.concatenate([jnp.pad(x.root, ((0, 0), (0, len(mean)))), jnp.concatenate([slopes, noise.matrix], axis=1)])
+    variances = jnp.concatenate([x.variances, noise.weights])
+    return Gaussian(jnp.concatenate([x.mean, mean]), below_diagonal(root), variances)
+
+
+def leading(x: Gaussian, n: int) -> Gaussian:
+    """Law of the first n components alone: the first rows of L."""
+    return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
+
+
 def transform(x: Gaussian, image: Image, noise: Columns) -> Gaussian:
     """f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w."""
     return of_sum(image.mean, Columns(image.slopes, x.variances), image.curvature, noise)
@@ -185,9 +200,17 @@ def _measured(
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), Section V.3, its order reversed
     since L is lower.
     """
-    n, lower = len(d), np.tril(np.ones(root.shape, bool))
     product = d * f
     s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(f * product, (0,))], 0)), (0,))
+    after, kept, w = _turned(root, d, product, f, s)
+    return after, kept, w * inverse(s[0]), s[0]
+
+
+def _turned(
+    root: jax.Array, d: jax.Array, product: jax.Array, f: jax.Array, s: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
+    n, lower = len(d), np.tril(np.ones(root.shape, bool))
     w = lax.cumsum(lax.select(lower, root * product, jnp.zeros_like(root)), axis=1, reverse=True)
     over = inverse(s)  # where s is 0, so is what it divides
     here, next_ = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
@@ -197,7 +220,29 @@ def _measured(
     strictly = np.concatenate([lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
     after = root - lax.select(strictly, later * (f * over_next), jnp.zeros_like(root))
     kept = lax.select(here > 0, d * (next_ * over_here), d)
-    return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False) * over[0], s[0]
+    return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False)
+
+
+def revise(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
+    """Change the law of one scalar t = E t + row xi, and leave that of x given t: what is learned is of t alone.
+
+    The mean of t moves by `shift`, its variance V = row diag(d) row' becomes `ratio` times V, as by a likelihood of t
+    of any shape: mean + K shift and P - (1 - ratio) K V K', K = Cov(x, t) / V. With f = row and
+    s_j = ratio sum_{k < j} f_k^2 d_k + sum_{k >= j} f_k^2 d_k: d_j+ = d_j s_{j+1} / s_j and
+    L_j+ = L_j - (1 - ratio) (f_j / s_{j+1}) sum_{k > j} d_k f_k L_k. Ratios of sums of positive terms, whether the
+    ratio is below 1 or above. Where V is 0, x stays as it is.
+
+    Shapes: row (n,), shift and ratio () and ratio >= 0.
+
+    Source: Agee and Turner, Triangular decomposition of a positive definite matrix plus a symmetric dyad (1972), with
+    the sums of an observation of ratio r / (V + r).
+    """
+    product = x.variances * row
+    power = row * product
+    before = jnp.append(0.0, lax.cumsum(power))
+    s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
+    root, variances, w = _turned(x.root, x.variances, product, (1 - ratio) * row, s)
+    return Gaussian(x.mean + w * (inverse(s[0]) * shift), below_diagonal(root), variances)
 
 
 def moments_of_mixture(

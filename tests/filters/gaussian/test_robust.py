@@ -145,7 +145,7 @@ def test_a_branch_before_a_random_gain_arrives_with_the_variance_that_draws_have
     g = rng.rayleigh(np.sqrt(2 / np.pi), 200_000)
     for branch, (mean, variance) in enumerate([(0.0, 0.5), (3.0, 1.0)]):
         z = g * (2.0 + mean + np.sqrt(variance) * rng.normal(size=len(g))) + np.sqrt(0.1) * rng.normal(size=len(g))
-        claimed = float(before.spread[0, 0] + received.variance[0, branch])
+        claimed = float(before.columns.diagonal[0] + received.variance[0, branch])
         assert z.mean() == pytest.approx(float(before.signal[0] + received.mean[0, branch]), abs=4 * z.std() / 447)
         assert z.var() == pytest.approx(claimed, abs=4 * np.std((z - z.mean()) ** 2) / 447)
 

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, given
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
     AbstractSizedFilter,
@@ -37,8 +38,6 @@ from heliograph.model.premise import believing
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import diagonal, diagonal_of
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import ArrayLike, Float
 
 ITERATIONS = 5
@@ -100,7 +99,7 @@ class AdaptiveFilter(AbstractSizedFilter):
     def init(self) -> AdaptiveBelief:
         """The filter's prior, and the variances' with as much weight as forgetting leaves them."""
         shape = jnp.full(self.received, PRIOR_SHAPE)
-        variance = diagonal_of(jnp.asarray(at(self.noise, 0).covariance))
+        variance = jnp.diagonal(jnp.asarray(at(self.noise, 0).covariance))
         return AdaptiveBelief(*self.base.init(), shape, shape * variance)
 
     @predicts
@@ -115,7 +114,7 @@ class AdaptiveFilter(AbstractSizedFilter):
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
         signal = signal_without_noise(plant, sensor, base.transform, belief, start_of(base))
-        before = expected_of(belief, signal, at(base.channel, k))
+        before = expected_of(signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
         z = nearest(jnp.asarray(z), before.signal, angles)
         rule = base.rule if isinstance(base, RobustFilter) else None
@@ -125,7 +124,7 @@ class AdaptiveFilter(AbstractSizedFilter):
             (state.shape, state.scale),
             z,
             noise.center,
-            diagonal_of(jnp.asarray(noise.covariance)),
+            jnp.diagonal(jnp.asarray(noise.covariance)),
             jnp.asarray(self.memory),
             rule,
             law,
@@ -135,8 +134,7 @@ class AdaptiveFilter(AbstractSizedFilter):
         both = present[:, None] & present[None]
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(before.signal))
         innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
-        after = given(learned.mean, learned.spread)
-        return AdaptiveBelief(*after, learned.shape, learned.scale), innovation
+        return AdaptiveBelief(*learned.state, learned.shape, learned.scale), innovation
 
     @estimates
     def estimate(self, state: AdaptiveBelief) -> Estimate:
@@ -151,21 +149,19 @@ class AdaptiveFilter(AbstractSizedFilter):
 
 
 class Learned(NamedTuple):
-    """Mean, covariance and law of the variances after the update, and the innovation's covariance (m, m) with those
-    before it; weight of each component.
+    """State and law of the variances after the update, and the innovation's covariance (m, m) with those before it;
+    weight of each component.
 
     By those that were learned from a value itself no value would be far from what was expected.
     """
 
-    mean: jax.Array
-    spread: jax.Array
+    state: Gaussian
     shape: jax.Array
     scale: jax.Array
     covariance: jax.Array
     weight: jax.Array
 
 
-@runs_last
 def _learn(
     before: Expected,
     state: tuple[jax.Array, jax.Array],
@@ -177,7 +173,6 @@ def _learn(
     law: Law | None,
 ) -> Learned:
     arrived = ~jnp.isnan(z)
-    center, variance = (x.reshape(x.shape + (1,) * (z.ndim - x.ndim)) for x in (center, variance))
     # Forget towards the prior, and count the new value.
     first = PRIOR_SHAPE * (1 - memory)
     shape, scale = memory * state[0] + first, memory * state[1] + first * variance
@@ -192,19 +187,23 @@ def _learn(
             residual = jnp.where(arrived, e + center - shift, 0.0)
             shown = weight
         elif rule is not None:
-            weight, shown = rule.iterate(before, diagonal(noise), e, arrived)
+            weight, shown = rule.iterate(before, _independent(noise), e, arrived)
             received = arrived & (weight > SMALLEST)
-        used = reweighted(diagonal(noise), weight)
+        used = reweighted(_independent(noise), weight)
         learned = scale + weight * squared_residuals(before, used, residual, received) / 2
         last, noise = noise, jnp.where(received, learned / after_shape, noise)
     # The state with the last variances.
     if law is not None:
-        corrected = score_update(before, z, *_scaled(law, last / variance))
-        x, p = corrected.mean, corrected.covariance
+        x = score_update(before, z, _scaled(law, last / variance)).state
     else:
-        x, p = joint_update(before, e, received, used)
+        x = joint_update(before, e, received, used)
     a, b = jnp.where(received, after_shape, state[0]), jnp.where(received, noise * after_shape, state[1])
-    return Learned(x, p, a, b, before.spread + diagonal(scale / shape), jnp.where(arrived, shown, jnp.nan))
+    return Learned(x, a, b, before.columns.covariance + jnp.diag(scale / shape), jnp.where(arrived, shown, jnp.nan))
+
+
+def _independent(variance: jax.Array) -> Columns:
+    """Noise of independent components with these variances (m,)."""
+    return Columns(np.eye(len(variance)), variance)
 
 
 def _scaled(law: Law, ratio: jax.Array) -> Law:

@@ -5,15 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import decorrelated, nothing
-from heliograph.factors.gaussian import Gaussian, given
+from heliograph.factors.columns import Columns, columns_of, nothing
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     FilterAngles,
     Step,
     corrects,
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
-from heliograph.filters.gaussian.precise import above_rounding
 from heliograph.filters.gaussian.scores import (
     AbstractWeights,
     Corrected,
@@ -23,7 +22,7 @@ from heliograph.filters.gaussian.scores import (
     squared_residuals,
     weighted_update,
 )
-from heliograph.filters.gaussian.signal import Signal, innovation_covariance, received_noise, signal_of
+from heliograph.filters.gaussian.signal import Signal, received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
@@ -36,7 +35,6 @@ from heliograph.model.premise import believes
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
-from heliograph.numerics.linalg import diagonal, diagonal_of
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -133,10 +131,10 @@ class StudentVB(AbstractWeights):
         return rule
 
     def iterate(
-        self, before: Expected, noise: jax.Array, e: jax.Array, present: jax.Array
+        self, before: Expected, noise: Columns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """The weights of the last update, and those that it would give the next one."""
-        scale = diagonal_of(noise)
+        scale = noise.diagonal
         used = w = jnp.broadcast_to(jnp.ones_like(scale), e.shape)
         for _ in range(self.iterations):
             used = w
@@ -177,20 +175,17 @@ class RobustFilter(AbstractBeliefFilter):
         noise = at(self.noise, k)
         if self.rule is None:
             law = noise.law(sensed)
-            after = score_update(before, z, *law)
-            center, total = law.mean_and_variance()
-            innovation = _innovation(before, z, center, diagonal(total), after, True)
-        else:
-            after = weighted_update(before, z, noise.center, noise.covariance, self.rule)
-            innovation = _innovation(before, z, noise.center, noise.covariance, after)
-        covariance = above_rounding(after.covariance, state.covariance, start_of(self))
-        return given(after.mean, covariance), innovation
+            after = score_update(before, z, law)
+            center, variance = law.mean_and_variance()
+            return after.state, _innovation(before, z, center, jnp.diag(variance), after, True)
+        after = weighted_update(before, z, noise.center, columns_of(noise.covariance), self.rule)
+        return after.state, _innovation(before, z, noise.center, noise.covariance, after)
 
     def expected(self, state: Gaussian, k: Step) -> tuple[Expected, jax.Array]:
         """Moments of what would arrive without the noise that may hold outliers, and the sensor's mean signal."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start_of(self))
-        return expected_of(state, signal, channel), signal.mean
+        return expected_of(signal, channel), signal.mean
 
 
 def signal_without_noise(
@@ -200,13 +195,11 @@ def signal_without_noise(
     return signal_of(plant, sensor, transform, state, start, nothing(len(sensor.outputs)))
 
 
-def expected_of(state: Gaussian, signal: Signal, channel: SecondOrder) -> Expected:
-    """Through the channel: t with mean M y + b, Cov(x, t) = Cov(x, y) M', and the spread of gain and plain noise."""
+def expected_of(signal: Signal, channel: SecondOrder) -> Expected:
+    """Through the channel: t with mean M y + b and slopes M times the signal's; gain and plain noise are its noise."""
     gain = jnp.asarray(channel.mean_gain)
-    spread, rest = innovation_covariance(signal, channel), received_noise(signal, channel).covariance
-    matrix = gain @ decorrelated(state.root.T[::-1, ::-1], signal.slopes.T[::-1])[::-1].T
     mean = gain @ signal.mean + channel.offset
-    return Expected(state.mean, state.covariance, mean, signal.cross @ gain.T, spread, matrix, rest)
+    return Expected(signal.prior, mean, gain @ signal.slopes, received_noise(signal, channel))
 
 
 def _innovation(
@@ -215,7 +208,7 @@ def _innovation(
     """Innovation about the noise's mean with the covariance that the law says; the score's density is the mixture's."""
     present = ~jnp.isnan(z)
     expected = before.signal + center
-    value, covariance = z - expected, before.spread + noise
+    value, covariance = z - expected, before.columns.covariance + noise
     both = present[:, None] & present[None]
     density = after.log_density if by_law else log_density(value, covariance, jnp.abs(z) + jnp.abs(expected))
     return Innovation(value, jnp.where(both, covariance, jnp.nan), density, after.weight)

@@ -1,100 +1,96 @@
 """Arithmetic of robust updates: the score of a mixture, component after component, and weights before one update.
 
-x is the state, t what would arrive without the noise that may hold outliers, z = t + v; C = Cov(x, t), V = Cov(t).
+x is the state, t what would arrive without the noise that may hold outliers, z = t + v; V = Cov(t).
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from heliograph.filters.gaussian.correction import absent, gain_and_bound, gain_and_covariance
-from heliograph.numerics.linalg import add, diagonal_of, solve, summed, times, transpose, with_rounding
+from heliograph.factors.columns import Columns, joined, triangular
+from heliograph.factors.gaussian import Gaussian, leading, observe, of_columns, revise, with_rows
+from heliograph.filters.robust_noise import Law
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.over_runs import runs_last
 
 LARGEST = 1e150  # deviations of the widest branch: beyond, squares overflow
 SMALLEST = 1e-200  # weight: below, a component counts as missing
 
 
 class Expected(NamedTuple):
-    """Moments of the state and of what would arrive without its noise, before the measurement.
+    """What would arrive without its noise, t = E t + slopes xi + noise, of a state x = m + L xi before the measurement.
 
-    mean (n,), covariance (n, n), signal (m,), cross C (n, m), spread V (m, m). Of a linear sensor also the matrix H
-    of t (m, n) and what of V is not H P H' (m, m), with which an update keeps its digits.
+    Shapes: prior of n states, signal (m,), slopes (m, n), noise (m, columns).
     """
 
-    mean: jax.Array
-    covariance: jax.Array
+    prior: Gaussian
     signal: jax.Array
-    cross: jax.Array
-    spread: jax.Array
-    matrix: jax.Array | None = None
-    noise: jax.Array | None = None
+    slopes: jax.Array
+    noise: Columns
+
+    @property
+    def columns(self) -> Columns:
+        """Cov t."""
+        return joined(Columns(self.slopes, self.prior.variances), self.noise)
 
 
 class Corrected(NamedTuple):
     """State after the update, weight of each component (0: left out, 1: in full), log density of what arrived."""
 
-    mean: jax.Array
-    covariance: jax.Array
+    state: Gaussian
     weight: jax.Array
     log_density: jax.Array
 
 
-@runs_last
-def score_update(
-    before: Expected, z: jax.Array, log_share: jax.Array, mean: jax.Array, variance: jax.Array, least: jax.Array
-) -> Corrected:
+def score_update(before: Expected, z: jax.Array, law: Law) -> Corrected:
     """Exact posterior moments of one component after another, for a Gaussian prior and a noise of Gaussian branches.
 
-    With s_j = V_ii + r_j (at least `least`), u_j = (e - m_j) / s_j and q_j in proportion to p_j N(e; m_j, s_j): the
-    score g = sum q_j u_j and G = sum q_j / s_j - Var_q u give mean + c g and covariance - c c' G, c the joint's column
-    at t_i. G may be negative: the covariance grows where the branch is not clear. The weight is G's first part over its
-    value at e = 0.
+    With s_j = V_ii + r_j (at least `least`), u_j = (e - m_j) / s_j and q_j in proportion to p_j N(e; m_j, s_j), the
+    score g = sum q_j u_j: t_i moves by V_ii g, its variance becomes V_ii (sum q_j r_j / s_j + V_ii Var_q u), a sum of
+    positive terms, and x given t_i stays. The variance grows where the branch is not clear. The weight is
+    sum_j q_j / s_j over its value at e = 0.
 
-    Shapes: log_share, mean, variance, least (m, branches).
+    Shapes: the law's (m, branches).
     Source: Masreliez, Approximate non-Gaussian filtering with linear state and observation relations (1975).
     """
-    x, p, t, c, v = before.mean, before.covariance, before.signal, before.cross, before.spread
-    m, present = len(t), ~jnp.isnan(z)
-    prior, p = p, with_rounding(p, m)
-    # Each component is one scalar update of the joint of (x, t): the score moves the mean, its slope the covariance.
+    n, m, present = len(before.prior.mean), len(before.signal), ~jnp.isnan(z)
+    both = with_rows(before.prior, before.signal, before.slopes, triangular(before.noise))
     weights, density = [], jnp.zeros_like(z[0])
     for i in range(m):
-        e = jnp.where(present[i], z[i] - t[i], 0.0)
-        branch = (log_share[i], mean[i], jnp.maximum(v[i, i] + variance[i], least[i]))
-        g, curvature, gain, log_density = _score(e, *branch)
-        weights.append(jnp.where(present[i], gain / _score(jnp.zeros_like(e), *branch)[2], jnp.nan))
-        density = density + jnp.where(present[i], log_density, 0.0)
-        g, curvature = (jnp.where(present[i], value, 0.0) for value in (g, curvature))
-        to_x, to_t = c[:, i], v[:, i]
-        x, t = x + to_x * g, t + to_t * g
-        p = p - to_x[:, None] * to_x[None] * curvature
-        c = c - to_x[:, None] * to_t[None] * curvature
-        v = v - to_t[:, None] * to_t[None] * curvature
-    return Corrected(x, jnp.where(jnp.any(present, axis=0), p, prior), jnp.stack(weights), density)
+        row = both.root[n + i]
+        v = row**2 @ both.variances
+        e = jnp.where(present[i], z[i] - both.mean[n + i], 0.0)
+        branches = law.log_share[i], law.mean[i], jnp.maximum(law.variance[i], law.least[i] - v)
+        score = _score(e, v, *branches)
+        weights.append(jnp.where(present[i], score.weight / _score(jnp.zeros_like(e), v, *branches).weight, jnp.nan))
+        density = density + jnp.where(present[i], score.log_density, 0.0)
+        both = revise(both, jnp.where(present[i], row, 0.0), v * score.slope, score.left)
+    return Corrected(leading(both, n), _stacked(weights), density)
 
 
-def _score(
-    e: jax.Array, log_share: jax.Array, mean: jax.Array, total: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """g, G, sum q_j / s_j and log density of an innovation e (...), of branches (branches, ...)."""
-    reach = LARGEST * jnp.sqrt(jnp.max(total, axis=0))
+class _Score(NamedTuple):
+    """g, the share of t's variance that is left, sum q_j / s_j and log density of an innovation."""
+
+    slope: jax.Array
+    left: jax.Array
+    weight: jax.Array
+    log_density: jax.Array
+
+
+def _score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.Array, noise: jax.Array) -> _Score:
+    """Score of an innovation e about a t of variance v, with branches (branches,) of the noise."""
+    total = v + noise
+    reach = LARGEST * jnp.sqrt(jnp.max(total))
     apart = jnp.clip(e, -reach, reach) - mean
     u = apart / total
-    logs = log_share - (apart * u + jnp.log(2 * np.pi * total)) / 2
-    top = jnp.max(logs, axis=0)
+    logs = log_share - (apart * u + jnp.log(2 * jnp.pi * total)) / 2
+    top = jnp.max(logs)
     q = jnp.exp(logs - top)
-    whole = _sum(q)
+    whole = jnp.sum(q)
     q = q / whole
-    g, gain = _sum(q * u), _sum(q / total)
-    return g, gain - _sum(q * (u - g) ** 2), gain, top + jnp.log(whole)
-
-
-def _sum(terms: jax.Array) -> jax.Array:
-    return add(list(terms))
+    g = q @ u
+    left = q @ (jnp.maximum(noise, 0.0) / total) + v * (q @ (u - g) ** 2)
+    return _Score(g, left, q @ (1 / total), top + jnp.log(whole))
 
 
 @readable
@@ -106,72 +102,57 @@ class AbstractWeights(Module):
         raise unwritten(self, "weights")
 
     def iterate(
-        self, before: Expected, noise: jax.Array, e: jax.Array, present: jax.Array
+        self, before: Expected, noise: Columns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The weights of the update, and those to report, for noise (m, m)."""
-        scale = diagonal_of(noise)
-        w = self.weights(e, e**2 / (diagonal_of(before.spread) + scale), scale)
+        """The weights of the update, and those to report, for noise of m components."""
+        scale = noise.diagonal
+        w = self.weights(e, e**2 / (before.columns.diagonal + scale), scale)
         return w, w
 
 
-@runs_last
 def weighted_update(
-    before: Expected, z: jax.Array, center: jax.Array, noise: jax.Array, rule: AbstractWeights
+    before: Expected, z: jax.Array, center: jax.Array, noise: Columns, rule: AbstractWeights
 ) -> Corrected:
     """One joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; a component of weight zero is missing."""
     arrived = ~jnp.isnan(z)
     e = jnp.where(arrived, z - before.signal - center, 0.0)
     w, shown = rule.iterate(before, noise, e, arrived)
-    present = arrived & (w > SMALLEST)
-    x, p = joint_update(before, e, present, reweighted(noise, w))
-    return Corrected(x, p, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(x[0]))
+    after = joint_update(before, e, arrived & (w > SMALLEST), reweighted(noise, w))
+    return Corrected(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
 
 
-def reweighted(noise: jax.Array, w: jax.Array) -> jax.Array:
-    """r_ij / sqrt(w_i w_j)."""
-    root = jnp.sqrt(jnp.maximum(w, SMALLEST))
-    return noise / (root[:, None] * root[None])
+def reweighted(noise: Columns, w: jax.Array) -> Columns:
+    """r_ij / sqrt(w_i w_j): each row over the root of its weight."""
+    return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
 
-def joint_update(before: Expected, e: jax.Array, present: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and covariance after the components that are present, with noise of this covariance (m, m)."""
-    both = present[:, None] & present[None]
-    omega = jnp.where(both, before.spread + noise, 0.0) + absent(present)
-    cross = jnp.where(present[:, None], transpose(before.cross), 0.0)
-    if before.matrix is None or before.noise is None:
-        gain, after = gain_and_bound(before.covariance, cross, omega)
-    else:
-        matrix = jnp.where(present[:, None], before.matrix, 0.0)
-        rest = jnp.where(both, before.noise + noise, 0.0) + absent(present)
-        gain, after = gain_and_covariance(before.covariance, cross, omega, matrix, rest, jnp.zeros_like(e))
-    used = jnp.any(present, axis=0)
-    mean = before.mean + summed(gain * jnp.where(present, e, 0.0)[None], 1)
-    return mean, jnp.where(used, after, before.covariance)
+def joint_update(before: Expected, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
+    """State after the components that are present, with noise of this covariance besides that of t."""
+    innovation = jnp.where(present, e, jnp.nan)
+    return observe(before.prior, before.slopes, innovation, joined(before.noise, noise))[0]
 
 
-def squared_residuals(before: Expected, noise: jax.Array, e: jax.Array, present: jax.Array) -> jax.Array:
+def squared_residuals(before: Expected, noise: Columns, e: jax.Array, present: jax.Array) -> jax.Array:
     """E_i = (z_i - t_i+)^2 + V_ii+ after a joint update with this noise: what is then known of each noise's square."""
-    both = present[:, None] & present[None]
-    omega = jnp.where(both, before.spread + noise, 0.0) + absent(present)
-    rows = jnp.where(present[:, None], before.spread, 0.0)
-    solved = solve(omega, jnp.concatenate([rows, jnp.where(present, e, 0.0)[:, None]], axis=1))
-    moved = times(transpose(rows), solved)
-    left = diagonal_of(before.spread) - diagonal_of(moved[:, :-1])
-    return (e - moved[:, -1]) ** 2 + jnp.maximum(left, 0.0)
+    t = of_columns(jnp.zeros_like(e), before.columns)
+    after, _ = observe(t, t.root, jnp.where(present, e, jnp.nan), noise)
+    return (e - after.mean) ** 2 + after.columns.diagonal
 
 
-def branch_precision(
-    before: Expected, e: jax.Array, scale: jax.Array, law: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-) -> tuple[jax.Array, jax.Array]:
+def branch_precision(before: Expected, e: jax.Array, scale: jax.Array, law: Law) -> tuple[jax.Array, jax.Array]:
     """Expected precision sum q_j r / r_j (m,) of each component's noise, in units of r, and the mean that it is about.
 
     q_j is the probability of branch j given the component alone.
     """
     log_share, mean, variance, least = law
-    total = jnp.maximum(diagonal_of(before.spread)[:, None] + variance, least)
+    total = jnp.maximum(before.columns.diagonal[:, None] + variance, least)
     apart = e[:, None] - mean
     logs = log_share - (apart**2 / total + jnp.log(total)) / 2
     q = jnp.exp(logs - jnp.max(logs, axis=1, keepdims=True))
     precision = q * scale[:, None] / least
-    whole = summed(precision, 1)
-    return whole / summed(q, 1), summed(precision * mean, 1) / whole
+    whole = jnp.sum(precision, axis=1)
+    return whole / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / whole
+
+
+def _stacked(entries: list[jax.Array]) -> jax.Array:
+    return jnp.stack(entries) if entries else jnp.zeros(0)
