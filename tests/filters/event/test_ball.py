@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.event.ball import ball_moments, cut_to_ball
 from heliograph.filters.event.parts import Parts
 from heliograph.numerics.float64 import compiled
@@ -59,15 +60,21 @@ def test_three_components_are_those_of_draws():
 
 def test_inside_and_outside_are_the_whole_and_what_is_known_stays():
     random = np.random.default_rng(1)
-    root = random.normal(size=(4, 4))
-    parts = Parts(np.zeros(1), random.normal(size=(1, 4)), (root @ root.T)[None], np.ones((1, 1, 1)))
+    law = Gaussian(random.normal(size=(1, 4)), random.normal(size=(1, 6)), random.uniform(0.5, 4, size=(1, 4)))
+    parts = Parts(np.zeros(1), law, np.ones((1, 1, 1)))
     directions = np.eye(4)[:2] - np.eye(4)[2:]
     near, far = compiled(lambda r: tuple(cut_to_ball(parts, directions, r, side) for side in (True, False)))(1.5)
     share = np.exp([near.log_weight[0], far.log_weight[0]])
     assert share.sum() == pytest.approx(1, rel=1e-9)
-    mean = share @ np.stack([near.mean[0], far.mean[0]])
-    np.testing.assert_allclose(mean, parts.mean[0], atol=1e-8)
-    known = Parts(np.zeros(1), np.array([[0.5, 0.2, 0.0, 0.0]]), np.zeros((1, 4, 4)), np.ones((1, 1, 1)))
+    means, covariances = (
+        np.stack([getattr(side.gaussian, name)[0] for side in (near, far)]) for name in ("mean", "covariance")
+    )
+    apart = means - law.mean
+    np.testing.assert_allclose(share @ means, law.mean[0], atol=1e-8)
+    whole = np.einsum("s,sij->ij", share, covariances + apart[:, :, None] * apart[:, None])
+    np.testing.assert_allclose(whole, law.covariance[0], atol=1e-7)
+    still = Gaussian(np.array([[0.5, 0.2, 0.0, 0.0]]), np.zeros((1, 6)), np.zeros((1, 4)))
+    known = Parts(np.zeros(1), still, np.ones((1, 1, 1)))
     known_inside = compiled(lambda radius: cut_to_ball(known, directions, radius, True))
     assert known_inside(1.0).log_weight[0] == pytest.approx(0, abs=1e-8) and known_inside(0.5).log_weight[0] < -1e3
-    np.testing.assert_array_equal(known_inside(1.0).mean, known.mean)
+    np.testing.assert_array_equal(known_inside(1.0).gaussian.mean, still.mean)

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import Columns, eliminated, joined, nothing
+from heliograph.factors.gaussian import Gaussian, observe, of_columns
 from heliograph.filters.event.parts import CERTAIN, Parts
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.lapack import eigh
@@ -60,33 +62,29 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
 def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: bool) -> Parts:
     """Each Gaussian cut to |D x| <= radius, or to where it is more, and the Gaussian of the same moments.
 
-    With S = Cov(D x) = V diag(s) V', e = V' D x has independent components, and for K = P D' V diag(s)^-1 the mean is
-    m + K (E e - V' D m), the covariance P - K (diag(s) - Cov e) K'.
+    With Cov(D x) = V diag(s) V', e = V' D x has independent components. Of those that are known to vary, x is given
+    exactly, and then E e and Cov e enter with K = Cov(x, e) diag(s)^-1: mean m + K (E e - V' D m), and columns K more.
 
     Shapes: directions (m, N).
     """
 
-    def single(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        column = covariance @ directions.T
-        variance, turn = eigh(directions @ column)
+    def single(x: Gaussian) -> tuple[jax.Array, Gaussian]:
+        rows, centre = directions @ x.root, directions @ x.mean
+        variance, turn = eigh(Columns(rows, x.variances).covariance)
         # What has no variance lies where it is.
-        centre, least = turn.T @ (directions @ mean), CERTAIN**0.5 * (radius**2 + jnp.sum((directions @ mean) ** 2))
-        known = variance > least
-        size = jnp.where(known, variance, least)
+        least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
+        rows, centre = turn.T @ rows, turn.T @ centre
+        size = jnp.maximum(variance, least)
         moments = ball_moments(centre, size, radius, inside)
-        gain = jnp.where(known, column @ turn / size, 0.0)
-        possible = jnp.isfinite(moments.log_mass)
-        shift = jnp.where(possible, moments.mean - centre, 0.0)
-        less = jnp.where(possible, jnp.diag(size) - moments.covariance, 0.0)
-        return moments.log_mass, mean + gain @ shift, (covariance - gain @ less @ gain.T)[rows, columns]
+        known = (variance > least) & jnp.isfinite(moments.log_mass)
+        gain = jnp.where(known, (x.root * x.variances) @ rows.T / size, 0.0)
+        given, _ = observe(x, rows, jnp.where(known, 0.0, jnp.nan), nothing(len(rows)))
+        mean = x.mean + gain @ jnp.where(known, moments.mean - centre, 0.0)
+        spread = eliminated(moments.covariance).through(gain)
+        return moments.log_mass, of_columns(mean, joined(given.columns, spread))
 
-    # Of a covariance, what lies on and below its diagonal, which is all that it is.
-    size = parts.mean.shape[1]
-    rows, columns = np.tril_indices(size)
-    log_mass, mean, lower = jax.lax.map(lambda moments: single(*moments), (parts.mean, parts.covariance))
-    places = np.zeros((size, size), dtype=int)
-    places[rows, columns] = places[columns, rows] = np.arange(len(rows))
-    return Parts(parts.log_weight + log_mass, mean, lower[:, places], parts.label)
+    log_mass, after = jax.lax.map(single, parts.gaussian)
+    return Parts(parts.log_weight + log_mass, after, parts.label)
 
 
 def _slice(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:

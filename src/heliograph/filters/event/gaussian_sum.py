@@ -1,6 +1,6 @@
 """A filter behind a sender that decides when to send: a sum of Gaussians over what the sender compares with."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compiled
-from heliograph.factors.gaussian import Gaussian, given
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian, given, leading, with_rows
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import cut_to_ball
-from heliograph.filters.event.moments import arriving, augmented, moved, updated
+from heliograph.filters.event.moments import Link, arriving, augmented, moved, pinned, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
-from heliograph.filters.gaussian.belief import moments_around
+from heliograph.filters.gaussian.belief import moments_around, start_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -32,26 +33,37 @@ COUNTED = 16  # lost transmissions that are counted; more are as many
 class EventBelief(NamedTuple):
     """The sum: Gaussians of (x, r), r the sender's reference, and labels (mode, steps since sent, number lost).
 
-    Shapes: weight (H,), mean (H, n + m), covariance (H, n + m, n + m), label (H, S, M, A, C) with S = 1 where y is sent
-    as a whole, else m; `begun` (S,) once there is a reference, `moved` once the chain was used.
+    Shapes, with N = n + m: mean, variances (H, N), lower (H, N (N - 1) / 2), weight (H,), label (H, S, M, A, C) with
+    S = 1 where y is sent as a whole, else m; `begun` (S,) once there is a reference, `moved` once the chain was used.
     """
 
-    weight: jax.Array
     mean: jax.Array
-    covariance: jax.Array
+    lower: jax.Array
+    variances: jax.Array
+    weight: jax.Array
     label: jax.Array
     begun: jax.Array
     moved: jax.Array
 
     @property
+    def gaussian(self) -> Gaussian:
+        """The Gaussians of (x, r)."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariances of (x, r)."""
+        return self.gaussian.covariance
+
+    @property
     def parts(self) -> Parts:
         """The sum, with the logarithms of its weights."""
-        return Parts(safe_log(self.weight), self.mean, self.covariance, self.label)
+        return Parts(safe_log(self.weight), self.gaussian, self.label)
 
     @staticmethod
     def of(parts: Parts, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """The state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
-        return EventBelief(jnp.exp(parts.log_weight), *parts[1:], begun, moved)
+        return EventBelief(*parts.gaussian, jnp.exp(parts.log_weight), parts.label, begun, moved)
 
 
 class EventFilter(AbstractSizedFilter):
@@ -95,21 +107,20 @@ class EventFilter(AbstractSizedFilter):
     def init(self) -> EventBelief:
         """The prior, and no reference yet."""
         start, m = at(self.plant, 0), self.outputs
-        n = len(start.states)
-        mean = jnp.concatenate([jnp.asarray(start.initial_mean), jnp.zeros(m)])
-        covariance = jnp.zeros((n + m, n + m)).at[:n, :n].set(jnp.asarray(start.initial_covariance))
+        x = given(start.initial_mean, start.initial_covariance)
+        both = with_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), (self.trigger.heartbeat or 0) + 1, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        gaussian = Parts(jnp.zeros(1), mean[None], covariance[None], label[None])
+        single = Parts(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
         begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.of(self._alone(gaussian), begun, jnp.asarray(False))
+        return EventBelief.of(self._alone(single), begun, jnp.asarray(False))
 
-    def _alone(self, gaussian: Parts) -> Parts:
+    def _alone(self, single: Parts) -> Parts:
         """One Gaussian in a sum of which all others have no weight."""
         count = self._known_slots + (self.lost if self.follows else 0)
-        every = Parts(*(jnp.repeat(leaf, count, axis=0) for leaf in gaussian))
-        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, gaussian.log_weight[0], -jnp.inf))
+        every: Parts = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), single)
+        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, single.log_weight[0], -jnp.inf))
 
     @property
     def _known_slots(self) -> int:
@@ -129,19 +140,17 @@ class EventFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
         """x moves and r stays, or is the prediction; modes move, and it is one step longer since the last sent."""
-        plant, u, parts = at(self.plant, k), jnp.asarray(u), state.parts
-        mean, covariance = jax.vmap(lambda m, p: moved(plant, self.transform, m, p, u))(parts.mean, parts.covariance)
+        plant, u, start = at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0))
+        both = jax.vmap(lambda x: moved(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
-            n = len(self.states)
-            expected = self.reference(self._whole(state).mean, u, k)
-            mean = mean.at[:, n:].set(expected)
-            covariance = covariance.at[:, n:].set(0.0).at[:, :, n:].set(0.0)
+            expected, places = self.reference(self._whole(state).mean, u, k), len(self.states) + np.arange(self.outputs)
+            both = jax.vmap(lambda x: pinned(x, places, expected))(both)
         rows = jnp.asarray(at(self.channel, k).transition)
-        label = jnp.einsum("hsiac,ij->hsjac", parts.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
+        label = jnp.einsum("hsiac,ij->hsjac", state.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
         if self.trigger.heartbeat is not None:
             older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
             label = older.at[..., -1, :].add(label[..., -1, :])
-        return EventBelief(state.weight, mean, covariance, label, state.begun, jnp.asarray(True))
+        return EventBelief(*both, state.weight, label, state.begun, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
@@ -153,13 +162,13 @@ class EventFilter(AbstractSizedFilter):
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
-        parts, begun = state.parts, state.begun
+        parts, begun, start = state.parts, state.begun, start_of(at(self.plant, 0))
         total, value, covariance = jnp.zeros(()), [], []
         # Senders one after the other, each with its value or its silence.
         for s, those in enumerate(self.senders):
             mine = values[those] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
-            wide = augmented(plant, sensor, self.transform, parts, len(self.states))
+            wide = augmented(plant, sensor, self.transform, parts, start)
             there = jnp.any(~jnp.isnan(mine))
             after, expected, spread = self._used(wide, channel, mine, lost, s, begun[s])
             whole = log_total(after.log_weight)
@@ -232,9 +241,10 @@ class EventFilter(AbstractSizedFilter):
         for j in range(1 if self.alike else label.shape[1]):
             only = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
             mode = jnp.argmax(chance > 0) if self.alike else j
-            links.append((jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]))
+            moments = channel.mean, channel.gain_spread, channel.noise
+            links.append(Link(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
             before.append(wide.labelled(s, only))
-            used.append(updated(before[-1], z, there, *links[-1], sender, self.outputs, self.delivers))
+            used.append(updated(before[-1], z, there, links[-1], sender, self.outputs, self.delivers))
         # Restricted to where the sender had to send.
         count, size = len(links), len(label)
         selected = self._selected(together([*used, *before]), s, begun)
@@ -243,12 +253,12 @@ class EventFilter(AbstractSizedFilter):
         # What was to be expected of a value that comes.
         signals = []
         for sent, link in zip(map(join, of_mode[count:]), links, strict=True):
-            sent = sent._replace(label=jnp.zeros((1, 1)))
-            signals.append(sent._replace(**arriving(sent, *link, sender, self.outputs)))
+            received = arriving(sent.gaussian, link, sender, self.outputs)
+            signals.append(Parts(sent.log_weight, received, jnp.zeros((1, 1))))
         # One sum again, with a new reference.
         whole = join(together(of_mode[:count]).keep(self._renewed(sender)))
         whole = whole.labelled(s, _sent(whole.label[:, s], False))
-        signal = join(together(signals))
+        signal = join(together(signals)).gaussian
         return self._alone(whole), signal.mean[0], signal.covariance[0]
 
     def _selected(self, used: Parts, s: int, begun: jax.Array) -> Parts:
@@ -326,11 +336,11 @@ class EventFilter(AbstractSizedFilter):
 
     def _or_nothing(self, parts: Parts, before: Parts) -> Parts:
         """The sum, or where the rule forbids what came that before it, with a floor as its likelihood."""
-        size = parts.mean.shape[1]
-        stays = before.keep(np.r_[0:size])
+        stays = before.keep(np.arange(parts.gaussian.mean.shape[1]))
         stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
         forbidden = ~jnp.isfinite(log_total(parts.log_weight))
-        return Parts(*(jnp.where(forbidden, x, y) for x, y in zip(stays, parts, strict=True)))
+        either: Parts = jax.tree.map(lambda x, y: jnp.where(forbidden, x, y), stays, parts)
+        return either
 
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
@@ -344,8 +354,9 @@ class EventFilter(AbstractSizedFilter):
 
     def _whole(self, state: EventBelief) -> Gaussian:
         """Mean and covariance of the state by the whole sum."""
-        n, whole = len(self.states), join(state.parts)
-        return given(whole.mean[0, :n], whole.covariance[0, :n, :n])
+        whole = leading(join(state.parts).gaussian, len(self.states))
+        first: Gaussian = jax.tree.map(lambda leaf: leaf[0], whole)
+        return first
 
 
 def _sent(label: jax.Array, lost: bool) -> jax.Array:

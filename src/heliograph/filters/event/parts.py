@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian, leading, merge, of_columns, revise
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
-from heliograph.numerics.linalg import symmetrize, with_rounding
 from heliograph.numerics.types import Array, Float
 
 FLOOR = 1e-6  # probability of what the rule forbids
@@ -19,13 +21,12 @@ CERTAIN = 1e-24  # a variance below this share of its mean square and of the int
 class Parts(NamedTuple):
     """Gaussians of a sum, with what is known of the sender in each.
 
-    log_weight (K,), mean (K, N), covariance (K, N, N), label (K, senders, ...): probabilities of each sender's
-    label given the Gaussian.
+    log_weight (K,), gaussian of N components with a leading axis K, label (K, senders, ...): probabilities of each
+    sender's label given the Gaussian.
     """
 
     log_weight: Float[jax.Array, " K"]
-    mean: Float[jax.Array, "K N"]
-    covariance: Float[jax.Array, "K N N"]
+    gaussian: Gaussian
     label: Float[jax.Array, "K senders ..."]
 
     def labelled(self, s: int, label: jax.Array) -> "Parts":
@@ -42,11 +43,18 @@ class Parts(NamedTuple):
 
     def some(self, first: int, stop: int | None = None) -> "Parts":
         """Take some of the Gaussians."""
-        return Parts(*(leaf[first:stop] for leaf in self))
+        few: Parts = jax.tree.map(lambda leaf: leaf[first:stop], self)
+        return few
 
-    def keep(self, places: Array) -> "Parts":
+    def keep(self, places: np.ndarray) -> "Parts":
         """Some components of the Gaussians, in another order."""
-        return self._replace(mean=self.mean[:, places], covariance=self.covariance[:, places][:, :, places])
+        if np.array_equal(places, np.arange(len(places))):
+            return self._replace(gaussian=leading(self.gaussian, len(places)))
+
+        def single(x: Gaussian) -> Gaussian:
+            return of_columns(x.mean[places], Columns(x.root[places], x.variances))
+
+        return self._replace(gaussian=jax.vmap(single)(self.gaussian))
 
 
 def safe_log(x: jax.Array) -> jax.Array:
@@ -63,36 +71,39 @@ def log_total(log_weight: jax.Array) -> jax.Array:
 
 def together(parts: Sequence[Parts]) -> Parts:
     """Several sums as one."""
-    return Parts(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+    every: Parts = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return every
 
 
 @jax.jit
 def cut(parts: Parts, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> Parts:
     """Each Gaussian cut to lower <= d'x <= upper, (K,) or (), and the Gaussian of the same moments."""
-    law = _law(parts, direction)
-    return _cut(parts, law, [jnp.broadcast_to(end, law[0].shape) for end in (lower, upper)])
+    row, variance = _component(parts, direction)
+    ends = [jnp.broadcast_to(end, variance.shape) for end in (lower, upper)]
+    return _cut(parts, parts.gaussian.mean @ direction, row, variance, ends)
 
 
 @jax.jit
 def cut_away(parts: Parts, direction: jax.Array, edge: jax.Array) -> Parts:
     """Each Gaussian cut to d'x >= edge, and after all these each cut to d'x <= -edge, (2 K,)."""
-    centre, column, variance = _law(parts, direction)
-    turned = jnp.concatenate([centre, -centre]), jnp.concatenate([column, -column]), jnp.tile(variance, 2)
-    return _cut(together([parts, parts]), turned, [jnp.full(2 * len(centre), edge)])
+    row, variance = _component(parts, direction)
+    centre, edges = parts.gaussian.mean @ direction, jnp.full(2 * len(variance), edge)
+    centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
+    return _cut(together([parts, parts]), centre, row, jnp.tile(variance, 2), [edges])
 
 
-def _law(parts: Parts, direction: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mean of d'x, (K,), its covariance with x, (K, N), and its variance, (K,)."""
-    column = parts.covariance @ direction
-    return parts.mean @ direction, column, column @ direction
+def _component(parts: Parts, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The row f (K, N) of d'x = d'm + f xi, and its variance (K,)."""
+    row = direction @ parts.gaussian.root
+    return row, jnp.sum(row**2 * parts.gaussian.variances, axis=1)
 
 
-def _cut(parts: Parts, law: tuple[jax.Array, jax.Array, jax.Array], ends: Sequence[jax.Array]) -> Parts:
-    """Gaussians cut to where d'x is above the first end, and below the second if there is one.
+def _cut(parts: Parts, centre: jax.Array, row: jax.Array, variance: jax.Array, ends: Sequence[jax.Array]) -> Parts:
+    """Gaussians cut to where d'x = centre + row xi is above the first end, and below the second if there is one.
 
-    With c, S the mean and variance of d'x and k = P d / S:  w P(...), m + k sqrt(S) mu, P - k k' S (1 - v).
+    With S the variance of d'x and mu, v the moments of a standard normal number that is cut: d'x moves by sqrt(S) mu
+    and has the variance v S; x given d'x stays.
     """
-    centre, column, variance = law
     # Without variance d'x lies inside or it does not.
     certain = variance <= CERTAIN * (centre**2 + sum(end**2 for end in ends))
     deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
@@ -100,16 +111,12 @@ def _cut(parts: Parts, law: tuple[jax.Array, jax.Array, jax.Array], ends: Sequen
     # Moments of a standard normal number between the two, or beyond one.
     moments = (truncated_normal if len(ends) > 1 else upper_tail)(*((end - centre) / deviation for end in ends))
     log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
-    gain = jnp.where(certain[:, None], 0.0, column / deviation[:, None])
     # Moments of the part inside, where it has any probability.
-    possible = jnp.isfinite(log_mass)
-    shift = jnp.where(possible, moments.mean, 0.0)
-    less = jnp.where(possible, 1 - moments.variance, 0.0)
-    mean = parts.mean + gain * shift[:, None]
-    covariance = jax.vmap(lambda p: with_rounding(p, 1))(parts.covariance)
-    # The product of gains first, so that it is one number for (i, j) and (j, i).
-    covariance = covariance - less[:, None, None] * (gain[:, :, None] * gain[:, None])
-    return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
+    changes = jnp.isfinite(log_mass) & ~certain
+    shift = deviation * jnp.where(changes, moments.mean, 0.0)
+    ratio = jnp.where(changes, moments.variance, 1.0)
+    after = jax.vmap(revise)(parts.gaussian, jnp.where(changes[:, None], row, 0.0), shift, ratio)
+    return Parts(parts.log_weight + log_mass, after, parts.label)
 
 
 def join(parts: Parts, groups: int = 1) -> Parts:
@@ -124,14 +131,11 @@ def _join(parts: Parts, groups: int) -> Parts:
         total = log_total(parts.log_weight)
         share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
-        mean = share @ parts.mean
-        apart = parts.mean - mean
-        inside = parts.covariance + apart[:, :, None] * apart[:, None]
-        covariance = jnp.tensordot(share, inside, axes=1)
-        label = jnp.tensordot(share, parts.label, axes=1)
-        return Parts(total, mean, symmetrize(covariance), label)
+        return Parts(total, merge(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
 
-    return Parts(*jax.vmap(joined)(Parts(*(leaf.reshape(groups, -1, *leaf.shape[1:]) for leaf in parts))))
+    size = len(parts.log_weight) // groups
+    few: Parts = jax.vmap(joined)(jax.tree.map(lambda leaf: leaf.reshape(groups, size, *leaf.shape[1:]), parts))
+    return few
 
 
 def reduced(parts: Parts, count: int, places: slice) -> Parts:
@@ -152,7 +156,7 @@ def _one_fewer(parts: Parts, ends: tuple[int, int]) -> Parts:
     first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))
     top = jnp.max(parts.log_weight)
     weight = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
-    centre, spread = parts.mean[:, places], jnp.diagonal(parts.covariance, axis1=1, axis2=2)[:, places]
+    centre, spread = parts.gaussian.mean[:, places], jax.vmap(lambda x: x.columns.diagonal)(parts.gaussian)[:, places]
     # Cost of each pair, and the least.
     w1, w2 = weight[first], weight[second]
     both = spread[first] + spread[second]
@@ -170,4 +174,5 @@ def _one_fewer(parts: Parts, ends: tuple[int, int]) -> Parts:
         moved = jnp.where(is_second.reshape(shape), values[-1:], values)
         return jnp.where(is_first.reshape(shape), new, moved)[:-1]
 
-    return Parts(*(placed(leaf, new) for leaf, new in zip(parts, merged, strict=True)))
+    fewer: Parts = jax.tree.map(placed, parts, merged)
+    return fewer

@@ -111,8 +111,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         modes = len(state.law)
         sent = repeated(signal, modes)
         posteriors, weight, innovation = receive(sent, channel, jnp.arange(modes), state.law, values)
-        spreads = jnp.asarray(posteriors.covariance)
-        came = join(Parts(safe_log(weight), posteriors.mean, spreads, jnp.eye(len(weight))[:, None]))
+        came = join(Parts(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
 
         log_silent, quiet = self._silence(prior, signal, state.reference, k)
         nothing = self._nothing(prior, _alone(log_silent, quiet, state.law), state.law, channel, down)
@@ -137,7 +136,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         if len(down):
             known, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, known)
-        x = given(after.mean[0], after.covariance[0])
+        x = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
         following = StochasticBelief(*x, after.label[0, 0], state.reference, state.moved)
         return following, Innovation(value, covariance, total)
 
@@ -227,5 +226,5 @@ class StochasticEventFilter(AbstractSizedFilter):
 
 
 def _alone(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> Parts:
-    mean, covariance, law = (jnp.asarray(moment)[None] for moment in (belief.mean, belief.covariance, law))
-    return Parts(log_weight[None], mean, covariance, law[None])
+    alone: Parts = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], Parts(log_weight, belief, law[None]))
+    return alone
