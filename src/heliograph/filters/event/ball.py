@@ -78,7 +78,7 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
         moments = ball_moments(centre, size, radius, inside)
         known = (variance > least) & jnp.isfinite(moments.log_mass)
         gain = jnp.where(known, (x.root * x.variances) @ rows.T / size, 0.0)
-        given, _ = observe(x, rows, jnp.where(known, 0.0, jnp.nan), nothing(len(rows)))
+        given, _ = observe(x, rows, jnp.zeros(len(rows)), nothing(len(rows)), known)
         mean = x.mean + gain @ jnp.where(known, moments.mean - centre, 0.0)
         spread = eliminated(moments.covariance).through(gain)
         return moments.log_mass, of_columns(mean, joined(given.columns, spread))

@@ -79,7 +79,7 @@ def updated(
 
     def single(x: Gaussian) -> tuple[Gaussian, jax.Array]:
         expected, slopes, noise = _through(x, link.of_sender(sender, m), m)
-        after, innovations = observe(x, slopes, jnp.where(there, z - expected, jnp.nan), noise)
+        after, innovations = observe(x, slopes, z - expected, noise, there)
         if delivers:  # y is z, to the last digit
             after = pinned(after, np.arange(size - m, size)[sender], jnp.where(there, z, 0.0))
         return after, innovations.log_density(there, jnp.abs(jnp.where(there, z, 0.0)))

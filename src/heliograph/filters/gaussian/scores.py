@@ -128,14 +128,13 @@ def reweighted(noise: Columns, w: jax.Array) -> Columns:
 
 def joint_update(before: Expected, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
     """State after the components that are present, with noise of this covariance besides that of t."""
-    innovation = jnp.where(present, e, jnp.nan)
-    return observe(before.prior, before.slopes, innovation, joined(before.noise, noise))[0]
+    return observe(before.prior, before.slopes, e, joined(before.noise, noise), present)[0]
 
 
 def squared_residuals(before: Expected, noise: Columns, e: jax.Array, present: jax.Array) -> jax.Array:
     """E_i = (z_i - t_i+)^2 + V_ii+ after a joint update with this noise: what is then known of each noise's square."""
     t = of_columns(jnp.zeros_like(e), before.columns)
-    after, _ = observe(t, t.root, jnp.where(present, e, jnp.nan), noise)
+    after, _ = observe(t, t.root, e, noise, present)
     return (e - after.mean) ** 2 + after.columns.diagonal
 
 
