@@ -18,6 +18,7 @@ from heliograph.factors.gaussian import (
     merge,
     move,
     observe,
+    of_columns,
     of_sum,
     revise,
     smoothed,
@@ -250,3 +251,18 @@ def test_rows_below_a_gaussian_are_the_joint_law_and_its_first_components_the_sa
     np.testing.assert_allclose(both.covariance[3:, :3], h @ p, **EXACT)
     for before, now in zip(x, leading(both, 3), strict=True):
         np.testing.assert_array_equal(now, before)
+
+
+@pytest.mark.parametrize("size", [1e-154, 1e-155, 1e-160, 1e-170])
+def test_squares_below_the_normal_numbers_count_as_zero(size):
+    """1 / 1e-310 is no number: the column stays as it is, and nothing is learned of what it hides in."""
+    x = Gaussian(np.zeros(2), np.array([0.5]), np.array([1.0, 2.0]))
+    both = of_columns(np.zeros(2), Columns(np.array([[size, 0.0], [size, 1.0]]), np.ones(2)))
+    np.testing.assert_allclose(both.covariance, [[0.0, 0.0], [0.0, 1.0]], atol=1e-300)
+    after, _ = observe(x, np.array([[size, 0.0]]), np.zeros(1), nothing(1))
+    revised = revise(x, np.array([size, 0.0]), 0.0, 0.5)
+    for part in (*both, *after, *revised):
+        assert np.isfinite(part).all()
+    if size < 1e-154:
+        for now in (after, revised):
+            np.testing.assert_array_equal(now.variances, x.variances)

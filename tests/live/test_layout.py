@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.live.layout import factors, fits, moved, placed, with_covariances
+from heliograph.live.layout import factors, fits, moved, parts_of, placed, with_covariances
 
 NEW = {
     ".mean": [2, 3],
@@ -27,6 +28,15 @@ def test_an_older_layout_is_that_of_now_with_covariances():
         NEW | {".covariance": [2, 3, 3]},
     ):
         assert not fits(other, NEW)
+
+
+def test_a_sum_of_an_event_filter_has_its_parts_in_the_order_that_they_had_with_covariances():
+    """Snapshots without names of parts are read by this order."""
+    sensor = hg.LinearSensor([[1.0]], 0.1)
+    start = hg.event_filter(hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), sensor, hg.perfect(1), hg.SendOnDelta(0.5)).init()
+    before = with_covariances({path: part.shape for path, part in parts_of(start).items()})
+    assert list(before) == [".weight", ".mean", ".covariance", ".label", ".begun", ".moved"]
+    assert before[".covariance"] == list(start.covariance.shape)
 
 
 @pytest.mark.parametrize("count", [1, 63, 130])

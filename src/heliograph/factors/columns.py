@@ -99,21 +99,26 @@ def _taken(entries: jax.Array, places: np.ndarray) -> jax.Array:
     return lax.gather(entries, places[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
 
 
+def is_positive(x: jax.Array) -> jax.Array:
+    """Whether a number is above zero and 1 / x is a number too, which it is not of the smallest: these count as 0."""
+    return x > float(np.finfo(np.dtype(x.dtype)).tiny)
+
+
 def inverse(x: jax.Array) -> jax.Array:
     """1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
-    return 1 / jnp.where(x > 0, x, 1.0)
+    return 1 / jnp.where(is_positive(x), x, 1.0)
 
 
 def reciprocal(x: jax.Array) -> jax.Array:
     """1 / x of a positive number, and 0 of 0."""
-    some = x > 0
-    return jnp.where(some, 1 / jnp.where(some, x, 1.0), 0.0)
+    positive = is_positive(x)
+    return jnp.where(positive, 1 / jnp.where(positive, x, 1.0), 0.0)
 
 
 def square_root(x: jax.Array) -> jax.Array:
     """Root of x, of slope 0 at 0: what is even in it has one there, and 0 times infinity would be none."""
-    some = x > 0
-    return jnp.where(some, jnp.sqrt(jnp.where(some, x, 1.0)), 0.0)
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def triangular(columns: Columns) -> Columns:

@@ -18,6 +18,7 @@ from heliograph.factors.columns import (
     decorrelated,
     eliminated,
     inverse,
+    is_positive,
     joined,
     known_factors,
     triangular,
@@ -219,7 +220,7 @@ def _turned(
     later = lax.pad(lax.slice_in_dim(w, 1, n, axis=1), jnp.zeros((), w.dtype), [(0, 0, 0), (0, 1, 0)])
     strictly = np.concatenate([lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
     after = root - lax.select(strictly, later * (f * over_next), jnp.zeros_like(root))
-    kept = lax.select(here > 0, d * (next_ * over_here), d)
+    kept = lax.select(is_positive(here), d * (next_ * over_here), d)
     return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False)
 
 

@@ -33,14 +33,14 @@ COUNTED = 16  # lost transmissions that are counted; more are as many
 class EventBelief(NamedTuple):
     """The sum: Gaussians of (x, r), r the sender's reference, and labels (mode, steps since sent, number lost).
 
-    Shapes, with N = n + m: mean, variances (H, N), lower (H, N (N - 1) / 2), weight (H,), label (H, S, M, A, C) with
+    Shapes, with N = n + m: weight (H,), mean, variances (H, N), lower (H, N (N - 1) / 2), label (H, S, M, A, C) with
     S = 1 where y is sent as a whole, else m; `begun` (S,) once there is a reference, `moved` once the chain was used.
     """
 
+    weight: jax.Array
     mean: jax.Array
     lower: jax.Array
     variances: jax.Array
-    weight: jax.Array
     label: jax.Array
     begun: jax.Array
     moved: jax.Array
@@ -48,7 +48,7 @@ class EventBelief(NamedTuple):
     @property
     def gaussian(self) -> Gaussian:
         """The Gaussians of (x, r)."""
-        return Gaussian(*self[:3])
+        return Gaussian(self.mean, self.lower, self.variances)
 
     @property
     def covariance(self) -> Any:
@@ -63,7 +63,7 @@ class EventBelief(NamedTuple):
     @staticmethod
     def of(parts: Parts, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """The state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
-        return EventBelief(*parts.gaussian, jnp.exp(parts.log_weight), parts.label, begun, moved)
+        return EventBelief(jnp.exp(parts.log_weight), *parts.gaussian, parts.label, begun, moved)
 
 
 class EventFilter(AbstractSizedFilter):
@@ -150,7 +150,7 @@ class EventFilter(AbstractSizedFilter):
         if self.trigger.heartbeat is not None:
             older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
             label = older.at[..., -1, :].add(label[..., -1, :])
-        return EventBelief(*both, state.weight, label, state.begun, jnp.asarray(True))
+        return EventBelief(state.weight, *both, label, state.begun, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""

@@ -136,7 +136,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         if len(down):
             known, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, known)
-        x = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
+        x: Gaussian = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
         following = StochasticBelief(*x, after.label[0, 0], state.reference, state.moved)
         return following, Innovation(value, covariance, total)
 
