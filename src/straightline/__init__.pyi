@@ -2,6 +2,14 @@
 
 from .compiled import (
     compile as compile,
+    compile_one as compile_one,
+    explain as explain,
+)
+from .accumulated import (
+    accumulate as accumulate,
+)
+from .rules.present import (
+    present as present,
 )
 from .nodes import (
     Unsupported as Unsupported,

@@ -1,15 +1,22 @@
 """Compiled programs over consecutive runs: some results summed over them, others returned run by run."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
+from types import MappingProxyType
 from typing import Any
 
+import jax
 import numpy as np
+from jaxtyping import PyTree
 
-from straightline.compiled import addresses, aligned
+from straightline.compiled import addresses, aligned, memory_of, threads
 from straightline.folding import DTYPES
 from straightline.llvm.module import written
+from straightline.lowering import like
 from straightline.machine import WIDEST, Tiers, features, narrow
-from straightline.program import Program, Summed, row_length
+from straightline.program import Program, Summed, folded, lower, row_length
+
+PARTS = 64  # sums of their own, which computers of any number of cores share out
 
 
 class Accumulated:
@@ -20,10 +27,10 @@ class Accumulated:
 
     def __init__(self, program: Program, summed: Summed):
         differs = [n == summed.number for n in range(len(program.inputs))]
-        self.summed = summed
+        self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
         self.code = written(program, differs, WIDEST, features()[2], summed=summed)
-        self.common = self.code.common
+        self.common, self.operations = self.code.common, self.code.operations
         self.blocks = Tiers(self.code.blocks, (narrow(), WIDEST))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
 
@@ -45,13 +52,43 @@ class Accumulated:
         """
         return Begun(self, arguments, runs)
 
+    def __call__(self, *arguments: PyTree, runs: int, first: int = 0) -> PyTree:
+        """Compute runs on all cores; return sums, (..., batch), and what is collected, (run, ...).
+
+        Runs are dealt to sums of their own in an order that depends on their count alone, and so do the bits.
+
+        Args:
+            arguments: trees like the examples.
+            runs: how many.
+            first: number of the first one; 0 by default.
+        """
+        begun = self.begin(jax.tree.leaves(arguments), runs)
+        share = -(-runs // (PARTS * WIDEST)) * WIDEST
+        starts = range(first, first + runs, share)
+        sums = [begun.zeros() for _ in starts]
+
+        def compute(part: int) -> list[np.ndarray | None]:
+            return begun.add(np.arange(starts[part], min(starts[part] + share, first + runs)), sums[part])
+
+        collected = list(threads().map(compute, range(len(starts))))
+        totals = iter(begun.total(sums))
+        leaves: list[Any] = []
+        for fixed, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
+            total = next(totals) if is_summed else None
+            if fixed is None:
+                leaves.append(total if is_summed else np.concatenate(parts))
+            else:  # all runs share it
+                counts = _counts(first, runs, self.summed.batches)
+                leaves.append(fixed[..., None] * counts if is_summed else np.broadcast_to(fixed, (runs, *fixed.shape)))
+        return jax.tree.unflatten(self.tree, leaves)
+
 
 class Begun:
     """A program with its arguments; `shared` has the results that all runs share, None for all others."""
 
     def __init__(self, program: Accumulated, arguments: Sequence[Any], runs: int):
-        self.program = program
-        self.arguments = [np.ascontiguousarray(x, dtype=t) for x, t in zip(arguments, program.types, strict=True)]
+        self.program, self.summed = program, program.summed.outputs
+        self.arguments = [memory_of(x, t) for x, t in zip(arguments, program.types, strict=True)]
         self.memory = aligned(program.code.shared)
         self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:
@@ -67,7 +104,7 @@ class Begun:
         self._machine = None if all(program.common) else program.blocks.machine(-(-runs // WIDEST))
 
     def zeros(self) -> list[np.ndarray]:
-        """Return sums over no runs, of each summed result: (..., batch), rows as `folded` takes them."""
+        """Return sums over no runs, of each summed result, as `add` and `total` take them."""
         length = row_length(WIDEST, self.program.summed.batches)
         return [np.zeros((*b.shape, length)) for b, s in self._outputs() if s]
 
@@ -96,6 +133,10 @@ class Begun:
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
         return given
 
+    def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+        """Return the sums (..., batch) of several sums, of each summed result."""
+        return [folded(reduce(np.add, sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
+
     def _outputs(self) -> list[tuple[Any, bool]]:
         return list(zip(self.program.code.outputs, self.program.summed.outputs, strict=True))
 
@@ -104,3 +145,45 @@ class Begun:
         inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
         every = [*inputs, *self.program.code.tables, *results, self.memory]
         return np.array(addresses(every), dtype=np.uint64)
+
+
+def accumulate(
+    function: Callable[..., PyTree],
+    *examples: PyTree,
+    batches: int = 1,
+    known: Mapping[int, np.ndarray] = MappingProxyType({}),
+) -> Accumulated:
+    """Compile a JAX function of the number of a run, whose results are summed over runs or collected.
+
+    Such is a Monte Carlo simulation: the run's number makes its key. What is summed takes no more memory for more runs.
+    The result is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
+
+    Args:
+        function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what
+            is summed (real numbers, in a tree) and what is collected run by run (a tree, such as `()`).
+        examples: the arguments without the number; shapes and types count alone, but for what is known.
+        batches: sums that are kept apart, run r in that of r mod `batches`, from which the mean has an error; 1 by
+            default.
+        known: of examples by their number among the leaves, which entries (a mask) are the example's in every call,
+            such as zeros; they are constants of the code. None by default.
+
+    Raises:
+        Unsupported: an operation that native code does not take, with the line that it comes from.
+        ValueError: a function that returns no pair.
+    """
+    features()  # refuses a processor that LLVM does not know
+    leaves = jax.tree.leaves(examples)
+    numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
+    program = lower(function, *examples, like((), np.uint32), known=numbers)
+    pair = program.tree.children()
+    if program.tree.node_data() is None or program.tree.node_data()[0] is not tuple or len(pair) != 2:
+        expected = "a pair of what is summed and what is collected"
+        raise ValueError(f"function of a run: expected {expected}, got {program.tree}")
+    count = pair[0].num_leaves
+    summed = tuple(n < count for n in range(len(program.outputs)))
+    return Accumulated(program, Summed(summed, batches, len(leaves)))
+
+
+def _counts(first: int, runs: int, batches: int) -> np.ndarray:
+    """Return how many runs each batch has."""
+    return np.bincount(np.arange(first, first + runs % batches) % batches, minlength=batches) + runs // batches

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
+from straightline.graph import MOST
 from straightline.llvm.module import LINE, Code, written
 from straightline.machine import LONG, WIDEST, Machine, Tiers, features, generated, narrow
 from straightline.nodes import Unsupported
@@ -26,7 +27,8 @@ class Compiled:
     """Code for blocks of runs, one for each number of a vector; of `width` runs, or of as many as suit the processor.
 
     `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
-    it. Results have the same bits whatever the width and the number of cores.
+    it. Results have the same bits whatever the width and the number of cores. `operations` are those of a run,
+    `divisions` those of them that divide or take roots.
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
@@ -36,16 +38,17 @@ class Compiled:
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
         self.code: Code = written(program, self.differs, self.width, features()[2])
+        self.operations, self.divisions = self.code.operations, self.code.divisions
         self.blocks = Tiers(self.code.blocks, (width or narrow(), self.width))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
         self._why: str | None = None
         self._first: list[np.ndarray] = []
         self._addresses, self._tables = list[int](), addresses(self.code.tables)
 
-    def with_first(self, *leaves: Any) -> "Compiled":
+    def with_first(self, *arguments: PyTree) -> "Compiled":
         """Return the same code whose first arguments are these, which calls leave out."""
         new = copy(self)
-        new._first = [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types, strict=False)]
+        new._first = [memory_of(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
         new._addresses = addresses(new._first)
         return new
 
@@ -65,10 +68,27 @@ class Compiled:
     def _runs(self, arrays: Sequence[Any]) -> int:
         return next((len(x) for x, d in zip(arrays, self.differs, strict=False) if d), 1)
 
-    def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
-        """Return the results of all runs, with a leading axis of runs."""
-        arrays, given = list(self._first), len(self._first)
-        arrays += [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types[given:], strict=True)]
+    def _arrays(self, arguments: PyTree) -> list[np.ndarray]:
+        """Return the arguments of a call, of the types and shapes that the code has."""
+        leaves, given = jax.tree.leaves(arguments), len(self._first)
+        if len(leaves) != len(self.types) - given:
+            raise ValueError(f"arguments: expected {len(self.types) - given} arrays, got {len(leaves)}")
+        arrays = [*self._first, *(memory_of(x, t) for x, t in zip(leaves, self.types[given:], strict=True))]
+        runs = self._runs(arrays)
+        for number, (x, shape, differs) in enumerate(zip(arrays, self.shapes, self.differs, strict=True)):
+            if x.shape != ((runs, *shape) if differs else shape):
+                expected = f"(run, {', '.join(map(str, shape))})" if differs else shape
+                raise ValueError(f"array {number} of the arguments: expected shape {expected}, got {x.shape}")
+        return arrays
+
+    def __call__(self, *arguments: PyTree, cores: int | None = None) -> PyTree:
+        """Return the results of all runs, with a leading axis of runs.
+
+        Args:
+            arguments: trees like the examples; arrays of which each run has its own have a leading axis of runs.
+            cores: threads that compute; those of the machine by default.
+        """
+        arrays, given = self._arrays(arguments), len(self._first)
         runs = self._runs(arrays)
         code = self.code
         outputs = [np.empty((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
@@ -157,10 +177,84 @@ class Alone:
         run(pointers, scratch, 0, 1, 1)
 
 
-def compile(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = ()) -> Compiled:
-    """Compile a function of one run's arguments, of the shapes of these, for many runs."""
+def compile(
+    function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = (), most: int = MOST
+) -> Compiled:
+    """Compile a JAX function of one run's arrays for many runs, in double precision.
+
+    The result is called with arrays that have a leading axis of runs, and returns NumPy arrays that have one too. Runs
+    are computed side by side in the lanes of the processor's vectors, on all cores; what depends on shared arguments
+    alone is computed once. A run's bits depend neither on its neighbours nor on the number of cores.
+
+    Args:
+        function: of one run's arguments, trees of arrays; any that JAX traces.
+        examples: arguments of one run, of which shapes and types count alone (numbers, arrays, `jax.ShapeDtypeStruct`).
+        shared: numbers of the arguments that all runs share, which calls give without the axis of runs; none by
+            default.
+        most: operations above which the function is refused; 400,000 by default.
+
+    Raises:
+        Unsupported: an operation that native code does not take, with the line that it comes from.
+    """
+    features()  # refuses a processor that LLVM does not know
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
-    return Compiled(lower(function, *examples), differs)
+    return Compiled(lower(function, *examples, most=most), differs)
+
+
+def compile_one(
+    function: Callable[..., PyTree], *examples: PyTree, in_place: Mapping[int, int] = MappingProxyType({})
+) -> Alone:
+    """Compile a JAX function for one run that is computed again and again, such as a step of a controller.
+
+    The result has memory of its own: arrays `inputs` and `outputs`, leaf by leaf, and a call, which takes no arguments
+    and less than a microsecond beside the arithmetic, computes the one from the other. `again` makes another such
+    memory for the same code.
+
+    Args:
+        function: of trees of arrays; any that JAX traces.
+        examples: arguments, of which shapes and types count alone.
+        in_place: which results, by their number among the leaves (from the last if negative), are written over which
+            arguments, by theirs; none by default.
+
+    Raises:
+        Unsupported: an operation that native code does not take, with the line that it comes from.
+    """
+    features()  # refuses a processor that LLVM does not know
+    program = lower(function, *examples)
+    return Alone(program, {n % len(program.outputs): argument for n, argument in in_place.items()})
+
+
+def explain(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = ()) -> str:
+    """Say of how many operations the code of a function would be, loads of arguments among them, or why there is none.
+
+    Args:
+        function: of one run's arguments, as for `compile`.
+        examples: arguments of one run, of which shapes and types count alone.
+        shared: numbers of the arguments that all runs share; none by default.
+
+    Returns:
+        "57 operations, 3 of them divisions and roots", or "refused: svd at model.py:12".
+    """
+    try:
+        code = compile(function, *examples, shared=shared)
+    except Unsupported as error:
+        return f"refused: {error}"
+    return counted(code)
+
+
+def counted(code: Compiled) -> str:
+    """Return the operations of a run in words."""
+    return f"{code.operations} operations{f', {code.divisions} of them divisions and roots' if code.divisions else ''}"
+
+
+def memory_of(x: Any, dtype: Any) -> np.ndarray:
+    """Return numbers as contiguous memory; a key of random numbers as its words."""
+    if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
+        x = jax.random.key_data(x)
+    array = np.asarray(x)
+    if array.dtype.kind not in ("biuf" if dtype == np.float64 else "biu"):
+        raise ValueError(f"arguments: expected numbers of type {np.dtype(dtype)}, got {array.dtype}")
+    return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
 
 
 def addresses(arrays: Sequence[np.ndarray]) -> list[int]:

@@ -116,15 +116,15 @@ class Lowering:
 
 
 def failed(operation: str, error: Exception, where: str) -> Unsupported:
-    """Return an error by which XLA computes a program whose native code cannot be made, and say so once for a line."""
+    """Return the refusal of a program whose native code cannot be made for a defect, and say so once for a line."""
     refused = Unsupported(f"{operation}, whose native code failed ({type(error).__name__}: {error})", where)
-    say(f"native code: {refused}; XLA computes")
+    say(f"no native code: {refused}")
     return refused
 
 
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """Turn a failure of what makes native code into a refusal, by which XLA computes."""
+    """Turn a failure of what makes native code into a refusal."""
     try:
         yield
     except Unsupported:

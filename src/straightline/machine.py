@@ -11,6 +11,7 @@ import llvmlite.binding as llvm
 
 from straightline.llvm.module import Source
 from straightline.lowering import refusing, say
+from straightline.nodes import Unsupported
 
 Function = Callable[[int, int, int, int, int], None]
 SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
@@ -27,10 +28,18 @@ LONG = 20_000
 
 @cache
 def target() -> llvm.Target:
-    """Return the LLVM target of this machine."""
+    """Return the LLVM target of this machine.
+
+    Raises:
+        Unsupported: LLVM does not know its processor, which is said once.
+    """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple()
+    try:
+        return llvm.Target.from_default_triple()
+    except RuntimeError as error:
+        say(f"no native code: expected a processor that LLVM knows, got {error}")
+        raise Unsupported("LLVM does not know this processor") from None
 
 
 @cache

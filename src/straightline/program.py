@@ -4,8 +4,9 @@ Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 
 most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning (`folded`).
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -14,17 +15,17 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
 from straightline.graph import MOST, Graph
-from straightline.lowering import Lowering, Value, keys_of, traced, type_of
-from straightline.memory import InMemory
+from straightline.lowering import Lowering, Value, array_of, keys_of, traced, type_of
+from straightline.memory import LONG, InMemory
 from straightline.nodes import Block, Buffer, Guard, Loop, Node, Store
 from straightline.rules import (  # noqa: F401  (they fill the rules)
-    arrived,
     calls,
     decompositions,
     elementwise,
     indexing,
     loops,
     matrices,
+    present,
     random_bits,
     rows,
     scatter,
@@ -47,26 +48,53 @@ class Program(NamedTuple):
     tree: Any
 
 
-def lower(function: Callable[..., PyTree], *examples: PyTree, most: int = MOST) -> Program:
+Known = Mapping[int, tuple[np.ndarray, np.ndarray]]  # number of a leaf -> which entries are known, and these numbers
+
+
+def lower(
+    function: Callable[..., PyTree],
+    *examples: PyTree,
+    most: int = MOST,
+    known: Known = MappingProxyType({}),
+) -> Program:
     """Lower a function of one run, for arguments of these shapes, to at most so many operations."""
-    return lower_traced(*traced(function, *examples), most)
+    return lower_traced(*traced(function, *examples), most, known)
 
 
-def lower_traced(traced: ClosedJaxpr, tree: Any, most: int = MOST) -> Program:
+def lower_traced(
+    traced: ClosedJaxpr,
+    tree: Any,
+    most: int = MOST,
+    known: Known = MappingProxyType({}),
+) -> Program:
     """Lower a program that is traced already."""
     lowering = Lowering(most)
     avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
     inputs, values = [], []
-    for aval in avals:
+    for number, aval in enumerate(avals):
         is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
         shape = (*aval.shape, 2) if is_key else aval.shape
         buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
         view = InMemory.whole(buffer)
         inputs.append(buffer)
-        values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
+        if number in known:
+            values.append(_partly_known(lowering, view, *known[number]))
+        else:
+            values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
     with jax.enable_x64(True):
         outputs = lowering.results(traced, values)
     return Program(lowering.graph, inputs, outputs, tree)
+
+
+def _partly_known(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
+    """Return an array of which some entries are known: all, or a few of a short one, as constants."""
+    if mask.all():
+        return lowering.known(numbers)
+    if view.size > LONG:
+        return view
+    graph, kind = lowering.graph, view.type
+    entries = zip(mask.ravel().tolist(), numbers.ravel().tolist(), range(view.size), strict=True)
+    return array_of([graph.constant(x, kind) if m else graph.load(view.buffer, i) for m, x, i in entries], view.shape)
 
 
 def needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
@@ -248,6 +276,7 @@ def row_length(width: int, batches: int) -> int:
 def folded(sums: np.ndarray, batches: int) -> np.ndarray:
     """Return sums (..., batch) from rows (..., `row_length`)."""
     totals = sums[..., :batches].copy()
-    beyond = sums[..., batches:]
-    totals[..., : beyond.shape[-1]] += beyond
+    for start in range(batches, sums.shape[-1], batches):
+        beyond = sums[..., start : start + batches]
+        totals[..., : beyond.shape[-1]] += beyond
     return totals

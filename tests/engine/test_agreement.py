@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.engine import choice as engine
 from heliograph.engine.choice import engine_of
 from heliograph.numerics.over_runs import runs_last
+from straightline import machine
 from straightline.compiled import Alone, Compiled, compile
 from straightline.jax_function import function_of
 from straightline.program import lower
@@ -381,9 +381,9 @@ def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypa
         raise RuntimeError("no target for this processor")
 
     x = RANDOM.normal(size=(3, 2, 2))
-    monkeypatch.setattr(engine, "target", unknown)
-    engine._available.cache_clear()
-    with pytest.warns(UserWarning, match="native code: expected a processor that LLVM knows, got no target"):
+    monkeypatch.setattr(machine.llvm.Target, "from_default_triple", unknown)
+    for cached in (machine.target, machine.features):
+        cached.cache_clear()
+    with pytest.warns(RuntimeWarning, match="no native code: expected a processor that LLVM knows, got no target"):
         assert engine_of(lambda x: x @ x, x) == "xla: LLVM does not know this processor"
     np.testing.assert_allclose(hg.simulation.over_runs(lambda x: x @ x, x), x @ x)
-    engine._available.cache_clear()

@@ -48,7 +48,7 @@ def test_a_rule_that_fails_lets_xla_compute_and_says_so_once(monkeypatch):
 
     monkeypatch.setitem(RULES, "cbrt", fails)
     x = np.array([8.0, 27.0])
-    with pytest.warns(RuntimeWarning, match=r"native code: cbrt, .*no such thing.* at .*test_meaning.py:\d+; XLA"):
+    with pytest.warns(RuntimeWarning, match=r"no native code: cbrt, .*no such thing.* at .*test_meaning.py:\d+"):
         values = hg.simulation.over_runs(lambda v: jnp.cbrt(v) + 1, x)
     np.testing.assert_allclose(values, [3.0, 4.0], rtol=1e-12)  # XLA's root has 14 digits
 
@@ -81,7 +81,7 @@ def test_xla_computes_where_llvm_makes_no_code_which_is_said_once(compute, monke
         patch.setattr("straightline.machine.Machine", fails)
         with pytest.warns(RuntimeWarning) as said:
             values = compute()
-    assert ["LLVM ERROR" in str(x.message) and "XLA computes" in str(x.message) for x in said] == [True]
+    assert ["LLVM ERROR" in str(x.message) and "no native code" in str(x.message) for x in said] == [True]
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "xla")
     np.testing.assert_allclose(values, compute(), rtol=1e-12)
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from straightline import present
 from straightline.accumulated import Accumulated
 from straightline.lowering import scalars
 from straightline.machine import Machine
 from straightline.program import Summed, folded, lower, row_length
-from straightline.rules.arrived import arrived
 
 BATCHES, STEPS = 50, 4
 
@@ -103,9 +103,9 @@ def test_a_sum_of_what_is_used_again():
 
 def test_what_has_arrived_is_never_requested():
     def filled(x):
-        return jnp.where(jnp.isnan(x), 0.0, 2 * x), jnp.where(jnp.isnan(arrived(x)), 0.0, 3 * x)
+        return jnp.where(jnp.isnan(x), 0.0, 2 * x), jnp.where(jnp.isnan(present(x)), 0.0, 3 * x)
 
     program = lower(filled, np.zeros(2))
     asking, plain = ([node.op for node in scalars(output)] for output in program.outputs)
     assert asking == ["select", "select"] and plain == ["mul", "mul"]
-    np.testing.assert_array_equal(jax.jit(jax.vmap(arrived))(np.array([1.0, np.nan])), [1.0, np.nan])
+    np.testing.assert_array_equal(jax.jit(jax.vmap(present))(np.array([1.0, np.nan])), [1.0, np.nan])

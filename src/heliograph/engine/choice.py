@@ -4,8 +4,8 @@ The environment variable HELIOGRAPH_ENGINE forces one: "native", which refuses u
 """
 
 import os
-import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache, wraps
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -18,12 +18,7 @@ from heliograph.numerics.collector import no_collector
 from heliograph.numerics.stack import with_room
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
-from straightline.compiled import Compiled
-from straightline.graph import MOST
-from straightline.lowering import like, traced
-from straightline.machine import target
-from straightline.nodes import Unsupported
-from straightline.program import lower_traced
+from straightline import Unsupported, compile
 
 Code = TypeVar("Code")
 P = ParamSpec("P")
@@ -31,14 +26,21 @@ R = TypeVar("R")
 
 SETTING = "HELIOGRAPH_ENGINE"
 COMPILED = 256  # functions whose code is held at once
+LONG = 400_000  # operations, those that fold among them: a longer program is left to XLA
 SHORT = 8_000  # operations: native code of 11,000 takes as long to make as a program of XLA, one of a thousand a third
 ENGINES = ("native", "xla")
+
+
+@cache
+def threads() -> ThreadPoolExecutor:
+    """Return a pool of threads for parts of one computation, one thread for each core."""
+    return ThreadPoolExecutor(os.cpu_count() or 1)
 
 
 class Choice(NamedTuple):
     """Code of a function, or the reason why XLA computes it; `arrays` are those of its arguments and of its closure."""
 
-    code: Compiled | None
+    code: Any  # what `straightline.compile` returns
     why: str
     arrays: tuple[Any, ...] = ()
 
@@ -47,13 +49,11 @@ class Choice(NamedTuple):
         """Return "native: ..." with the number of operations, or "xla: ..." with the reason."""
         if self.code is None:
             return f"xla: {self.why}"
-        code = self.code.code
-        slow = f", {code.divisions} of them divisions and roots" if code.divisions else ""
-        return f"native: {code.operations} operations{slow}"
+        slow = f", {self.code.divisions} of them divisions and roots" if self.code.divisions else ""
+        return f"native: {self.code.operations} operations{slow}"
 
     def results(self) -> PyTree:
         """Run the code on the arrays."""
-        assert self.code is not None
         return self.code(*self.arrays)
 
 
@@ -76,7 +76,7 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
 
 
 def chosen(
-    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int = MOST
+    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int = LONG
 ) -> Choice:
     """Return the code of a function of one run for arguments like these, compiled once; or why there is none.
 
@@ -85,7 +85,7 @@ def chosen(
     engine = setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
-    choice = _available() or _cached(function, arguments, differs, MOST if engine == "native" else most)
+    choice = _cached(function, arguments, differs, LONG if engine == "native" else most)
     if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
         choice = Choice(None, why)
     if choice.code is None and engine == "native":
@@ -94,7 +94,7 @@ def chosen(
 
 
 def computed(
-    function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree], most: int = MOST
+    function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree], most: int = LONG
 ) -> PyTree:
     """Compute a function once, in double precision, as NumPy arrays: by native code where it supports the function.
 
@@ -146,7 +146,7 @@ def setting() -> str:
 def attempted(make: Callable[[], Code]) -> Code | None:
     """Return native code, or None if XLA has to compute instead."""
     engine = setting()
-    if engine == "xla" or _available() is not None:
+    if engine == "xla":
         return None
     try:
         with no_collector():
@@ -155,17 +155,6 @@ def attempted(make: Callable[[], Code]) -> Code | None:
         if engine == "native":
             raise fail("native code", "a program of operations that it takes", str(error)) from None
         return None
-
-
-@cache
-def _available() -> Choice | None:
-    """Return None if this machine can run native code, else the reason, which is reported once."""
-    try:
-        target()
-    except RuntimeError as error:
-        warnings.warn(f"native code: expected a processor that LLVM knows, got {error}; XLA computes", stacklevel=4)
-        return Choice(None, "LLVM does not know this processor")
-    return None
 
 
 def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int) -> Choice:
@@ -201,7 +190,7 @@ class _Array(NamedTuple):
 @lru_cache(COMPILED)
 @with_room
 @no_collector()
-def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Compiled | None, str]:
+def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Any, str]:
     """Compile code for one structure, and the shapes and types of its arrays."""
     arrays = [k for k in kinds if isinstance(k, _Array)]
 
@@ -211,8 +200,9 @@ def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Compiled | None
         function, *arguments = jax.tree.unflatten(form, leaves)
         return function(*arguments)
 
-    traced_program, tree = traced(call, *(like(k.shape, k.dtype) for k in arrays))
+    struct: Any = jax.ShapeDtypeStruct
+    examples = [struct(k.shape, k.dtype) for k in arrays]
     try:
-        return Compiled(lower_traced(traced_program, tree, most), [k.differs for k in arrays]), ""
+        return compile(call, *examples, shared=[n for n, k in enumerate(arrays) if not k.differs], most=most), ""
     except Unsupported as error:
         return None, str(error)

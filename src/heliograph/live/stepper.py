@@ -13,9 +13,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.trees.static import Static
 from heliograph.numerics.types import Float, PyTree
-from straightline.compiled import Alone
-from straightline.nodes import Unsupported
-from straightline.program import lower
+from straightline import Unsupported, compile_one
 
 Leaves = list[np.ndarray]
 
@@ -23,7 +21,7 @@ Leaves = list[np.ndarray]
 class NativeStepper:
     """State of one filter, stepped in place by native code."""
 
-    def __init__(self, code: Alone, numbers: Leaves, state: Leaves):
+    def __init__(self, code: Any, numbers: Leaves, state: Leaves):
         self._code = code.again(numbers)
         places, outputs, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
         self._state, (self._z, self._u, self._k) = places[:n], places[n:]
@@ -117,7 +115,7 @@ def by_xla(static: Static) -> Any:
     return jax.jit(step, compiler_options=understood())
 
 
-def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Alone | None:
+def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
     """Compile native code with arguments (numbers, state, z, u, k), flattened; None if XLA has to step the filter."""
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
@@ -127,7 +125,7 @@ def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: 
 @lru_cache
 def _made(
     static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
-) -> Alone | None:
+) -> Any:
     """Compile the native code, once for each structure, set of shapes and engine."""
     numbers, state = counts
 
@@ -140,10 +138,9 @@ def _made(
         placed = [jnp.where(flagged, b, a) for a, b in zip(after, before, strict=True)]
         return judged, flagged, after, estimate, placed  # what takes the state's place comes last
 
-    def made() -> Alone:
-        # The last outputs are written over the arguments of the state.
-        program = lower(step, *(np.zeros(shape, kind) for shape, kind in shapes))
-        first = len(program.outputs) - state
-        return Alone(program, {first + i: numbers + i for i in range(state)})
+    def made() -> Any:
+        # The last results are written over the arguments of the state.
+        in_place = {-state + i: numbers + i for i in range(state)}
+        return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
     return attempted(made)

@@ -12,7 +12,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.medium import AbstractMedium
 from heliograph.simulation.stepping import AllFilters
-from straightline.rules.arrived import arrived
+from straightline import present
 
 
 class World(Module):
@@ -34,7 +34,7 @@ class World(Module):
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         medium, z = self.medium.receive(medium, x, u, key, k)
-        z = tuple(arrived(values) if whole else values for values, whole in zip(z, self.filters.complete, strict=True))
+        z = tuple(present(values) if whole else values for values, whole in zip(z, self.filters.complete, strict=True))
         drawn: dict[str, PyTree] = {name: link.uplinks.draw(key, k) for name, link in self.filters.reporting.items()}
         across = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
         edges = {name: state for name, (state, _) in across.items()}

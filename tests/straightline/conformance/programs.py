@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 
 from heliograph.numerics.over_runs import runs_last
-from straightline.rules.arrived import arrived
+from straightline import present
 from tests.straightline.conformance.case import Case
 
 X = np.array([0.0, -0.0, 1.5, -2.0, np.nan, np.inf, 40.0])
@@ -100,7 +100,7 @@ CASES: dict[str, list[Case]] = {
     "call_hi_primitive": _of(lambda x: jnp.frexp(x)[0]),
     "platform_index": _of(lambda x: lax.platform_dependent(x, cpu=lambda v: v + 1, default=lambda v: v - 1)),
     "runs_last": _of(runs_last(lambda x: 2 * x)),
-    "arrived": _of(arrived),
+    "present": _of(present),
     "copy": _of(jnp.copy),
     "copy_p": _of(jnp.copy),
     "stop_gradient": _of(lax.stop_gradient),

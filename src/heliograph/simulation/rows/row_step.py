@@ -20,7 +20,6 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.plausible_step import plausible_step
 from heliograph.simulation.rows.columns import columns_of
 from heliograph.simulation.stepping import AllFilters, initial_states
-from straightline.lowering import like
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each
@@ -96,7 +95,7 @@ class RowStep:
         _check_reports(filters)
         start = initial_states(filters)
         numbers, static = cast(NetworkStep(network, filters))
-        self._like = tuple(like(leaf.shape, leaf.dtype) for leaf in numbers)
+        self._like = tuple(_like(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)
         self._layout = Layout(static, self.state, received, inputs)
         self.outputs = flat_like(_traced(self._layout, self._like).out_info[1])
@@ -152,6 +151,11 @@ def _check_reports(filters: AllFilters) -> None:
             raise fail(f"timeline: fusion {name!r}", expected, "links that chance has a part in")
 
 
+def _like(shape: tuple[int, ...], dtype: Any) -> Any:
+    """Return a placeholder from which JAX traces an array."""
+    return jax.ShapeDtypeStruct(shape, dtype)  # type: ignore[no-untyped-call]
+
+
 @lru_cache
 def _stepped(layout: Layout) -> Any:
     """Return the function of one row to states and outputs, traced once for the outputs' layout, code and text."""
@@ -176,7 +180,7 @@ def _in_rows(layout: Layout) -> Any:
 def _traced(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
     """Return the traced step of a row, which JAX holds for networks that differ in numbers alone."""
     with jax.enable_x64(True):
-        return _stepped(layout).trace(list(numbers), like((layout.size,), np.float64))
+        return _stepped(layout).trace(list(numbers), _like((layout.size,), np.float64))
 
 
 @lru_cache(TEXTS)

@@ -6,16 +6,15 @@ Their zeros and ones are known when the program is made, to save operations.
 
 import os
 from collections.abc import Iterator, Sequence
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
-from heliograph.engine.choice import attempted
+from heliograph.engine.choice import attempted, threads
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.medium import medium_of
@@ -28,22 +27,18 @@ from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.smoothed import Part, Recorded, Smoother, finished, reduced_run
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
-from straightline.accumulated import Accumulated, Begun
-from straightline.compiled import threads
-from straightline.lowering import Lowering, array_of, keys_of, traced
-from straightline.memory import LONG, InMemory
-from straightline.nodes import Buffer, Type, Unsupported
-from straightline.program import Program, Summed, folded
+from straightline import Unsupported, accumulate
 
 PROGRAMS = 64  # whose code is held at once
-PLAIN = (0.0, 1.0, -1.0)  # numbers that are known in a program
+PLAIN = (0.0, 1.0, -1.0)  # numbers that are known in a program,
+FEW = 64  # of arrays of so many numbers at most
 NODES = 4  # simulated by one program: the plant is simulated again for each so many nodes, which costs a tenth
 
 
 class Native(NamedTuple):
-    """A program for a network, with the network's numbers; `tree` is the structure of what is collected of a run."""
+    """A program begun with a network's numbers; `tree` is the structure of what is collected of a run."""
 
-    begun: Begun
+    begun: Any
     tree: Any
 
 
@@ -85,8 +80,7 @@ def native(
     lanes = min(LANES, -(-runs // BLOCK))
     collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     check_memory(Needed(parts * collected, sums, variables), runs, len(inputs))
-    words = np.asarray(jax.random.key_data(key))
-    return Native(program.begin([words, *(a for a in arrays if _is_given(a))], runs), form)
+    return Native(program.begin([key, *arrays], runs), form)
 
 
 class _Known:
@@ -106,15 +100,20 @@ class _Known:
     def of(cls, array: np.ndarray) -> "_Known":
         """Describe an array."""
         known = np.isin(array, PLAIN) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
-        if array.size > LONG and _is_given(array):
+        if array.size > FEW and _is_given(array):
             known[...] = False
         values = np.where(known, array, 0).astype(array.dtype)
         return cls(array.shape, array.dtype.str, known.tobytes(), values.tobytes())
 
-    def numbers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mask of the entries that are known, and these, zeros in place of the others."""
-        known = np.frombuffer(self.known, dtype=bool).reshape(self.shape)
-        return known, np.frombuffer(self.values, dtype=self.kind).reshape(self.shape)
+    @property
+    def mask(self) -> np.ndarray:
+        """Return which entries are known."""
+        return np.frombuffer(self.known, dtype=bool).reshape(self.shape)
+
+    @property
+    def example(self) -> np.ndarray:
+        """Return an array of the shape and type, with what is known of it, and zeros in place of the other entries."""
+        return np.frombuffer(self.values, dtype=self.kind).reshape(self.shape)
 
 
 def _is_given(array: np.ndarray) -> bool:
@@ -125,7 +124,7 @@ def _is_given(array: np.ndarray) -> bool:
 @lru_cache(PROGRAMS)
 def _made(
     tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool
-) -> tuple[Accumulated, Any] | Unsupported:
+) -> tuple[Any, Any] | Unsupported:
     """Cached `_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
     try:
         return _program(tree, held, fixed, known)
@@ -133,9 +132,7 @@ def _made(
         return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
-def _program(
-    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...]
-) -> tuple[Accumulated, Any]:
+def _program(tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...]) -> tuple[Any, Any]:
     """Compile the code of networks of one structure; also return the structure of what is collected of a run.
 
     `held` and `fixed`: the leaves that are no arrays, such as a user's functions.
@@ -143,7 +140,7 @@ def _program(
     form: list[Any] = []
 
     # One run, from the key, the arrays and the run's number.
-    def run(key: jax.Array, *leaves: Any) -> list[jax.Array]:
+    def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
         *arrays, number = leaves
         items = iter(arrays)
         whole = [value if h else next(items) for value, h in zip(fixed, held, strict=True)]
@@ -151,22 +148,14 @@ def _program(
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
         reduced = _run(world, u, reducer, run_key) if later is None else _smoothed(world, later, u, reducer, run_key)
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
-        results, structure = jax.tree.flatten(OfStep(summed[0], summed[1], reduced.collected))
-        form[:] = [structure, len(jax.tree.leaves(summed))]
-        return results
+        form[:] = [jax.tree.structure(OfStep(summed[0], summed[1], reduced.collected))]
+        return summed, reduced.collected
 
-    # Traced in double precision, with the shapes alone.
-    struct: Any = jax.ShapeDtypeStruct
-    with jax.enable_x64(True):
-        shapes: list[Any] = [struct(k.shape, np.dtype(k.kind)) for k in known]
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        made, _ = traced(run, key, *shapes, struct((), jnp.uint32))
-        program = _lowered(made, known)
     # Sums over runs by batch; the rest is collected.
-    structure, count = form
-    numbers = len(program.inputs) - 1
-    summed = tuple(n < count for n in range(len(program.outputs)))
-    return Accumulated(program, Summed(summed, BATCHES, numbers)), structure
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    masks = {n: k.mask for n, k in enumerate(known, start=1) if k.mask.any()}
+    program = accumulate(run, key, *(k.example for k in known), batches=BATCHES, known=masks)
+    return program, form[0]
 
 
 @eqx.filter_jit
@@ -196,37 +185,6 @@ def _smoothed(
 
     _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
     return reduced_run(reducer, later, outputs)
-
-
-def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
-    """Graph of a traced run: inputs are the key, the arrays that are arguments, and the run's number."""
-    lowering = Lowering()
-    graph = lowering.graph
-    # Key and number of the run.
-    words = Buffer("input", "u32", (2,), graph.top)
-    number = Buffer("input", "u32", (), graph.top)
-    inputs = [words]
-    values: list[Any] = [keys_of(InMemory.whole(words).nodes(graph))]
-    # Known arrays are constants; of arguments only zeros and ones are.
-    for leaf in known:
-        fixed, numbers = leaf.numbers()
-        if not _is_given(numbers):
-            values.append(lowering.known(numbers))
-            continue
-        type: Type = "f64" if numbers.dtype.kind == "f" else "u32"
-        buffer = Buffer("input", type, leaf.shape, graph.top)
-        inputs.append(buffer)
-        if numbers.size > LONG:
-            values.append(InMemory.whole(buffer))
-        else:
-            entries = zip(fixed.ravel().tolist(), numbers.ravel().tolist(), range(numbers.size), strict=True)
-            values.append(
-                array_of([graph.constant(x, type) if f else graph.load(buffer, i) for f, x, i in entries], leaf.shape)
-            )
-    # The program of one run.
-    values.append(InMemory.whole(number))
-    outputs = lowering.results(made, values)
-    return Program(graph, [*inputs, number], outputs, None)
 
 
 def natively(
@@ -319,7 +277,8 @@ class NativeLanes:
 
         def go(lane: int) -> list[np.ndarray | None]:
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros()
-            return self.code.begun.add(dealt[lane], sums)
+            some: list[np.ndarray | None] = self.code.begun.add(dealt[lane], sums)
+            return some
 
         collected = list(threads().map(go, used))
         order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
@@ -331,17 +290,14 @@ class NativeLanes:
 
     def total(self) -> Recorded:
         """Sums over all runs, by batch."""
-        # Sums of the lanes, by batch.
-        used = [sums for sums in self.sums if sums is not None]
-        totals = iter([folded(reduce(np.add, parts), BATCHES) for parts in zip(*used, strict=True)])
         code = self.code.begun
-        summed = code.program.summed.outputs
+        totals = iter(code.total([sums for sums in self.sums if sums is not None]))
         leaves, common = [], []
         # Results that all runs share stand as of one run.
-        for fixed, is_summed, shared in zip(code.shared, summed, code.program.common, strict=True):
+        for fixed, is_summed in zip(code.shared, code.summed, strict=True):
             value = next(totals) if is_summed else None
-            leaves.append(fixed if shared else value)
-            common.append(shared)
+            leaves.append(value if fixed is None else fixed)
+            common.append(fixed is not None)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
         return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
 

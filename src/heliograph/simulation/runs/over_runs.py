@@ -6,11 +6,10 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from heliograph.engine.choice import chosen
+from heliograph.engine.choice import chosen, threads
 from heliograph.numerics.check import check_count, fail, shown
 from heliograph.numerics.float64 import fully_optimised, to_numpy
 from heliograph.numerics.types import PyTree
-from straightline.compiled import threads
 
 WIDTH = 128  # runs in parallel: the smoother steps of a hundred steps of them stay in the cache
 

@@ -1,0 +1,48 @@
+"""Marks for numbers that are known to be present, so that tests for NaN in them are decided at compile time.
+
+Then a filter's treatment of missing components costs nothing where none is ever missing, and what depends on data only
+through such tests is the same in all runs.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import JaxprEqn, Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Shaped
+
+from straightline.lowering import RULES, Lowering
+
+_present: Any = Primitive("present")
+
+
+def present(x: Shaped[jax.Array | np.ndarray, "*shape"]) -> Shaped[jax.Array, "*shape"]:
+    """Return the same numbers, marked as never NaN: `jnp.isnan` of them is known to be false when code is made.
+
+    So the branch for a missing number costs nothing where none is ever missing. XLA ignores the mark.
+
+    Args:
+        x: numbers that the caller knows to be there.
+    """
+    marked: jax.Array = _present.bind(jnp.asarray(x))
+    return marked
+
+
+def _rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    lowering.graph.numbers.update(inputs[0].ravel().tolist())
+    return inputs
+
+
+def _mapped(arrays: Sequence[jax.Array], axes: Sequence[int]) -> tuple[jax.Array, int]:
+    return present(arrays[0]), axes[0]
+
+
+RULES["present"] = _rule
+_present.def_impl(lambda x: x)
+_present.def_abstract_eval(lambda x: x)
+ad.primitive_jvps[_present] = lambda primals, tangents: (present(*primals), *tangents)
+batching.primitive_batchers[_present] = _mapped
+mlir.register_lowering(_present, lambda context, x: [x])

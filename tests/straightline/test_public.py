@@ -1,0 +1,102 @@
+"""The public names, as a stranger uses them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import straightline as sl
+
+RANDOM = np.random.default_rng(8)
+
+
+def test_a_function_of_one_run_is_computed_for_many():
+    """Trees of arguments; one that all runs share has no axis of runs."""
+    code = sl.compile(lambda x, more: {"sum": x @ more["a"]}, np.zeros(3), {"a": np.zeros(3)}, shared=[1])
+    x, a = RANDOM.normal(size=(21, 3)), RANDOM.normal(size=3)
+    np.testing.assert_allclose(code(x, {"a": a})["sum"], x @ a, rtol=1e-14)
+    assert code.operations == 6 + 5  # numbers that are read, products and sums
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.zeros((5, 4)), np.zeros(3)), r"array 0 of the arguments: expected shape \(run, 3\), got \(5, 4\)"),
+        ((np.zeros((5, 3)), np.zeros((5, 3))), r"array 1 of the arguments: expected shape \(3,\), got \(5, 3\)"),
+        ((np.zeros((5, 3)),), "arguments: expected 2 arrays, got 1"),
+        ((np.zeros((5, 3)), np.zeros(3, complex)), "arguments: expected numbers of type float64, got complex128"),
+    ],
+)
+def test_arguments_unlike_the_examples_are_refused(arguments, message):
+    """Code reads memory as the examples say: other shapes would be read beyond their end."""
+    code = sl.compile(lambda x, a: x @ a, np.zeros(3), np.zeros(3), shared=[1])
+    with pytest.raises(ValueError, match=message):
+        code(*arguments)
+
+
+def test_what_is_not_taken_is_refused_with_its_line():
+    assert sl.explain(jnp.linalg.svd, np.eye(3)).startswith("refused: svd")
+    with pytest.raises(sl.Unsupported, match=r"svd at .*test_public.py:\d+"):
+        sl.compile(lambda x: jnp.linalg.svd(x)[1], np.eye(3))
+    with pytest.raises(sl.Unsupported, match="a program of more than 3 operations"):
+        sl.compile(lambda x: x @ x, np.eye(3), most=3)
+
+
+def test_one_run_is_computed_in_place():
+    """x+ = x / 2 + u, y = x: the state is written over itself, also where the result is counted from the last."""
+    for number in (0, -2):
+        code = sl.compile_one(lambda x, u: (x / 2 + u, x), np.zeros(2), np.zeros(2), in_place={number: 0})
+        (x, u), (_, y) = code.inputs, code.outputs
+        u[...] = 1.0, 2.0
+        code()
+        code()
+        assert x.tolist() == [1.5, 3.0] and y.tolist() == [1.0, 2.0]
+        other = code.again([])
+        other()
+        assert other.inputs[0].tolist() == [0.0, 0.0] and x.tolist() == [1.5, 3.0]
+
+
+def drawn(key, scale, number):
+    z = scale * jax.random.normal(jax.random.fold_in(key, number))
+    return {"z": z, "zz": z * z, "count": jnp.ones(())}, z
+
+
+def test_runs_are_summed_by_batch_with_the_draws_of_jax():
+    key, runs = jax.random.key(3), 1003
+    code = sl.accumulate(drawn, key, 1.0, batches=10)
+    sums, each = code(key, 2.0, runs=runs, first=7)
+    numbers = np.arange(7, 7 + runs)
+    with jax.enable_x64(True):
+        expected = np.asarray(jax.vmap(lambda n: drawn(key, 2.0, n)[1])(numbers.astype(np.uint32)))
+    # Arithmetic of JAX by XLA, of which logarithm and square root round differently.
+    np.testing.assert_allclose(each, expected, rtol=1e-13)
+    by_batch = [each[numbers % 10 == b] for b in range(10)]
+    np.testing.assert_allclose(sums["zz"], [np.sum(z**2) for z in by_batch], rtol=1e-13)
+    assert sums["count"].tolist() == [len(z) for z in by_batch]
+
+
+def test_what_is_known_of_an_example_is_a_constant():
+    """A zero that is known costs no product; the call's own entry there is not read."""
+
+    def product(a, number):
+        return a @ a, number
+
+    whole = sl.accumulate(product, np.eye(2))
+    known = sl.accumulate(product, np.diag([2.0, 3.0]), known={0: ~np.eye(2, dtype=bool)})
+    assert known.operations < whole.operations
+    sums, _ = known(np.full((2, 2), 5.0), runs=4)
+    assert sums[..., 0].tolist() == [[100.0, 0.0], [0.0, 100.0]]
+    with pytest.raises(ValueError, match="function of a run: expected a pair of what is summed and what is collected"):
+        sl.accumulate(lambda number: number * 1.0)
+
+
+def test_what_is_present_is_not_asked_for():
+    def filled(x):
+        return jnp.where(jnp.isnan(x), 0.0, 2 * x)
+
+    assert sl.explain(filled, 1.0) != sl.explain(lambda x: filled(sl.present(x)), 1.0) == "2 operations"
+    assert jax.grad(lambda x: filled(sl.present(x)))(1.0) == 2.0
+
+
+def test_few_names_are_public():
+    assert len(sl.__all__) <= 8
