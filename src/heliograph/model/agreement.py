@@ -87,9 +87,9 @@ def joined(premises: Sequence[Premise]) -> Premise:
     )
 
 
-def part_of(premise: Premise, rows: np.ndarray) -> Premise:
+def part_of(premise: Premise, rows: Sequence[int]) -> Premise:
     """Return the premise of what is received of these rows of the channel's outputs."""
-    chosen = known(np.eye(first(premise.channel).outputs)[rows])
+    chosen = known(np.eye(first(premise.channel).outputs)[list(rows)])
     return premise.replaced(channel=at_each_step(lambda channel: Series([channel, chosen]), premise.channel))
 
 

@@ -121,7 +121,7 @@ def premise_at(network: HasNodes, name: str) -> Premise:
     if isinstance(node, Node):
         return Premise(plant, node.sensor, node.channel, node.trigger)
     if network.common is not None:
-        return part_of(Premise(plant, network.common.sensor, network.common.channel), network.rows()[name])
+        return part_of(Premise(plant, network.common.sensor, network.common.channel), network.rows[name])
     if network.relays is None:  # a node without a sensor
         return Premise(plant)
     schedules = {

@@ -295,7 +295,7 @@ def medium_of(network: Network) -> AbstractMedium:
     """Build the transmission from the plant to the nodes of a network."""
     # Relays in slots.
     if network.relays is not None:
-        places = network.places()
+        places = network.places
         listeners = {name: i for i, name in enumerate(network.relays.filters)}
         return Slots(
             network.relays,
@@ -305,12 +305,12 @@ def medium_of(network: Network) -> AbstractMedium:
         )
     # One channel for all nodes.
     if network.common is not None:
-        rows = network.rows()
-        received = tuple(np.stack([rows[name] for name in names]) for names in network.groups)
+        rows = network.rows
+        received = tuple(np.array([rows[name] for name in names]) for names in network.groups)
         return CommonChannel(network.common.sensor, network.common.channel, received)
     # A sensor and a channel for each node, stacked by group.
     groups: list[NodeGroup | Silent] = []
-    places = network.places()
+    places = network.places
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories = memory_places({name: node.channel for name, node in nodes.items()})
     for names in network.groups:

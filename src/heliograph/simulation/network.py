@@ -1,12 +1,12 @@
 """Network: one plant, and nodes that receive measurements of it, with their filters."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
+from itertools import accumulate
 from typing import NamedTuple
 from zlib import crc32
 
 import equinox as eqx
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
@@ -20,6 +20,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
 from heliograph.numerics.check import check_horizon, fail, table
+from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets, memories, without_names
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
@@ -58,6 +59,14 @@ class Kind(NamedTuple):
     filters: tuple[str, ...]
 
 
+class Place(NamedTuple):
+    """Where an estimate stands: which kind of filters, and which filter and node along its axes."""
+
+    kind: int
+    filter: int
+    node: int
+
+
 class Network(Module):
     """A plant observed by named nodes: the description that simulation, filters and reports are made from.
 
@@ -85,12 +94,15 @@ class Network(Module):
     meshes: dict[str, Fusion]
     relays: RelayNetwork | None
     common: Common | None
-    names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
+    # The index: names in the given order (compiled code sorts dictionaries), and where each stands.
+    names: tuple[str, ...] = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
-    mesh_kinds: tuple[Kind, ...] = eqx.field(
-        static=True
-    )  # of fusions between neighbours, sorted as in compiled code, after the filters' kinds
+    mesh_kinds: tuple[Kind, ...] = eqx.field(static=True)  # of fusions between neighbours, sorted as in compiled code
+    places: FrozenMapping[tuple[str, str], Place] = eqx.field(static=True)  # by node and filter
+    rows: FrozenMapping[str, range] = eqx.field(static=True)  # among all measurements, joined in the order of the nodes
     single: bool = eqx.field(static=True)
 
     def __init__(
@@ -114,7 +126,12 @@ class Network(Module):
         check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
+        self.states, self.inputs = first(plant).states, first(plant).inputs
         self._check_nodes()
+        ends = accumulate(node.received for node in self.nodes.values())
+        self.rows = FrozenMapping(
+            {name: range(end - self.nodes[name].received, end) for name, end in zip(self.names, ends, strict=True)}
+        )
         self.nodes = nodes_standing(self)
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
@@ -129,6 +146,7 @@ class Network(Module):
         self.mesh_kinds = tuple(
             Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
         )
+        self.places = FrozenMapping(_places_of(self.groups, self.kinds))
         self._check_links()
         self._check_fused()
         self.fused = fused_standing(self)
@@ -250,13 +268,6 @@ class Network(Module):
         }
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 
-    def rows(self) -> dict[str, np.ndarray]:
-        """Outputs of the common channel that each node receives."""
-        ends = np.cumsum([self.nodes[name].received for name in self.names])
-        return {
-            name: np.arange(end - self.nodes[name].received, end) for name, end in zip(self.names, ends, strict=True)
-        }
-
     def restricted_to(self, names: Iterable[str]) -> "Network":
         """Return the network of a recording that lacks the measurements of some relays, without their filters.
 
@@ -283,31 +294,10 @@ class Network(Module):
             raise fail("fusion", f"a filter that some node has {known}", repr(name))
         return results
 
-    def places(self) -> dict[tuple[str, str], tuple[int, int, int]]:
-        """Place of each estimate as (kind, filter, node), by node and filter."""
-        return {
-            (node, name): (k, f, i)
-            for k, kind in enumerate(self.kinds)
-            for f, name in enumerate(kind.filters)
-            for i, node in enumerate(self.groups[kind.group])
-        }
-
     def mesh_nodes(self, name: str) -> tuple[str, ...]:
         """Names of the nodes of a fusion between neighbours, in the order of the network."""
         neighbours = self.meshes[name].neighbours or {}
         return tuple(node for node in self.names if node in neighbours)
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the plant's states."""
-        names: tuple[str, ...] = first(self.plant).states
-        return names
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the plant's inputs."""
-        names: tuple[str, ...] = first(self.plant).inputs
-        return names
 
     @property
     def shared(self) -> dict[str, tuple[str, ...]]:
@@ -387,6 +377,15 @@ def _world(node: Node | ReceivingNode) -> object:
     if isinstance(node, Node):
         return node.sensor, without_names(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
+
+
+def _places_of(groups: Sequence[Sequence[str]], kinds: Sequence[Kind]) -> dict[tuple[str, str], Place]:
+    return {
+        (node, name): Place(k, f, i)
+        for k, kind in enumerate(kinds)
+        for f, name in enumerate(kind.filters)
+        for i, node in enumerate(groups[kind.group])
+    }
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:

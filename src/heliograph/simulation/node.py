@@ -5,7 +5,6 @@ from typing import Protocol
 
 import equinox as eqx
 import jax
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.gaussian_sum import EventFilter
@@ -24,6 +23,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, shown, table
+from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -239,8 +239,9 @@ class HasNodes(Protocol):
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs."""
 
-    def rows(self) -> dict[str, np.ndarray]:
-        """Places of each node's measurement in that of the common channel."""
+    @property
+    def rows(self) -> FrozenMapping[str, range]:
+        """Places of each node among all measurements, joined in the order of the nodes."""
 
     def claims(self) -> dict[str, dict[str, Claim]]:
         """Claims by node and filter."""

@@ -81,7 +81,7 @@ class Judges:
 
     def __init__(self, network: Network):
         self._places: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
-        for (node, name), position in network.places().items():
+        for (node, name), position in network.places.items():
             if network.nodes[node].filters[name].received:
                 self._places[node].append(position)
 
@@ -139,7 +139,7 @@ def doubts(
         lines.append(f"node {node!r}: {_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
     # Rows that a single filter skips.
     items = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
-            for (node, name), (kind, f, i) in network.places().items()}  # fmt: skip
+            for (node, name), (kind, f, i) in network.places.items()}  # fmt: skip
     every = {(FUSED, name): list(judgement) for name, judgement in outputs["judged_centrally"].items()}
     all_rows = {k: "" for rows in refused.values() for k in rows}
     for (node, name), (distance, _, reason, _) in (items | every).items():
@@ -174,7 +174,7 @@ class _Faults:
         elif central:
             before = jax.tree.map(lambda leaf: leaf[row - 1], self.outputs["fused"][name])
         else:
-            kind, f, i = self.network.places()[node, name]
+            kind, f, i = self.network.places[node, name]
             before = jax.tree.map(lambda leaf: leaf[row - 1, f, i], self.outputs["estimates"][kind])
         fault = function_fault(filter, before, self.u[row], row)
         return f"; {fault}" if fault else ""

@@ -303,7 +303,7 @@ def _reporting(network: Network) -> dict[str, Reporting]:
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and fusion.by_report:
             centre = centre_filter(network, name)
-            places, mine = network.places(), network.nodes_with(fusion.filter)
+            places, mine = network.places, network.nodes_with(fusion.filter)
             sources, order = sources_of(network, places, mine, fusion.filter)
             uplinks = uplinks_of(fusion, mine, len(network.states))
             results[name] = Reporting(uplinks, centre, order, sources, tuple(mine))

@@ -114,7 +114,7 @@ def fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict
     tests: dict[str, FusedInnovation] = {}
     if network.common is not None or network.relays is not None or network.shared:
         return tests
-    places, plant = network.places(), at(network.plant, 0)
+    places, plant = network.places, at(network.plant, 0)
     start = in_float64(given)(np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance))
     start = jax.tree.map(np.asarray, start)  # on no device: no program
     claims = network.claims()

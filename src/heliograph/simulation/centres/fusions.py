@@ -120,7 +120,7 @@ def fusions_of(network: Network) -> tuple[Fused, ...]:
         if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
             nodes = network.nodes_with(fusion.filter)
             alike.setdefault(structure((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes))), []).append(name)
-    places, claims = network.places(), network.claims().get(FUSED, {})
+    places, claims = network.places, network.claims().get(FUSED, {})
     return tuple(_fused(network, names, places, [claims[name] for name in names]) for names in alike.values())
 
 
@@ -154,7 +154,7 @@ def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
 
 def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
     """Build the centre for the nodes that have the filter `name`."""
-    places, claims = network.places(), network.claims()[FUSED]
+    places, claims = network.places, network.claims()[FUSED]
     mine = network.nodes_with(name)
     # Places of the nodes' filters, and the longest measurement.
     sources, order = sources_of(network, places, mine, name)
@@ -190,7 +190,7 @@ def _observe(
 ) -> Apart | Together:
     """Measurement model of these nodes for a centre."""
     if network.common is not None:
-        rows = network.rows()
+        rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
         return Together(network.common.sensor, described(network.common.channel), np.array(padded))
     parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]

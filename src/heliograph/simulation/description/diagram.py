@@ -73,8 +73,8 @@ def _node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
     if isinstance(node, Node):
         return ARROW.join([", ".join(node.outputs), link_in_words(node.channel), filters])
     if network.common is not None:
-        rows = network.rows()[name] + 1
-        return ARROW.join([f"numbers {rows[0]} to {rows[-1]} of the common channel", filters])
+        rows = network.rows[name]
+        return ARROW.join([f"numbers {rows.start + 1} to {rows.stop} of the common channel", filters])
     return ARROW.join([f"{node.received} numbers from {_senders(network.relays, name)}", filters])
 
 

@@ -67,7 +67,7 @@ def weighed_of(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]
     """Innovations by component of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
     parts = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
-    for (node, name), (kind, f, i) in network.places().items() if parts else ():
+    for (node, name), (kind, f, i) in network.places.items() if parts else ():
         if parts[kind] is not None:
             weighed.setdefault(node, {})[name] = Weighed(*(np.asarray(columns)[:, f, i] for columns in parts[kind]))
     central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}

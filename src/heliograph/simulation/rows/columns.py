@@ -73,7 +73,7 @@ def _weighed(network: Network, outcome: PyTree) -> dict[tuple[str, str], Weighed
     """Return the columns of what each filter that weighs made of its components, by node and filter."""
     parts = {
         name: [np.asarray(field)[f, i] for field in outcome["weighed"][kind]]
-        for name, (kind, f, i) in network.places().items()
+        for name, (kind, f, i) in network.places.items()
         if outcome["weighed"][kind] is not None
     }
     central = {(FUSED, name): list(at) for name, at in outcome["weighed_centrally"].items() if at is not None}

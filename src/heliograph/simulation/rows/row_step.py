@@ -34,9 +34,9 @@ class NetworkStep(Module):
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def __init__(self, network: Network, filters: AllFilters):
-        rows = network.rows()
+        rows = network.rows
         self.filters = filters
-        self.places = tuple(tuple(tuple(rows[name].tolist()) for name in names) for names in network.groups)
+        self.places = tuple(tuple(tuple(rows[name]) for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Step all filters, without implausible measurements; return the states and the outputs.
