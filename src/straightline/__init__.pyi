@@ -14,3 +14,6 @@ from .rules.present import (
 from .nodes import (
     Unsupported as Unsupported,
 )
+from .c_function import (
+    to_c as to_c,
+)

@@ -100,3 +100,48 @@ def test_what_is_present_is_not_asked_for():
 
 def test_few_names_are_public():
     assert len(sl.__all__) <= 8
+
+
+def pid(state, error, gains):
+    """A controller with a bounded integral: u = P e + I int e + D e', within +-10."""
+    integral = jnp.clip(state["integral"] + 0.01 * error, -1.0, 1.0)
+    u = gains @ jnp.stack([error, integral, (error - state["last"]) / 0.01])
+    return {"integral": integral, "last": error}, jnp.clip(u, -10.0, 10.0)
+
+
+def test_c_names_what_it_reads_and_writes():
+    code = sl.to_c(pid, {"integral": 0.0, "last": 0.0}, 0.0, np.zeros(3), name="pid")
+    assert "const double gains[3]" in code.header and '#include "pid.h"' in code.source
+    assert [x.name for x in code.arguments] == ["state_integral", "state_last", "error", "gains"]
+    assert [x.name for x in code.results] == ["result_0_integral", "result_0_last", "result_1"]
+    assert code.operations["div"] == 1 and code.source.count("/") >= 1
+
+
+def test_c_says_what_depends_on_what():
+    code = sl.to_c(
+        lambda p, f, unused: (f @ p @ f.T, f @ p @ f.T, f[0]), np.eye(2), np.eye(2), 0.0, name="move",
+        names=(["p", "f", "double"], ["after", "again", "row"]), symmetric=[0],
+    )  # fmt: skip
+    assert [x.symmetric for x in code.results] == [True, True, False]
+    assert [x.same for x in code.results] == [0, 0, 2]
+    assert [x.used for x in code.arguments] == [True, True, False] and code.arguments[2].name == "double_"
+    assert "p[2]" not in code.source  # the lower triangle
+
+
+def test_zero_times_a_finite_number_is_zero_in_c():
+    for finite, count in ((), 1), ([0], 0):
+        assert sl.to_c(lambda x: 0.0 * x, np.zeros(1), name="zero", finite=finite).operations.get("mul", 0) == count
+
+
+@pytest.mark.parametrize(
+    ("function", "name", "error", "message"),
+    [
+        (lambda x: x, "while", ValueError, "name: expected one that C takes for a function, got 'while'"),
+        (lambda x: jnp.linalg.svd(x[None])[1], "f", sl.Unsupported, r"svd at .*test_public.py:\d+"),
+        (lambda x: x + jax.random.normal(jax.random.key(0)), "f", sl.Unsupported, r"random_\w+ at .*public.py:\d+"),
+        (lambda x: 1e39 * x, "f", ValueError, r"single precision: expected numbers up to 3.4e38, got 1e\+39"),
+    ],
+)  # fmt: skip
+def test_what_c_does_not_have_is_refused(function, name, error, message):
+    with pytest.raises(error, match=message):
+        sl.to_c(function, np.zeros(2), name=name, single=True)

@@ -12,14 +12,13 @@ import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
 from heliograph.disk.whole_file import check_output, whole_files
-from heliograph.export.program import RESERVED, step_program
+from heliograph.export.program import RESERVED, Real, step_program
 from heliograph.export.text import CText, Form, c_text
 from heliograph.factors.columns import computed_in
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, fail, instance, shown
-from straightline.c_source import Real
 
 PRECISIONS: dict[str, Real] = {"double": "double", "float": "float"}
 COMPILER = "cc"
@@ -101,9 +100,9 @@ def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
-    with computed_in(np.float64 if real == "double" else np.float32):
-        program = step_program(filter, real)
     try:
+        with computed_in(np.float64 if real == "double" else np.float32):
+            program = step_program(filter, real, prefix)
         return c_text(program, Form(prefix, real, names, kind))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision

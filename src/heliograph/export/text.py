@@ -1,18 +1,14 @@
 """Text of the two files of an exported step: a header with explanations, and a source that computes."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple
 
 import heliograph
 from heliograph.disk.quoting import visible
-from heliograph.export.program import StepProgram, no_c, place_of
+from heliograph.export.program import Real, StepProgram
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
-from straightline.c_source import CSource, Place, Real, c_type, literal
-from straightline.nodes import Node, Type, Unsupported
 
 MEANING: dict[Claim, str] = {
     "exact": "the covariance is E[(x - mean)(x - mean)']",
@@ -22,13 +18,7 @@ MEANING: dict[Claim, str] = {
 }
 
 
-class Member(NamedTuple):
-    """An array in the state of the step: its name, type, initial values, and the values after a step."""
-
-    name: str
-    type: Type
-    start: Sequence[float]
-    after: Sequence[Node]
+SIZES = {"double": 8, "float": 4, "unsigned char": 1, "int32_t": 4, "uint32_t": 4, "int64_t": 8, "uint64_t": 8}
 
 
 class Form(NamedTuple):
@@ -50,82 +40,45 @@ class CText(NamedTuple):
 
 
 def c_text(program: StepProgram, form: Form) -> CText:
-    """Write a step as C.
-
-    Raises:
-        ValueError: an operation that C does not have, with its place; numbers beyond single precision.
-    """
+    """Write a step as C."""
     prefix, real = form.prefix, form.real
-    members, mean, covariance = _members(program)
-    # Where inputs are read: members of the state, z, u, and the step counter.
-    places = {leaf.buffer: _entry(f"state->{leaf.name}") for leaf in program.leaves}
-    places |= {program.z: _entry("z"), program.u: _entry("u"), program.k: lambda index: "state->step"}
-    roots = [node for member in members for node in member.after]
-    source = CSource([*roots, *program.mean, program.implausible, program.spoilt], places, real, prefix)
-    try:
-        body = source.statements(program.graph.top)
-    except Unsupported as error:
-        raise no_c(error.operation, place_of(error.operation, program.equations)) from None
-    # The step counter is part of the state only if something depends on it.
-    counts = program.k in source.needed or program.filter.horizon is not None
-    finish = _finish(members, program, source, counts)
+    kinds = {x.name.removeprefix("next_"): x.type for x in program.compute.results}
     text = _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
-        tables="".join(f"\n{table}\n" for table in source.table_definitions()),
-        start="\n".join(_start(members, real, counts)),
-        checks="\n".join(_checks(program, real)),
-        body="\n".join([*source.declarations(), *body, *finish]),
-        mean=mean,
-        covariance=covariance,
+        functions="\n\n".join(_static(code) for code in (program.initial, program.compute)),
+        start=_start(program),
+        checks="\n".join(_checks(program)),
+        step="\n".join(_step(program)),
+        mean=program.mean,
+        covariance=program.covariance,
         real=real,
     )
     # The header declares the state and explains the functions.
+    fields = [(kinds[m.name], m.name, max(m.start.size, 1)) for m in program.members]
     header = _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
         comment=_comment(program, form),
-        members="\n".join(_fields(members, real, counts)),
+        members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _counter(program)),
         real=real,
     )
-    return CText(header, text, source.operations, _size(members, real, counts))
+    sizes = [(SIZES[kind], count) for kind, _, count in fields] + ([(8, 1)] if program.counts else [])
+    return CText(header, text, program.compute.operations, _size(sizes))
 
 
-def _entry(array: str) -> Place:
-    return lambda index: f"{array}[{index}]"
+def _static(code: Any) -> str:
+    """Return the text of a function that only this file knows."""
+    text: str = code.definition
+    return text.replace(f"void {code.name}(", f"static void {code.name}(", 1)
 
 
-def _members(program: StepProgram) -> tuple[list[Member], str, str]:
-    """Return the arrays of the state, and the names of those that hold the estimate, which may be the filter's."""
-    members = [Member(leaf.name, leaf.buffer.type, leaf.start.ravel().tolist(), leaf.after) for leaf in program.leaves]
-    names = []
-    for name, nodes, start in (
-        ("estimate_mean", program.mean, program.start_mean),
-        ("estimate_covariance", program.covariance, program.start_covariance),
-    ):
-        same = (m for m in members if list(m.after) == nodes and np.array_equal(m.start, start.ravel(), equal_nan=True))
-        member = next(same, None)
-        if member is None:
-            member = Member(name, "f64", start.ravel().tolist(), nodes)
-            members.append(member)
-        names.append(member.name)
-    return members, names[0], names[1]
+def _counter(program: StepProgram) -> list[str]:
+    return ["    int64_t step;"] if program.counts else []
 
 
-def _stored(type: Type, real: Real) -> str:
-    """Return the type in which a number is stored: a flag is a byte."""
-    return "unsigned char" if type == "bool" else c_type(type, real)
-
-
-def _fields(members: Sequence[Member], real: Real, counts: bool) -> list[str]:
-    lines = [f"    {_stored(m.type, real)} {m.name}[{max(len(m.start), 1)}];" for m in members]
-    return [*lines, "    int64_t step;"] if counts else lines
-
-
-def _size(members: Sequence[Member], real: Real, counts: bool) -> int:
+def _size(fields: Sequence[tuple[int, int]]) -> int:
     """Return the bytes of the state, each number aligned to its own size."""
-    sizes = {"f64": 8 if real == "double" else 4, "bool": 1, "i32": 4, "u32": 4, "i64": 8, "u64": 8}
-    fields = [(sizes[m.type], max(len(m.start), 1)) for m in members] + ([(8, 1)] if counts else [])
     total = 0
     for size, count in fields:
         total = -(-total // size) * size + size * count
@@ -133,38 +86,34 @@ def _size(members: Sequence[Member], real: Real, counts: bool) -> int:
     return -(-total // largest) * largest
 
 
-def _start(members: Sequence[Member], real: Real, counts: bool) -> list[str]:
-    lines = [
-        f"    state->{m.name}[{i}] = {literal(value, m.type, real)};"
-        for m in members
-        for i, value in enumerate(m.start)
-    ]
-    return [*lines, "    state->step = 0;"] if counts else lines
+def _start(program: StepProgram) -> str:
+    """Return the statements that set the state before the first step."""
+    members = ", ".join(f"state->{m.name}" for m in program.members)
+    return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")
 
 
-def _checks(program: StepProgram, real: Real) -> list[str]:
+def _checks(program: StepProgram) -> list[str]:
     """Return the statements that refuse invalid inputs before the computation."""
     filter = program.filter
-    lines = [] if filter.received else ["    (void)z;"]
-    lines += [] if filter.inputs else ["    (void)u;"]
-    lines += [f"    if (isinf(z[{i}])) return 1;" for i in range(filter.received)]
+    lines = [f"    if (isinf(z[{i}])) return 1;" for i in range(filter.received)]
     lines += [f"    if (!isfinite(u[{i}])) return 2;" for i in range(len(filter.inputs))]
     return [*lines, f"    if (state->step >= {filter.horizon}) return 3;"] if filter.horizon is not None else lines
 
 
-def _finish(members: Sequence[Member], program: StepProgram, source: CSource, counts: bool) -> list[str]:
-    """Return the statements that refuse an implausible step, and then write all that changed."""
-    known = [node for node in program.mean if node.op != "constant"]
-    lines = []
-    if program.spoilt.op != "constant":
-        lines.append(f"    if ({source.name(program.spoilt)}) return 6;")
-    lines += [f"    if (!isfinite({source.name(node)})) return 4;" for node in dict.fromkeys(known)]
-    if program.implausible.op != "constant":
-        lines.append(f"    if ({source.name(program.implausible)}) return 5;")
-    for member in members:
-        for i, node in enumerate(member.after):
-            lines.append(f"    state->{member.name}[{i}] = {source.name(node)};")
-    return [*lines, "    state->step += 1;"] if counts else lines
+def _step(program: StepProgram) -> list[str]:
+    """Return the statements that compute a step, refuse an implausible one, and then write all that changed."""
+    read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
+    written = [*(f"after.{m.name}" for m in program.members), "implausible", "spoilt"]
+    arguments = [*read, "z", "u", "state->step" if program.counts else "0", *written]
+    states = len(program.filter.states)
+    return [
+        f"    {program.compute.name}(\n        " + ",\n        ".join(arguments) + ");",
+        "    if (spoilt[0]) return 6;",
+        f"    for (int i = 0; i < {states}; ++i) if (!isfinite(after.{program.mean}[i])) return 4;",
+        "    if (implausible[0]) return 5;",
+        *(["    after.step = state->step + 1;"] if program.counts else []),
+        "    *state = after;",
+    ]
 
 
 def claim_of(filter: AbstractFilter, real: Real) -> Claim:
@@ -244,7 +193,9 @@ _SOURCE = """/* {comment} */
 #ifdef __FAST_MATH__
 #error "a missing component is NaN, which this mode of the compiler does not know"
 #endif
-{tables}
+
+{functions}
+
 void {prefix}_start({prefix}_state *state)
 {{
 {start}
@@ -253,7 +204,9 @@ void {prefix}_start({prefix}_state *state)
 int {prefix}_step({prefix}_state *state, const {real} z[], const {real} u[])
 {{
 {checks}
-{body}
+    {prefix}_state after;
+    unsigned char implausible[1], spoilt[1];
+{step}
     return 0;
 }}
 

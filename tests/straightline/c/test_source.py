@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.export.c_files import COMPILER, FLAGS
 from straightline.c_source import CSource, literal
 from straightline.lowering import scalars
 from straightline.memory import InMemory
 from straightline.nodes import Unsupported
 from straightline.program import lower
 from tests.export.device import needs_compiler
+from tests.straightline.conformance.c import FLAGS
 
 X = np.array([0.3, -1.7, 2.5, 0.9])
 
@@ -36,7 +36,7 @@ def compiled(function, x, folder, real="double"):
     head = f"void made(const {real} *x, {real} *out)"
     lines = ["#include <math.h>", "#include <stdint.h>", *tables, f"{head};", head, "{", *body, "}", ""]
     (folder / "made.c").write_text("\n".join(lines))
-    command = [COMPILER, *FLAGS, "-shared", "-fPIC", "made.c", "-o", "made.so", "-lm"]
+    command = ["cc", *FLAGS, "-shared", "-fPIC", "made.c", "-o", "made.so", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     number = np.float64 if real == "double" else np.float32
     out = np.zeros(count, number)

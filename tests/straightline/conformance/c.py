@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.export.c_files import FLAGS
 from straightline.c_source import CSource, c_type
 from straightline.folding import DTYPES
 from straightline.lowering import scalars
 from tests.straightline.conformance.case import Case
 from tests.straightline.conformance.engines import program_of
 
+FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Werror", "-O2")
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 STRICT = ("-O0", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 

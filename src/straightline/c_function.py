@@ -1,0 +1,246 @@
+"""A JAX function of small arrays as one function of C99: no heap, no global variable, no library but libm."""
+
+import inspect
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+from jaxtyping import PyTree
+
+from straightline.c_lowering import lowered_for_c
+from straightline.c_source import CSource, Place, Real, c_type
+from straightline.lowering import code_line, scalars, traced, type_of
+from straightline.nodes import Node, Type, Unsupported
+
+RANDOM = ("random_", "threefry")
+RESERVED = frozenset((
+    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
+    "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
+    "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+))  # fmt: skip
+
+
+class CArray(NamedTuple):
+    """An argument or a result in C: name, type of a number, how many, and whether C passes it as an array.
+
+    `used`: of an argument, whether a result depends on it. `same`: of a result, the number of the first one that has
+    the same numbers. `symmetric`: of a result, whether entries across the diagonal are the same number.
+    """
+
+    name: str
+    type: str
+    size: int
+    is_array: bool
+    used: bool = True
+    same: int = 0
+    symmetric: bool = False
+
+    @property
+    def argument(self) -> str:
+        """Return the declaration as what a function reads."""
+        return f"const {self.type} {self.name}[{max(self.size, 1)}]" if self.is_array else f"{self.type} {self.name}"
+
+    @property
+    def result(self) -> str:
+        """Return the declaration as what a function writes."""
+        return f"{self.type} {self.name}[{max(self.size, 1)}]"
+
+
+class CFunction(NamedTuple):
+    """Text of a function in C99, what it reads and writes, and the number of each operation in it.
+
+    `header` declares it, and `source` is a file with it; `definition` is the function and the tables that it reads,
+    without the lines of a file around it.
+    """
+
+    name: str
+    header: str
+    source: str
+    definition: str
+    arguments: list[CArray]
+    results: list[CArray]
+    operations: dict[str, int]
+
+
+def to_c(
+    function: Callable[..., PyTree],
+    *examples: PyTree,
+    name: str,
+    single: bool = False,
+    names: tuple[Sequence[str], Sequence[str]] = ((), ()),
+    finite: Collection[int] = (),
+    symmetric: Collection[int] = (),
+) -> CFunction:
+    """Write a JAX function of small arrays as C99, for a device.
+
+    The arrays of the arguments come first, then those of the results, each row by row; a result may be written over an
+    argument, since all are written at the end. The same numbers as native code's but for libm's rounding, and for fused
+    products where the compiler makes them.
+
+    Args:
+        function: of trees of arrays; any that JAX traces.
+        examples: arguments, of which shapes and types count alone.
+        name: name of the function in C, with which names of tables begin.
+        single: whether numbers are float; double unless so.
+        names: of the arguments' arrays and of the results'; by default from the parameters and fields.
+        finite: numbers of the arguments' arrays that have no NaN, so that zero times an entry is zero; none by default.
+        symmetric: numbers of the arguments' arrays that are symmetric, of which one triangle is read; none by default.
+
+    Raises:
+        Unsupported: random numbers, or an operation that C does not have, with the line that it comes from.
+        ValueError: a name that C does not take; numbers beyond single precision.
+    """
+    _check_name(name)
+    program, tree = traced(function, *examples)
+    equations = list(_equations(program.jaxpr))
+    for equation in equations:
+        if equation.primitive.name.startswith(RANDOM):
+            raise Unsupported(equation.primitive.name, code_line(equation))
+    graph, buffers, outputs = lowered_for_c(program, finite, symmetric)
+    real: Real = "float" if single else "double"
+    read, written = _names(function, examples, tree, names)
+    # Arguments without axes are passed by value.
+    flat = [scalars(x) for x in outputs]
+    arguments = [CArray(n, _stored(b.type, real), b.size, bool(b.shape)) for n, b in zip(read, buffers, strict=True)]
+    places = {b: _place(x) for b, x in zip(buffers, arguments, strict=True)}
+    source = CSource([node for nodes in flat for node in nodes], places, real, name)
+    try:
+        body = source.statements(graph.top)
+    except Unsupported as error:
+        raise Unsupported(error.operation, error.where or _line_of(error.operation, equations)) from None
+    arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
+    results = _results(written, program, outputs, flat, real)
+    ends = [
+        f"    {x.name}[{i}] = {source.name(node)};"
+        for x, nodes in zip(results, flat, strict=True)
+        for i, node in enumerate(nodes)
+    ]
+    unread = [f"    (void){x.name};" for x in arguments if not x.used]
+    head = _declared(name, arguments, results)
+    lines = [f"{head}\n{{", *unread, *source.declarations(), *body, *ends, "}"]
+    definition = "\n\n".join([*source.table_definitions(), "\n".join(lines)])
+    return CFunction(
+        name,
+        _HEADER.format(guard=f"{name.upper()}_H", head=head),
+        _SOURCE.format(name=name, definition=definition),
+        definition,
+        arguments,
+        results,
+        source.operations,
+    )
+
+
+def _check_name(name: str) -> None:
+    if not (name.isascii() and name.isidentifier()) or name in RESERVED or name.startswith("_"):
+        raise ValueError(f"name: expected one that C takes for a function, got {name!r}")
+
+
+def _stored(type: Type, real: Real) -> str:
+    """Return the type in which a number is stored: a flag is a byte."""
+    return "unsigned char" if type == "bool" else c_type(type, real)
+
+
+def _place(array: CArray) -> Place:
+    return (lambda index: f"{array.name}[{index}]") if array.is_array else (lambda index: array.name)
+
+
+def _declared(name: str, arguments: Sequence[CArray], results: Sequence[CArray]) -> str:
+    """Return the head of the function."""
+    every = [*(x.argument for x in arguments), *(x.result for x in results)]
+    line = f"void {name}({', '.join(every)})"
+    return line if len(line) <= 100 else f"void {name}(\n    " + ",\n    ".join(every) + ")"
+
+
+def _results(
+    names: Sequence[str], program: ClosedJaxpr, outputs: Sequence[np.ndarray], flat: Sequence[list[Node]], real: Real
+) -> list[CArray]:
+    results = []
+    for n, (name, variable, value, nodes) in enumerate(zip(names, program.jaxpr.outvars, outputs, flat, strict=True)):
+        aval: Any = variable.aval
+        same = next(k for k in range(n + 1) if flat[k] == nodes)
+        results.append(CArray(name, _stored(type_of(aval), real), len(nodes), True, True, same, _is_symmetric(value)))
+    return results
+
+
+def _is_symmetric(value: np.ndarray) -> bool:
+    if value.ndim != 2 or value.shape[0] != value.shape[1] or len(value) < 2:
+        return False
+    return all(value[i, j] is value[j, i] for i in range(len(value)) for j in range(i))
+
+
+def _names(
+    function: Callable[..., PyTree], examples: Sequence[PyTree], tree: Any, names: tuple[Sequence[str], Sequence[str]]
+) -> tuple[list[str], list[str]]:
+    """Return the names of the arguments' and of the results' arrays."""
+    read, written = list(names[0]), list(names[1])
+    if not read:
+        parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind != p.VAR_POSITIONAL]
+        labels = [parameters[n] if n < len(parameters) else f"argument_{n}" for n in range(len(examples))]
+        read = [n for label, x in zip(labels, examples, strict=True) for n in _named(label, x)]
+    if not written:
+        written = _named("result", jax.tree.unflatten(tree, range(tree.num_leaves)))
+    taken = set[str]()
+    for some in (read, written):
+        for n in range(len(some)):
+            while some[n] in RESERVED or some[n] in taken:
+                some[n] += "_"
+            taken.add(some[n])
+    return read, written
+
+
+def _named(label: str, tree: PyTree) -> list[str]:
+    """Return a name in C for each array of a tree, from its place in it."""
+    results = []
+    for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        parts = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
+        text = "_".join([label, *parts])
+        results.append("".join(c if c.isalnum() and c.isascii() else "_" for c in text))
+    return results
+
+
+def _line_of(operation: str, equations: Sequence[Any]) -> str:
+    """Return the line of an operation of the graph."""
+    same = (e for e in equations if e.primitive.name.removesuffix("_convert_type") == operation)
+    return next((code_line(e) for e in same), "an unknown line")
+
+
+def _equations(jaxpr: Any) -> Iterator[Any]:
+    """Yield all operations, also those of inner programs."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for param in equation.params.values():
+            for inner in param if isinstance(param, tuple | list) else (param,):
+                if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
+                    yield from _equations(getattr(inner, "jaxpr", inner))
+
+
+_HEADER = """#ifndef {guard}
+#define {guard}
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+{head};
+
+#ifdef __cplusplus
+}}
+#endif
+
+#endif
+"""
+
+_SOURCE = """#include "{name}.h"
+
+#include <math.h>
+
+#ifdef __FAST_MATH__
+#error "NaN has a meaning here, which this mode of the compiler does not know"
+#endif
+
+{definition}
+"""
