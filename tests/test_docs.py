@@ -79,6 +79,20 @@ def test_a_time_has_one_place(pages):
             pages.with_figures(text, place)
 
 
+def test_long_runs_are_of_numbers_that_a_page_sets(monkeypatch):
+    """`python benchmarks/long_run.py PAGE NAME=NUMBER`, where a page says it, finds NAME in the blocks of PAGE."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    long_run = importlib.import_module("long_run")
+    commands = [c for page in PAGES for c in re.findall(r"benchmarks/long_run\.py ([^`]*)`", page.read_text())]
+    assert commands
+    for command in commands:
+        page, *changes = command.split()
+        blocks = "\n".join(BLOCK.findall((ROOT / "docs" / f"{page}.md").read_text()))
+        assert long_run.with_numbers(blocks, dict(change.split("=") for change in changes)) != blocks, command
+    with pytest.raises(ValueError, match="walks: expected a number that the page sets once"):
+        long_run.with_numbers("runs = 3\n", {"walks": "4"})
+
+
 def test_a_source_distribution_holds_all_but_what_a_clone_needs():
     """Tests read the docs and the benchmarks, and pages link to them."""
     table = tomllib.loads((ROOT / "pyproject.toml").read_text())

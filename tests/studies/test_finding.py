@@ -1,12 +1,14 @@
 """The command line finds studies by entry points, those of other packages too."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from heliograph import cli
 from heliograph.cli.studies import print_list, studies_of
 
+ROOT = Path(__file__).parents[2]
 MODULE = '''
 """Says a number.
 
@@ -71,6 +73,14 @@ def test_every_study_says_what_it_shows():
     assert "demo" in known and "quadratic-bias" in known and "hello" not in known
     with pytest.raises(ValueError, match=r"example: expected one of .*demo, .*, got 'nothing'"):
         cli.studies.run(["nothing"], None, {}, "example")
+
+
+def test_what_is_a_page_now_is_named(capsys):
+    for name, page in cli.studies.PAGES.items():
+        assert name not in studies_of("example") and (ROOT / "docs" / page).exists()
+        assert cli.main(["example", name, "--out", "out"]) == 2
+        said = capsys.readouterr().err
+        assert said.endswith(f"got '{name}', a page now: docs/{page}\n") and said.count("\n") == 1
 
 
 @pytest.mark.parametrize(

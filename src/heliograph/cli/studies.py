@@ -17,6 +17,9 @@ from cyclopts import Parameter
 from heliograph.cli.app import folder, number, path_option
 
 GROUP = "heliograph.studies"
+PAGES = {  # what is a page of the documentation, with blocks that run, by the name of the example that it was
+    "delays": "delays.md",
+}
 Changes = Annotated[
     list[str], Parameter(name="--set", negative="", help="Another number, as name=value; may be given several times.")
 ]
@@ -93,7 +96,8 @@ def run(
     for name in names:
         if name not in known:
             expected = ", ".join(known) + (" or all" if kind == "publication" else "")
-            raise fail("method" if kind == "publication" else kind, f"one of {expected}", repr(name))
+            page = f", a page now: docs/{PAGES[name]}" if kind == "example" and name in PAGES else ""
+            raise fail("method" if kind == "publication" else kind, f"one of {expected}", f"{name!r}{page}")
     target = folder("reproduce" if kind == "publication" else kind, out, names[0] if within is None else within)
     studies = {name: load(known[name]) for name in names}
     settings = {name: set_of(name, study, values, kind) for name, study in studies.items()}  # all before any work
