@@ -129,12 +129,10 @@ def test_lists_do_not_load_jax():
             "fusion",
             "late-data",
             "learning",
-            "links-with-memory",
             "live",
             "motor-drive",
             "network-design",
             "range-bearing",
-            "smoothing",
             "uwb",
             "without-centre",
         )

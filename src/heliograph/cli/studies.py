@@ -19,6 +19,8 @@ from heliograph.cli.app import folder, number, path_option
 GROUP = "heliograph.studies"
 PAGES = {  # what is a page of the documentation, with blocks that run, by the name of the example that it was
     "delays": "delays.md",
+    "links-with-memory": "memory.md",
+    "smoothing": "smoothing.md",
 }
 Changes = Annotated[
     list[str], Parameter(name="--set", negative="", help="Another number, as name=value; may be given several times.")
