@@ -60,10 +60,11 @@ def test_a_state_far_from_zero_keeps_its_digits():
 
 
 def test_a_state_that_is_known_stays_known():
-    """Far from zero, growing, received with gains that the mode decides: nothing is left to find, to the last bit."""
+    """Far from zero, growing, received with gains that the mode decides: nothing is left to find but its rounding."""
     plant = hg.LinearPlant([[-1.1468]], 0.0, [42.1271], 0.0)
     result = claims(side_information_filter(plant, hg.LinearSensor([[1e5]], 1e-12), LOSSY), Z)
-    np.testing.assert_array_equal(result[:, 1], 0.0)
+    rounded = np.cumsum(1.1468 ** (2 * np.arange(8))) * (4 * np.finfo(float).eps * 42.1271) ** 2  # of each step
+    assert np.all((result[:, 1] >= 0) & (result[:, 1] <= 1.001 * rounded))
     np.testing.assert_allclose(result[:, 0], 42.1271 * (-1.1468) ** np.arange(1, 9), rtol=1e-14)
 
 

@@ -128,9 +128,7 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     def moved_noise(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
         """Covariance (N, N) of the process noise and of the rounding of zeta, by E[1{next} 1{next}'] of the modes."""
-        own = process_noise(at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0)))
-        one = rounding_of(np.ones(1))  # of the mode's indicator
-        parts = Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
+        parts = noise_in_mode(at(self.plant, k), u, at(self.plant, 0))
         return Columns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
 
     def _projection(self) -> Float[np.ndarray, "n N"]:
@@ -209,6 +207,13 @@ class ModalFilter(AbstractModalFilter):
         model = transition, joined(spread_of_moves(carried, rows), own).covariance, output
         rounded = np.zeros(len(before.mean))  # it is part of the noise
         return linear_smoother_step(step, model, rounded, self.claim, self._projection())
+
+
+def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: LinearPlant) -> Columns:
+    """Covariance of the process noise of x~, with the rounding of the state and of the mode's indicator."""
+    own = process_noise(plant, jnp.asarray(u), start_of(start))
+    one = rounding_of(np.ones(1))
+    return Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
 
 
 def moved_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax.Array:

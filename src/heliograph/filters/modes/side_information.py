@@ -1,6 +1,6 @@
 """Filters with side information on the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,18 +9,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
-from heliograph.factors.columns import Columns
+from heliograph.factors.columns import (
+    Columns,
+    below_diagonal,
+    joined,
+    outer,
+    reciprocal,
+    rounding_of,
+    side_by_side,
+    triangular,
+    unit_lower,
+    unit_of,
+)
+from heliograph.factors.gaussian import Innovations, given
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.correction import absent, gain_and_bound, is_precise
-from heliograph.filters.gaussian.precise import above_rounding, noise_rounding, output_rounding
-from heliograph.filters.innovation import log_density
+from heliograph.filters.gaussian.signal import eliminated_spread, size_of
 from heliograph.filters.modes.modal import (
     beside,
+    kron,
     measured_about,
     moved_about,
-    padded,
+    moved_by_mode,
+    noise_in_mode,
     sum_of_modes,
     without_common,
 )
@@ -28,13 +39,12 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, over_time, unstack
-from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.plant import AnyPlant
 from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, probabilities
-from heliograph.numerics.lapack import pseudo_solve
-from heliograph.numerics.linalg import PRECISE, rounding, spread_of, symmetrize
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import memories
@@ -69,24 +79,35 @@ class SideInformation(Module):
 
 
 class SideInformationBelief(NamedTuple):
-    """s, the estimate of zeta, and E[r r' 1{mode} | side information] of r = (x~, s, e), with the error e = zeta - s.
+    """s, the estimate of zeta, and factors of E[q q' 1{mode} | side information] of q = (e, x~), of each mode.
 
-    x~ = (x - c, 1), c = E[x] before any data, and zeta holds x~ 1{mode}, mode after mode. Both s and e are carried
-    though s + e = zeta is known: no covariance is the difference of larger ones.
+    x~ = (x - c, 1) with c = E[x] before any data, zeta holds x~ 1{mode}, mode after mode, and e = zeta - s is the
+    error: in a mode, s follows from e and x~.
 
-    Shapes: with N = M (n + 1): centre (n,), mean (N,), moments (M, n + 1 + 2 N, n + 1 + 2 N).
+    Shapes: with N = M (n + 1) and q = N + n + 1: mean (N,), lower (M, q (q - 1) / 2), variances (M, q), centre c (n,).
     """
 
-    centre: Float[jax.Array, " n"]
     mean: Float[jax.Array, " N"]
-    moments: Float[jax.Array, "M r r"]
+    lower: Float[jax.Array, "M entries"]
+    variances: Float[jax.Array, "M q"]
+    centre: Float[jax.Array, " n"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def moments(self) -> Columns:
+        """E[q q' 1{mode}] of each mode as columns (M, q, q)."""
+        return Columns(unit_lower(self.lower), self.variances)
+
+    @property
+    def errors(self) -> Columns:
+        """E[e e' | side information] as columns (N, M q)."""
+        moments = self.moments
+        return side_by_side(Columns(moments.matrix[:, : len(self.mean)], moments.weights), np.ones(len(self.lower)))
 
     @property
     def covariance(self) -> Float[jax.Array, "N N"]:
         """E[e e' | side information]."""
-        count = len(self.mean)
-        return jnp.sum(self.moments, axis=0)[-count:, -count:]
+        return self.errors.covariance
 
 
 class SideInformationFilter(AbstractSizedFilter):
@@ -98,11 +119,8 @@ class SideInformationFilter(AbstractSizedFilter):
     under earlier laws.
 
     Its measurement is z and, where there are `flags`, the number of the flag after it; the likelihood is that of z
-    given these. Losses that the channel does not model must not depend on the modes. Moments are those of x - E[x], and
-    the error has moments of its own: a mean far from zero costs no digits, and with one mode no precise measurement
-    does. With several, x is the sum of its parts in each. What the products of moments leave of rounding, eps |F|^2 of
-    the deviations, is added to the error's variances, and after a precise measurement that of the mean: so that what is
-    claimed is never less than nothing, and no data without noise take it to where rounding decides.
+    given these. Losses that the channel does not model must not depend on the modes. Moments are those of x - E[x],
+    and the error is a coordinate of its own: neither a mean far from zero nor a precise measurement costs digits.
 
     Source: the filter of Costa (1994) with moments conditional on the side information.
     """
@@ -113,43 +131,53 @@ class SideInformationFilter(AbstractSizedFilter):
     initial: Float[Array, " M"]
     flagged: bool = eqx.field(static=True)
 
-    @compiled
+    @in_float64
     def init(self) -> SideInformationBelief:
         """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        modes, unit = len(law), jnp.zeros(len(self.states) + 1).at[-1].set(1.0)
-        expected = jnp.kron(law, unit)
-        # E[r | mode], of which x alone varies.
-        known = [jnp.concatenate([unit, expected, jnp.kron(of_mode - law, unit)]) for of_mode in np.eye(modes)]
-        moments = _of_state(padded(jnp.asarray(start.initial_covariance)), modes)
-        moments = law[:, None, None] * (moments + jnp.stack([jnp.outer(r, r) for r in known]))
-        return SideInformationBelief(jnp.asarray(start.initial_mean), expected, moments, jnp.asarray(False))
+        prior, unit = given(start.initial_mean, start.initial_covariance), np.eye(len(self.states) + 1)[:, -1:]
+        # q in each mode of x - c and of what is known there, x~ = (0, 1) and e = (1{mode} - p) x (0, 1).
+        x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
+        known = jnp.zeros_like(x).at[:, -1:].set(unit)
+        errors = [kron(of_mode[:, None], x) - kron(law[:, None], known) for of_mode in jnp.eye(len(law))]
+        moments = Columns(
+            jnp.stack([jnp.concatenate([e, x]) for e in errors]), outer(law, jnp.append(prior.variances, 1.0))
+        )
+        mean = jnp.kron(law, unit[:, 0])
+        return _of_factors(mean, jax.vmap(triangular)(moments), jnp.asarray(start.initial_mean), jnp.asarray(False))
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
         """s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
         plant, channel = at(self.plant, k), at(self.channel, k)
-        move, noise, centre = moved_about(plant, u, state.centre)
-        modes, size = len(state.moments), len(move)
+        move, _, centre = moved_about(plant, u, state.centre)
+        modes, (errors, x, weights) = len(self.initial), _parts(state)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
-        step, law = jnp.kron(rows.T, move), state.moments[:, size - 1, size - 1]
-        carried = _carried(_mirrored(state.moments), move[:-1, :-1], rows)
-        # e in mode j: F e + (1_j - p_i) x A~ x~, with the random transition of the mode.
-        chosen = jnp.eye(modes) - rows[:, None]
-        moments = _with_transition(carried, rows, chosen) + (law @ rows)[:, None, None] * _of_state(noise, modes)
-        # The rounding of these products.
-        reach = _deviation(state.moments).reshape(modes, -1, size) @ jnp.abs(move).T
-        error = jnp.einsum("lj,ila->ija", rows, reach[:, 1 + modes :])
-        reached = jnp.abs(chosen)[..., None] * reach[:, None, None, 0] + error[:, None]
-        rounded = jnp.einsum("ij,ijla->jla", rows, reached**2).reshape(modes, -1)
-        moments = _with_rounding(moments, rounded)
-        return SideInformationBelief(centre, step @ state.mean, moments, jnp.asarray(True))
+        law = _law(x, weights) @ rows
+        # F e and A~ x~ of each mode, then e+ and x~+ of each transition.
+        errors = jax.vmap(lambda e: moved_by_mode(e, move, rows))(errors)
+        x = jax.vmap(lambda x: move @ x)(x)
+
+        def to(chosen: jax.Array, e: jax.Array, x: jax.Array) -> jax.Array:
+            return jnp.concatenate([e + kron(chosen[:, None], x), x])
+
+        # From all modes to each: their columns side by side, and the process noise.
+        noise = noise_in_mode(plant, u, at(self.plant, 0))
+
+        def into(j: jax.Array, chances: jax.Array, law: jax.Array) -> Columns:
+            moved = Columns(jax.vmap(to)(j - rows, errors, x), weights)
+            own = Columns(kron(jnp.append(j, 1.0)[:, None], noise.matrix), law * noise.weights)
+            return triangular(joined(side_by_side(moved, chances), own))
+
+        moments = jax.vmap(into)(jnp.eye(modes), rows.T, law)
+        mean = moved_by_mode(state.mean[:, None], move, rows)[:, 0]
+        return _of_factors(mean, moments, centre, jnp.asarray(True))
 
     @corrects
     def correct(
         self, state: SideInformationBelief, z: ArrayLike, k: Step = 0
     ) -> tuple[SideInformationBelief, Innovation]:
-        """Weight the modes by the flag and by the pattern of arrivals, project s again, then use z."""
+        """Weight the modes by the flag and by the pattern of arrivals, then project zeta on (1, s, z)."""
         sensor, known, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))
         # P(flag, pattern | mode).
@@ -158,22 +186,18 @@ class SideInformationFilter(AbstractSizedFilter):
         spelled = jnp.where(flag_there, jnp.asarray(known.flags)[:, number], 1.0)
         kind = pattern_of(known, there)
         weight = jnp.asarray(known.chance)[:, kind] * spelled
-        size = len(self.states) + 1
-        # Moments given the side information, and the best s under them.
-        weight = weight / (weight @ state.moments[:, size - 1, size - 1])
-        moments = weight[:, None, None] * _mirrored(state.moments)
-        prior = _projected(state._replace(moments=moments), size)
-        # Kalman update of zeta with the components that arrived, and the rounding of the mean.
-        after, value, covariance, precise = _used(
-            prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there,
-            received_rounding(sensor, start_of(at(self.plant, 0)), jnp.asarray(known.mean)[:, kind]),
-        )  # fmt: skip
-        law = after.moments[:, size - 1, size - 1]
-        shares = mean_rounding(at(self.plant, 0), law, after.covariance, prior.covariance, precise)
-        errors = slice(-len(after.mean), None)
-        after = after._replace(moments=after.moments.at[:, errors, errors].add(law[:, None, None] * shares))
-        likelihood = log_density(value, covariance, jnp.abs(z) + jnp.abs(value))
-        covariance = jnp.where(there[:, None] & there, covariance, jnp.nan)
+        # Moments given the side information, then the projection.
+        _, x, weights = _parts(state)
+        weight = weight / (weight @ _law(x, weights))
+        prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
+        told = jnp.asarray(weight - 1)[:, None] * state.variances
+        links = jax.tree.map(lambda part: jnp.asarray(part)[:, kind], (known.mean, known.gain_spread, known.noise))
+        after, innovations, innovation = _projected(
+            prior, told, _received(prior, sensor, size_of(sensor, start_of(at(self.plant, 0))), *links), z
+        )
+        likelihood = innovations.log_density(there, jnp.abs(z) + jnp.abs(innovation.mean))
+        value = jnp.where(there, innovation.mean, jnp.nan)
+        covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.nan)
         if self.flagged:
             nis, covariance = append_flag(covariance, flag)
             value = jnp.append(value, nis)
@@ -183,146 +207,125 @@ class SideInformationFilter(AbstractSizedFilter):
     def estimate(self, state: SideInformationBelief) -> Estimate:
         """x - c = sum_j zeta^j."""
         projection = sum_of_modes(len(self.states), len(self.initial))
-        return Estimate(
-            state.centre + projection @ state.mean, projection @ state.covariance @ projection.T, self.claim
-        )
+        mean, covariance = state.centre + projection @ state.mean, state.errors.through(projection).covariance
+        return Estimate(mean, covariance, self.claim)
 
 
-def _mirrored(moments: jax.Array) -> jax.Array:
-    """Moments (M, r, r) that are symmetric but for rounding, of their upper triangle: half of the products is done."""
-    return jnp.where(np.triu(np.ones(moments.shape[1:], bool)), moments, moments.swapaxes(1, 2))
+class Received(NamedTuple):
+    """What arrives: z = common + output zeta + noise, with its noise in each mode times the mode's probability.
 
-
-def _of_state(covariance: jax.Array, modes: int) -> jax.Array:
-    """E[r r'] in each mode (M, r, r) of what x~ gains, with this covariance: in x~ and in e of the mode."""
-    gains = np.zeros((modes, 1 + 2 * modes), bool)
-    gains[:, 0], gains[:, 1 + modes :] = True, np.eye(modes)
-    there = np.kron(gains[:, :, None] & gains[:, None, :], np.ones(covariance.shape, bool))
-    return jnp.where(there, jnp.tile(covariance, (gains.shape[1],) * 2), 0.0)
-
-
-def _carried(moments: jax.Array, transition: jax.Array, rows: jax.Array) -> jax.Array:
-    """E[r r'] (M, r, r) with each x~ in r moved by A~ = diag(A, 1), those in s and in e then mixed by the chain."""
-    modes, n = len(rows), len(transition)
-
-    def act(columns: jax.Array) -> jax.Array:
-        parts = columns.reshape(modes, -1, n + 1, columns.shape[-1])
-        moved = jnp.concatenate([jnp.einsum("ab,itbc->itac", transition, parts[:, :, :n]), parts[:, :, n:]], axis=2)
-        apart = moved[:, 1:].reshape(modes, 2, modes, -1)
-        mixed = jnp.einsum("lj,itlc->itjc", rows, apart).reshape(modes, 2 * modes, n + 1, -1)
-        return jnp.concatenate([moved[:, :1], mixed], axis=1).reshape(columns.shape)
-
-    return _turned(moments, act)
-
-
-def _with_transition(moments: jax.Array, rows: jax.Array, chosen: jax.Array) -> jax.Array:
-    """E[r r'] in each next mode j, sum_i Pi_ij E[r r' | i], where e gains c_ij x x~, c = `chosen` (M, M, M)."""
-    modes, size = len(rows), moments.shape[1] // (1 + 2 * len(rows))
-    weights, errors = rows[:, :, None] * chosen, slice(-modes * size, None)
-    squares = weights[..., None] * chosen[:, :, None]
-    cross = jnp.einsum("ijl,iab->jlab", weights, moments[:, :size]).reshape(modes, modes * size, -1)
-    square = jnp.einsum("ijlm,iab->jlamb", squares, moments[:, :size, :size]).reshape(modes, modes * size, -1)
-    of_next = jnp.einsum("ij,iab->jab", rows, moments)
-    of_next = of_next.at[:, :, errors].add(cross.swapaxes(1, 2)).at[:, errors].add(cross)
-    return _mirrored(of_next.at[:, errors, errors].add(square))
-
-
-def _turned(moments: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """F E[r r'] F' (M, r, r), where `act` is the product of F with columns (M, r, c)."""
-    return _mirrored(act(act(moments).swapaxes(1, 2)))
-
-
-def _deviation(moments: jax.Array) -> jax.Array:
-    """Deviations (..., r)."""
-    return jnp.sqrt(jnp.maximum(jnp.diagonal(moments, axis1=-2, axis2=-1), 0.0))
-
-
-def _with_rounding(moments: jax.Array, squares: jax.Array) -> jax.Array:
-    """Add to the last variances, the errors', four eps of (|F| d)^2, d the deviations: the products' F E[r r'] F'."""
-    count = squares.shape[-1]
-    rounded = 4 * float(np.finfo(moments.dtype).eps) * squares
-    return moments.at[..., -count:, -count:].add(jnp.where(np.eye(count, dtype=bool), rounded[..., None], 0.0))
-
-
-def _projected(state: SideInformationBelief, size: int) -> SideInformationBelief:
-    """Best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+.
-
-    Moments of e are exact under any D. Directions of s of next to no variance are left as they are: what the products
-    of moments leave of rounding there would be divided by it.
+    Shapes: output (m, N), common (m,), noise (M, m, m) columns.
     """
-    count, total = len(state.mean), jnp.sum(state.moments, axis=0)
-    known = slice(size - 1, size + count)
-    change = pseudo_solve(total[known, known], total[known, -count:], rounding(PRECISE, total, 1000)).T
 
-    def act(r: jax.Array) -> jax.Array:
-        gained = change @ r[:, known]
-        return jnp.concatenate([r[:, :size], r[:, size:-count] + gained, r[:, -count:] - gained], axis=1)
-
-    moments, deviation = _turned(state.moments, act), _deviation(state.moments)
-    reach = deviation[:, -count:] + deviation[:, known] @ jnp.abs(change).T
-    mean = state.mean + change @ jnp.append(1.0, state.mean)
-    return state._replace(mean=mean, moments=_with_rounding(moments, reach**2))
+    output: jax.Array
+    common: jax.Array
+    noise: Columns
 
 
-def _used(
+class Expected(NamedTuple):
+    """Innovation z - E[z | 1, s] (m,) and its covariance (m, m)."""
+
+    mean: jax.Array
+    covariance: jax.Array
+
+
+def _parts(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Columns of e (M, N, q) and of x~ (M, n + 1, q) in each mode, and their weights (M, q)."""
+    root, count = jnp.asarray(state.moments.matrix), len(state.mean)
+    return root[:, :count], root[:, count:], jnp.asarray(state.variances)
+
+
+def _of_factors(mean: jax.Array, moments: Columns, centre: jax.Array, moved: jax.Array) -> SideInformationBelief:
+    """State of the triangular factors of each mode's moments (M, q, q)."""
+    lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))
+    return SideInformationBelief(mean, lower, jnp.asarray(moments.weights), centre, moved)
+
+
+def _law(x: jax.Array, weights: jax.Array) -> jax.Array:
+    """Probabilities of the modes (M,), E[1^2 1{mode}]."""
+    return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
+
+
+def _received(
     state: SideInformationBelief,
     sensor: LinearSensor,
-    mean: jax.Array,
-    spread: jax.Array,
-    z: jax.Array,
-    there: jax.Array,
-    of_z: jax.Array,
-) -> tuple[SideInformationBelief, jax.Array, jax.Array, jax.Array]:
-    """Update by e+ = (I - K H) e - K noise; returns the innovation and covariance, and if it is precise."""
-    measure, noise = measured_about(sensor, state.centre)
-    size = measure.shape[1]
-    # Cov(z | zeta, mode) = T_j(E[y y' 1{j}]) + P(j) Hbar_j R~ Hbar_j', and the rounding of z.
-    law = state.moments[:, size - 1, size - 1]
-    second = measure @ state.moments[:, :size, :size] @ measure.T + law[:, None, None] * noise
-    added = jnp.einsum("jmlab,jab->jml", spread, second) + law[:, None, None] * (mean @ noise @ mean.swapaxes(1, 2))
-    added = added + law[:, None, None] * jnp.diag(of_z)
+    size: jax.Array,
+    gains: jax.Array,
+    gain_spread: jax.Array,
+    link: Columns,
+) -> Received:
+    """Cov(z | zeta) in mode j is T_j(E[y y' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), and the rounding of z."""
+    (measure, noise), (_, x, weights) = measured_about(sensor, state.centre), _parts(state)
+    law = _law(x, weights)
+
+    def noise_of(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
+        sent = x.through(measure).covariance + p * noise
+        known = joined(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
+        rounding = rounding_of((jnp.abs(gain[:, :-1]) @ jnp.sqrt(size)) ** 2).times(p)
+        return triangular(joined(known, rounding, eliminated_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
+
     # Output matrix of zeta less the mean output; modes of probability zero have none.
-    output, common = without_common(mean @ measure, law)
+    output, common = without_common(gains @ measure, law)
     output = beside(jnp.where(law[:, None, None] > 0, output, 0.0))
-    prior = state.covariance
-    # S = H P H' + sum_j Cov(z | zeta, j), K = P H' S^-1, with the rounding of S, which no difference of modes is below.
-    cross, value = output @ prior, z - common - output @ state.mean
-    total = cross @ output.T + jnp.sum(added, axis=0)
-    rounded = _with_rounding(symmetrize(total), (jnp.abs(output) @ _deviation(prior)) ** 2)
-    seen = jnp.where(there[:, None] & there, rounded, 0.0) + absent(there)
-    gain, _ = gain_and_bound(prior, jnp.where(there[:, None], cross, 0.0), seen)
-    # s+ = s + K (H e + noise), e+ = e - K (H e + noise).
-    count, left = len(prior), jnp.eye(len(prior)) - gain @ output
-
-    def act(r: jax.Array) -> jax.Array:
-        e = r[:, -count:]
-        return jnp.concatenate([r[:, :size], r[:, size:-count] + gain @ (output @ e), left @ e], axis=1)
-
-    reach = _deviation(state.moments)[:, -count:] @ jnp.abs(left).T
-    moments = _with_rounding(_turned(state.moments, act), reach**2)
-    noise_of = jax.vmap(spread_of, in_axes=(None, 0))(gain, added)
-    moments = moments.at[:, size:, size:].add(jnp.kron(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), noise_of))
-    after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)
-    fresh = jnp.where(there[:, None] & there, jnp.sum(added, axis=0), 0.0) + absent(there)
-    return after, value, total, is_precise(seen, fresh)
+    return Received(output, common, jax.vmap(noise_of)(gains, gain_spread, link, Columns(x, weights), law))
 
 
-def received_rounding(sensor: LinearSensor, size: jax.Array, gains: jax.Array) -> jax.Array:
-    """Variance (m,) that rounding gives to z by what the outputs are off, behind the greatest of the modes' gains."""
-    of_noise = noise_rounding(sensor.noise.mean, sensor.noise.covariance)
-    of_outputs = output_rounding(sensor.matrix, size) + of_noise
-    largest: jax.Array = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
-    return largest**2
+def _projected(
+    state: SideInformationBelief, told: jax.Array, received: Received, z: jax.Array
+) -> tuple[SideInformationBelief, Innovations, Expected]:
+    """Project zeta on (1, s, z): what these say of e goes from e to s, column by column.
+
+    Before the side information (1, s) said nothing of e: what they say now is by what the weights `told` (M, q) more.
+    """
+    errors, x, weights = _parts(state)
+    m, count, modes, there = len(z), len(state.mean), len(weights), ~jnp.isnan(z)
+    # Columns of the state and of the noise of z, in each mode.
+    errors, x = (jnp.pad(part, ((0, 0), (0, 0), (0, m))) for part in (errors, x))
+    fresh = jnp.pad(jnp.asarray(received.noise.matrix), ((0, 0), (0, 0), (weights.shape[1], 0)))
+    weights = jnp.concatenate([weights, received.noise.weights], axis=1).reshape(-1)
+    told = jnp.pad(told, ((0, 0), (0, m))).reshape(-1)
+    # Rows 1 and s = zeta - e, and z less what s says and e, of all modes side by side; and their values.
+    zeta = jax.vmap(lambda j, x: kron(j[:, None], x))(jnp.eye(modes), x)
+    seen = jnp.where(there[:, None], jax.vmap(lambda e: received.output @ e)(errors) + fresh, 0.0)
+    known, rest = _beside(x[:, -1:], zeta - errors), _beside(seen, errors)
+    value = jnp.where(there, z - received.common - received.output @ state.mean, 0.0)
+    # Directions of s that rounding decides, eps of x~ and more where it was divided by little, say nothing.
+    size = jnp.tile(jnp.square(_beside(x)) @ weights, modes) + jnp.square(known[1:]) @ weights
+    least = jnp.append(0.0, np.sqrt(unit_of(weights)) * size)
+    known, numbers, variances = uncorrelated(known, jnp.append(1.0, state.mean), weights, 1 + count)
+    over = reciprocal(jnp.where(variances > least, variances, 0.0))
+    share = (rest @ (told * known).T) * over
+    rest, value = rest - share @ known, jnp.append(value, -state.mean) - share @ numbers
+    expected = Expected(value[:m], Columns(rest[:m], weights).covariance)
+    # The same with z.
+    rest, value, variances = uncorrelated(rest, value, weights, m)
+    innovations = Innovations(value[:m], variances, jnp.diagonal(expected.covariance))
+    # Factors of each mode.
+    after = jnp.moveaxis(rest[m:].reshape(count, modes, -1), 1, 0)
+    moments = jax.vmap(triangular)(Columns(jnp.concatenate([after, x], axis=1), weights.reshape(modes, -1)))
+    return _of_factors(-value[m:], moments, state.centre, state.moved), innovations, expected
 
 
-def mean_rounding(
-    start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array, precise: jax.Array | bool = False
-) -> jax.Array:
-    """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
-    n, size = len(start.initial_mean), start_of(start)
-    projection = sum_of_modes(n, len(law))
-    left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
-    return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size, precise) - left))
+def _beside(*parts: jax.Array) -> jax.Array:
+    """Rows of all parts, each (M, rows, columns), with the columns of all modes side by side."""
+    rows = jnp.moveaxis(jnp.concatenate(parts, axis=1), 0, 1)
+    return rows.reshape(len(rows), -1)
+
+
+def uncorrelated(
+    rows: jax.Array, numbers: jax.Array, weights: jax.Array, count: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Take from all rows, and from their numbers, what each of the first ones, in turn, says of those below it.
+
+    Returns rows, numbers and the variances (count,) of the first ones given those above them.
+    """
+    variances = []
+    for i in range(count):
+        weighted = weights * rows[i]
+        variances.append(rows[i] @ weighted)
+        share = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal(variances[i]), 0.0)
+        rows, numbers = rows - outer(share, rows[i]), numbers - share * numbers[i]
+    return rows, numbers, jnp.stack(variances)
 
 
 def pattern_of(channel: SideInformation, there: Bool[Array, " m"]) -> jax.Array:
