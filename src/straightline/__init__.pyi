@@ -17,3 +17,6 @@ from .nodes import (
 from .c_function import (
     to_c as to_c,
 )
+from .rules.named import (
+    operation as operation,
+)

@@ -25,6 +25,7 @@ from straightline.rules import (  # noqa: F401  (they fill the rules)
     indexing,
     loops,
     matrices,
+    named,
     present,
     random_bits,
     rows,

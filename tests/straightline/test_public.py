@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Primitive
 
 import straightline as sl
 
@@ -145,3 +146,35 @@ def test_zero_times_a_finite_number_is_zero_in_c():
 def test_what_c_does_not_have_is_refused(function, name, error, message):
     with pytest.raises(error, match=message):
         sl.to_c(function, np.zeros(2), name=name, single=True)
+
+
+def in_closed_form(a, power):
+    """Singular values of ((a, b), (c, d)): |hypot(a + d, b - c) +- hypot(a - d, b + c)| / 2, to a power."""
+    half = jnp.hypot(a[0, 0] + a[1, 1], a[0, 1] - a[1, 0]) / 2, jnp.hypot(a[0, 0] - a[1, 1], a[0, 1] + a[1, 0]) / 2
+    return [jnp.stack([half[0] + half[1], jnp.abs(half[0] - half[1])]) ** power]
+
+
+def test_an_operation_of_one_s_own_is_computed_by_its_function():
+    values = Primitive("singular_values")
+    values.multiple_results = True
+    values.def_abstract_eval(lambda a, power: [jax.core.ShapedArray(a.shape[:-1], a.dtype)])
+    with pytest.raises(sl.Unsupported, match="singular_values at"):
+        sl.compile(lambda a: values.bind(a, power=2), np.eye(2))
+    sl.operation(values, in_closed_form)
+    a = RANDOM.normal(size=(9, 2, 2))
+    [result] = sl.compile(lambda a: values.bind(a, power=2), a[0])(a)
+    np.testing.assert_allclose(result, np.linalg.svd(a)[1] ** 2, rtol=1e-13)
+    with pytest.raises(ValueError, match="operation: expected a primitive with a name of its own, got 'add'"):
+        sl.operation(Primitive("add"), in_closed_form)
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_axes_that_vmap_added_to_an_operation_come_last(count):
+    """A few are written out, many are a loop; what does not differ has an axis of one."""
+    scaled = Primitive("scaled")
+    scaled.multiple_results = True
+    scaled.def_abstract_eval(lambda a, x, sizes: [jax.core.ShapedArray((2, *sizes), a.dtype)])
+    sl.operation(scaled, lambda a, x: [a @ x], mapped="sizes")
+    a, x = RANDOM.normal(size=(5, 2, 2)), RANDOM.normal(size=(5, 2, count))
+    code = sl.compile(lambda a, x: scaled.bind(a[..., None], x, sizes=(count,))[0], a[0], x[0])
+    np.testing.assert_allclose(code(a, x), a @ x, rtol=1e-13)

@@ -28,6 +28,17 @@ def test_it_imports_nothing_of_heliograph():
     assert not {name: found for name, found in others.items() if found}
 
 
+def test_heliograph_takes_public_names_alone():
+    taken = set()
+    for path in (SOURCE.parent / "heliograph").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            assert not isinstance(node, ast.Import) or "straightline" not in [a.name for a in node.names], path.name
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("straightline"):
+                assert node.module == "straightline", f"{path.name} imports from {node.module}"
+                taken |= {alias.name for alias in node.names}
+    assert taken == set(straightline.__all__) - {"explain"}  # each has a use
+
+
 def test_it_compiles_where_there_is_no_heliograph():
     program = """
 import sys

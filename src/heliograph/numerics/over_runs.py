@@ -15,6 +15,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from heliograph.numerics.types import PyTree
+from straightline import operation
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -169,6 +170,13 @@ def _sloped(
     return results, slopes
 
 
+def _written(*leaves: jax.Array, kernel: _Kernel, tree: Any, **rest: Any) -> list[jax.Array]:
+    """The results of one run, entry by entry: what native code computes."""
+    results: list[jax.Array] = jax.tree.leaves(kernel.written(*jax.tree.unflatten(tree, leaves)))
+    return results
+
+
+operation(_kernel, _written, mapped="runs")
 _kernel.def_impl(_computed)
 _kernel.def_abstract_eval(_shapes)
 batching.primitive_batchers[_kernel] = _over_one_more
