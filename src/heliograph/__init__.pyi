@@ -45,6 +45,7 @@ from .model.channel import (
     hop as hop,
     parallel as parallel,
     perfect as perfect,
+    superposed as superposed,
 )
 from .model.fading import (
     gilbert_elliott as gilbert_elliott,

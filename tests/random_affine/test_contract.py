@@ -37,9 +37,18 @@ CHANNELS = {
         [hg.dropout(hg.model.with_direct_link(SCALAR, SCALAR), 0.6), hg.random_affine.known([[1.0, -0.5]])]
     ),
     "silent": hg.model.silent(2, 3, 0.5),
+    "sum": hg.superposed([SCALAR, hg.dropout(hg.hop(hg.Rayleigh(1.0), 0.1), 0.8)], 0.1),
+    "sum of relays": hg.superposed([TWO_HOPS, hg.hop(hg.Rayleigh(0.5), 0.0, dimension=2)], SKEWED, same=True),
 }
 
-LARGE = {"three hops", "dropout", "direct link", "parallel", "dropout of a direct link in series"}  # cost most
+LARGE = {
+    "sum of relays",
+    "three hops",
+    "dropout",
+    "direct link",
+    "parallel",
+    "dropout of a direct link in series",
+}  # cost most
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in CHANNELS])

@@ -9,8 +9,8 @@ import pytest
 import heliograph as hg
 from heliograph.h_infinity.system import disturbed_gain
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.intervals import moment_interval
 from heliograph.random_affine.moments.push import push
-from heliograph.random_affine.moments.second_moments import moment_interval
 from heliograph.testing import check_random_affine
 
 GAINS = np.array([0.2, 1.0])

@@ -170,3 +170,16 @@ def test_bad_input_gets_one_clear_line(name):
     with pytest.raises(ValueError, match=f"^{words}") as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_a_sum_of_links_with_memory_is_in_their_joint_modes():
+    """A burst of losses, a fading that drifts and one chain that two links share: draws against moments over time."""
+    burst = hg.gilbert_elliott(hg.hop(1.0, 0.1), hg.model.silent(1, 1, 0.1), 0.2, 0.4)
+    drifts = hg.model.autoregressive_fading(1.0, 0.3, 0.9, 0.1)
+    channel = hg.superposed([burst, drifts, hg.hop(hg.Rayleigh(0.5), 0.0)], 0.05)
+    assert len(hg.random_affine.joint_modes(channel).maps) == 2 * 2
+    check_random_affine(channel, highest=2)
+    common = hg.markov_fading([0.5, 1.5], [[0.8, 0.2], [0.3, 0.7]], 0.1, name="fog")
+    twice = hg.superposed([common, common], 0.05)
+    assert len(hg.random_affine.joint_modes(twice).maps) == 2
+    check_random_affine(twice, highest=2)

@@ -27,6 +27,7 @@ from heliograph.random_affine.outliers import (
     has_outliers,
     nominal,
 )
+from heliograph.random_affine.superposed import Superposed
 
 Vector = Float[jax.Array | np.ndarray, " m"]
 Matrix = Float[jax.Array | np.ndarray, "m branches"]
@@ -110,6 +111,10 @@ def split(channel: AbstractRandomAffine) -> SplitChannel:
         case GainAndNoise() if has_outliers(channel.noise):
             still = Gaussian(np.zeros((channel.outputs, channel.outputs)), channel.noise.mean)
             return SplitChannel(GainAndNoise(channel.law, channel.matrix, still), channel.noise)
+        case Superposed() if has_outliers(channel.noise):
+            still = Gaussian(np.zeros((channel.outputs, channel.outputs)), channel.noise.mean)
+            plain = Superposed(channel.maps, still, channel.places, channel.inputs)
+            return SplitChannel(plain, channel.noise)
         case Series():
             *before, last = channel.maps
             end = split(last)

@@ -13,6 +13,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, fold
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.superposed import Superposed
 
 LARGEST = 1e100  # of levels, gains and weights: products of three of them are numbers
 ROUNDING = 1e-13  # relative to the largest eigenvalue, in units of each component: smaller ones are rounding
@@ -67,7 +68,8 @@ def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
         Series: lambda _, parts: reduce(_after, parts),
         Mixture: lambda mixture, parts: _of_mixture(mixture, parts),
         Stack: lambda stack, parts: _stack(parts, stack.inputs),
-    }, "channel", "hops, series, mixtures and stacks of them")  # fmt: skip
+        Superposed: lambda channel, _: disturbed_gain(channel.as_stack),
+    }, "channel", "hops, series, mixtures, stacks and sums of them")  # fmt: skip
     return gain
 
 

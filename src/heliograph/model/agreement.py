@@ -29,6 +29,7 @@ from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import Modes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.outliers import is_bounded
+from heliograph.random_affine.superposed import Superposed
 
 ROUNDING = 1e-12  # relative: moments that were computed in another order
 PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"
@@ -240,6 +241,8 @@ def _covers(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None)
         case Modes() as x, Modes() as y if _holds_chain(x.memory, y.memory):
             pass
         case Stack() as x, Stack() as y:
+            pass
+        case Superposed() as x, Superposed() as y if x.places == y.places and _same_noise(x.noise, y.noise, order):
             pass
         case _:
             return False

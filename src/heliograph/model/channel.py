@@ -10,16 +10,24 @@ from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_turns
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.check import check_count, fail, scalar
+from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, independent, inner_maps
+from heliograph.random_affine.base import (
+    AbstractRandomAffine,
+    all_inner_maps,
+    as_maps,
+    check_forgets,
+    independent,
+    inner_maps,
+)
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
 from heliograph.random_affine.delay import Delay, Delayed, DelayLine, Relayed, in_series, of_part, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
+from heliograph.random_affine.superposed import Superposed
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
@@ -206,6 +214,49 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
         parts.append(of_part(c, total, start, past))
         start += signal_size(c)
     return Stack(parts)
+
+
+def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool = False) -> Superposed:
+    """Links that transmit at once, of which the receiver gets the sum z = sum_i (G_i y_i + n_i) + n.
+
+    Link i carries its own part of y, as in `parallel` (`joint_sensor` makes one sensor of several); `same=True`: all
+    carry all of y, as relays of one signal do. Links are independent: what is common to them, as one first hop that
+    several relays hear, comes before the sum, Series([first, superposed(relays, noise, same=True)]).
+
+    Args:
+        links: one for each transmitter, with as many outputs each as the receiver gets.
+        noise: law, covariance (m, m) or variance of the receiver's noise n.
+        same: True if every link carries all of y; False unless given.
+
+    Raises:
+        ValueError: links of other sizes; an erasure in a link, since a receiver of a sum does not see who is missing;
+            flags or time stamps, which would be added up.
+    """
+    links = independent(as_maps("links of a sum", links))
+    for i, link in enumerate(links, 1):
+        _check_added(f"link {i} of a sum", link)
+    sizes, sent = [link.outputs for link in links], [signal_size(link) for link in links]
+    if len(set(sizes)) > 1:
+        raise fail("links of a sum", "links of one number of outputs", sizes)
+    if instance("same", same, bool, "True or False") and len(set(sent)) > 1:
+        raise fail("links of a sum (same=True)", "links that all carry all of y", f"links of {sent} numbers")
+    past, total = max(link.past for link in links), sent[0] if same else sum(sent)
+    starts = [0] * len(links) if same else np.cumsum([0, *sent[:-1]]).tolist()
+    places = [
+        tuple(t * total + start + i for t in range(link.past + 1) for i in range(size))
+        for link, start, size in zip(links, starts, sent, strict=True)
+    ]
+    return Superposed(links, as_noise("noise of a sum", noise, sizes[0]), places, (1 + past) * total)
+
+
+def _check_added(name: str, link: AbstractRandomAffine) -> None:
+    """Raise ValueError where a link delivers what cannot be added up."""
+    inside = [link, *all_inner_maps(link)]
+    if any(isinstance(m, ModeOutput) or (isinstance(m, Delayed) and m.timestamped) for m in inside):
+        raise fail(name, "one without flags and time stamps, which would be added up", type(link).__name__)
+    if link.erases:
+        expected = "a loss that the receiver does not see: dropout(link, arrival) inside, erasure(sum, arrival) outside"
+        raise fail(name, expected, "an erasure")
 
 
 def mean_gain(channel: Channel) -> Channel:

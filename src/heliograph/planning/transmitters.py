@@ -2,8 +2,9 @@
 
 Every map z = g A y + n with a random gain or a noise is a hop, and its transmitter sends A y; what is known and without
 noise is a wire. Transmitters are named by their place: "hop1", "hop2" along a chain, "part1.", "part2." in a stack,
-"choice1." where a mixture chooses among several. A transmitter sends whether it is received or not: of modes and
-mixtures in which it is silent it knows nothing. Behind an observed loss (an erasure) a relay sends only what arrived.
+"link1.", "link2." in a sum, "choice1." where a mixture chooses among several. A transmitter sends whether it is
+received or not: of modes and mixtures in which it is silent it knows nothing. Behind an observed loss (an erasure) a
+relay sends only what arrived.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +25,7 @@ from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
 from heliograph.random_affine.moments.second_moments import second_moment_tensor
+from heliograph.random_affine.superposed import Superposed
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
 
@@ -90,6 +92,10 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
             visited, position = _visit_chain(inside, visit, position)
         case Stack():
             visited = [_visit(affine, visit, at)[0] for affine, at in _numbered(inside, position, "part")]
+        case Superposed():
+            places = _numbered(inside, position, "link")
+            parts = zip(places, channel.places, strict=True)
+            visited = [_visit(affine, visit, _taking(at, chosen))[0] for (affine, at), chosen in parts]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
             several = isinstance(channel, Mixture) and sum(not is_silent(affine) for affine in inside) > 1
@@ -107,7 +113,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
             link, position = _visit(inside[0], visit, position)
             visited = [link, *inside[1:]]
         case _:
-            expected = "hops in series, stacks, mixtures, modes, losses and delays"
+            expected = "hops in series, stacks, sums, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
     return with_inner_maps(channel, visited), position
 
@@ -118,6 +124,14 @@ def _numbered(
     """Maps side by side, each with its position: names begin with the word and the map's number."""
     at = [position._replace(prefix=f"{position.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
     return list(zip(maps, at, strict=True))
+
+
+def _taking(position: Position, places: Sequence[int]) -> Position:
+    """The position at a link that takes the components at these places."""
+    if position.signal is None:
+        return position
+    chosen = np.array([*places, -1])
+    return position._replace(signal=position.signal._replace(second=position.signal.second[chosen[:, None], chosen]))
 
 
 def _visit_chain(

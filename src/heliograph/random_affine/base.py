@@ -223,6 +223,11 @@ def inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     return [leaf for leaf in _fields(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
 
 
+def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+    """Return the maps inside a map, and those inside them."""
+    return [m for affine in inner_maps(channel) for m in (affine, *all_inner_maps(affine))]
+
+
 def with_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
     leaves, tree = _fields(channel)

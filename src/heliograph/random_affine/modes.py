@@ -31,6 +31,7 @@ from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.lift import Lift
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
+from heliograph.random_affine.superposed import Superposed
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
 
@@ -240,7 +241,7 @@ def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
     match channel:
         case AbstractModal():
             return int(channel.memory.identity == identity)
-        case Stack() | Mixture():
+        case Stack() | Superposed() | Mixture():
             return max(degree_in(affine, identity) for affine in channel.maps)
         case Lift():
             return channel.degree * degree_in(channel.base, identity)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.random_affine.moments.second_moments import CORNERS, moment_interval
+from heliograph.random_affine.moments.intervals import CORNERS, moment_interval
 from tests.as_code import printing
 from tests.random_affine.conditional import conditional_moments
 

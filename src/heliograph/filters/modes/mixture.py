@@ -43,6 +43,7 @@ from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Independent, Shaped
 from heliograph.random_affine.noise import Gaussian as GaussianNoise
+from heliograph.random_affine.superposed import Superposed
 
 COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
 
@@ -68,10 +69,11 @@ def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
         GainAndNoise: _atoms_of_hop,
         Series: _combined(_after),
         Stack: _combined(_others),
+        Superposed: lambda channel, _: atoms_of(channel.as_stack),
         # One of several maps, drawn: p(i) times the atoms of map i.
         Mixture: lambda mixture, parts: [c._replace(weight=p * c.weight) for p, atoms in
                                          zip(mixture.choice.probabilities, parts, strict=True) for c in atoms],
-    }, "mixture filter", "maps made of hops, series, stacks and mixtures")  # fmt: skip
+    }, "mixture filter", "maps made of hops, series, stacks, sums and mixtures")  # fmt: skip
 
 
 def _atoms_of_hop(hop: GainAndNoise, _: object) -> list[Component]:

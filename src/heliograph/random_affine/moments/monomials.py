@@ -48,6 +48,29 @@ def count(variables: int, degree: int) -> int:
     return comb(variables + degree - 1, degree)
 
 
+@cached_arrays
+def factors(variables: int, degree: int) -> np.ndarray:
+    """Variables that each monomial of `exponents` multiplies, in order: (count, degree)."""
+    choices = combinations_with_replacement(range(variables), degree)
+    flat = np.fromiter((variable for choice in choices for variable in choice), np.int64)
+    return flat.reshape(count(variables, degree), degree)
+
+
+def place(chosen: np.ndarray, variables: int) -> np.ndarray:
+    """Position of each monomial in `exponents`, from the variables (..., degree) that it multiplies, in any order.
+
+    Before variables s_1 <= s_2 <= ... stand, for each t, those with the same first ones and a smaller t-th.
+    """
+    ordered = np.sort(chosen, axis=-1)
+    before = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
+    rank = np.zeros(chosen.shape[:-1], dtype=np.int64)
+    for t in range(chosen.shape[-1]):
+        rest = chosen.shape[-1] - t
+        starting = np.array([count(n, rest) for n in range(variables + 1)])  # of `rest` variables among the last n
+        rank += starting[variables - before[..., t]] - starting[variables - before[..., t + 1]]
+    return rank
+
+
 def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
     """Raise if a moment matrix would need more than the stated memory."""
     if rows * columns > MEMORY_LIMIT_ENTRIES:
@@ -117,12 +140,10 @@ def _append_zero_column(a: Numbers) -> Numbers:
 @cached_arrays
 def product_table(variables: int, first: int, second: int) -> np.ndarray:
     """Entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
-    target = position(variables, first + second)
-    rows = [
-        [target[tuple(a + b for a, b in zip(p, q, strict=True))] for q in exponents(variables, second)]
-        for p in exponents(variables, first)
-    ]
-    return np.array(rows, dtype=np.int64).reshape(count(variables, first), count(variables, second))
+    a, b = factors(variables, first), factors(variables, second)
+    shape = len(a), len(b)
+    both = [np.broadcast_to(a[:, None], (*shape, first)), np.broadcast_to(b, (*shape, second))]
+    return place(np.concatenate(both, axis=-1), variables)
 
 
 def multiply(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
@@ -183,8 +204,11 @@ class Moments(Module):
 @cached_arrays
 def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
     """Return positions of monomials of degree `low` in (z, 1) and (y, 1), times powers of 1, among degree `high`."""
-    items = [
-        [i for i, powers in enumerate(exponents(size + 1, high)) if powers[-1] >= high - low]
-        for size in (outputs, inputs)
-    ]
-    return np.ix_(*items)
+    return np.ix_(*(times_one(size + 1, low, high) for size in (outputs, inputs)))
+
+
+@cached_arrays
+def times_one(variables: int, low: int, high: int) -> np.ndarray:
+    """Positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
+    chosen = factors(variables, low)
+    return place(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)

@@ -1,4 +1,8 @@
-"""Second moments of a channel, bounded under every possible law, and intervals of every moment."""
+"""Second moments of a channel, bounded under every possible law."""
+
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -7,92 +11,16 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of
 from heliograph.numerics.caching import cached
-from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import contract, diagonal, diagonal_of, summed
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import is_traced, library, placed, stacked
+from heliograph.numerics.traced import is_traced, is_zero, library, stacked
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, fold
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack, stack_rows
-from heliograph.random_affine.law import Constant, Discrete
-from heliograph.random_affine.moments.monomials import Moments, count, product_table
-
-CORNERS = 2048  # corner laws evaluated one by one; above, intervals are combined (sound, but looser)
-
-Entries = Float[jax.Array | np.ndarray, "..."]
-Interval = tuple[Entries, Entries]
-
-
-def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
-    """Lowest and highest value of each entry of E[Sym^order(H)].
-
-    Up to CORNERS corner laws the ends are attained, since every entry is linear in each uncertain law; above, the
-    intervals of the parts are multiplied: sound but not attained.
-    """
-    check_forgets("channel of a bound", channel)
-    corners = _corner_count(channel)
-    # Every entry is multilinear in the uncertain probabilities, so corner laws attain its ends.
-    if corners is not None and corners <= CORNERS:
-        matrices = channel.corner_moments(order)
-        return matrices.min(axis=0), matrices.max(axis=0)
-    # Too many corners: interval products of the parts.
-    match channel:
-        case Series():
-            low, high = moment_interval(channel.maps[0], order)
-            for affine in channel.maps[1:]:
-                low, high = _multiply_matrices(moment_interval(affine, order), (low, high))
-            return low, high
-        case Stack():
-            return _stack_interval(channel, order)
-        case GainAndNoise(law=Discrete() as law):
-            return _atom_interval(channel, law, order)
-    raise fail("uncertain channel", f"at most {CORNERS} corner laws", corners)
-
-
-def _corner_count(channel: AbstractRandomAffine) -> int | None:
-    try:
-        return channel.corner_count()
-    except ValueError:  # one law with more uncertain atoms than corners are listed for
-        return None
-
-
-def _multiply_matrices(second: Interval, first: Interval) -> Interval:
-    """Interval matrix product by centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1)."""
-    c2, r2 = (second[1] + second[0]) / 2, (second[1] - second[0]) / 2
-    c1, r1 = (first[1] + first[0]) / 2, (first[1] - first[0]) / 2
-    size = library(c1, c2).abs
-    center, radius = c2 @ c1, size(c2) @ r1 + r2 @ (size(c1) + r1)
-    return center - radius, center + radius
-
-
-def _atom_interval(channel: GainAndNoise, law: Discrete, order: int) -> Interval:
-    """Moments are sum_k E[g^k] B_k with known B_k; each E[g^k] has its exact range from the closed-form LP."""
-    basis = channel.gain_coefficients(order)
-    ends = [(-law.worst(-(law.values**k)), law.worst(law.values**k)) if k else (1.0, 1.0) for k in range(order + 1)]
-    xp = library(basis)
-    products = [
-        (xp.minimum(b * lo, b * hi), xp.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
-    ]
-    return sum(low for low, _ in products), sum(high for _, high in products)
-
-
-def _stack_interval(channel: Stack, order: int) -> Interval:
-    """Products of the parts' interval polynomials, row by row."""
-    tables = [[stacked(moment_interval(m, k)) if k else None for k in range(order + 1)] for m in channel.maps]
-    rows = stacked(stack_rows(channel, order, tables, _multiply_rows))
-    return rows[:, 0], rows[:, 1]
-
-
-def _multiply_rows(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
-    """Interval product of two polynomials: ends of the products of ends, summed over equal monomials.
-
-    Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.
-    """
-    table = product_table(variables, first, second)
-    size = (count(variables, first + second),)
-    products = a.reshape(-1, 1, a.shape[-1], 1) * b.reshape(1, -1, 1, b.shape[-1])
-    return stacked([placed(size, table, products.min(axis=(0, 1))), placed(size, table, products.max(axis=(0, 1)))])
-
+from heliograph.random_affine.combine import GainAndNoise, Series, Stack
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.moments.intervals import CORNERS, listed_corners, moment_interval
+from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments, product_table
+from heliograph.random_affine.superposed import Superposed
 
 PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
 
@@ -206,7 +134,7 @@ def has_known_gain(channel: AbstractRandomAffine) -> bool:
     """Return whether z = G y + n with a constant G."""
     holds: bool = fold(channel, {
         GainAndNoise: lambda hop, _: isinstance(hop.law, Constant),
-        Series | Stack: lambda _, parts: all(parts),
+        Series | Stack | Superposed: lambda _, parts: all(parts),
         AbstractRandomAffine: lambda *_: False,
     })  # fmt: skip
     return holds
@@ -228,18 +156,34 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """
     as_maps("channel of a filter", [channel])
     check_forgets("channel of a filter", channel)
+    return described_by(*_bounds(channel), uncertain=listed_corners(channel) != 1)
+
+
+class Bounds(NamedTuple):
+    """Nominal mean of (G, n), bounds of spread, shift and power, and the nominal spread."""
+
+    mean: Matrix
+    spread: QuadraticMap
+    shift: QuadraticMap
+    power: QuadraticMap
+    nominal: QuadraticMap
+
+
+def _bounds(channel: AbstractRandomAffine) -> Bounds:
+    corners = listed_corners(channel)
+    listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
+    if isinstance(channel, Superposed) and (corners == 1 or not listed):
+        return _from_sum(channel, [_bounds(affine) for affine in channel.maps])
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
-    corners = _corner_count(channel)
-    known = corners == 1
     # Known law: the moments themselves.
-    if known:
-        spread, shift, power = _tensors(nominal, mean)
-        parts = [QuadraticMap(t, np.zeros(t.shape)) for t in (spread, shift, power)]
+    if corners == 1:
+        spread, shift, power = (_certain(tensor) for tensor in _tensors(nominal, mean))
+        return Bounds(mean, spread, shift, power, spread)
     # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
-    elif isinstance(channel, Stack):
+    if isinstance(channel, Stack):
         parts = _from_stack(channel)
-    elif corners is not None and corners <= CORNERS:
+    elif listed:
         laws = (
             Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
         )
@@ -247,15 +191,18 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
         parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
     else:
         parts = _from_intervals(channel, nominal, mean)
-    center = parts[0] if known else nominal_spread(channel)
-    return described_by(mean, parts[0], parts[1], parts[2], center, not known)
+    spread, shift, power = parts
+    return Bounds(mean, spread, shift, power, nominal_spread(channel))
+
+
+def _certain(tensor: Tensor) -> QuadraticMap:
+    return QuadraticMap(tensor, np.zeros(tensor.shape))
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
     """Cov(z | y) under the nominal law."""
     nominal = channel.moments(2)
-    spread = _tensors(nominal, nominal.mean[:-1])[0]
-    return QuadraticMap(spread, np.zeros(spread.shape))
+    return _certain(_tensors(nominal, nominal.mean[:-1])[0])
 
 
 def second_moment_tensor(matrix: Matrix, outputs: int, inputs: int) -> Tensor:
@@ -363,6 +310,63 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
         QuadraticMap(sum(q.center for q in maps) + apart * center, sum(q.radius for q in maps) + apart * radius)
         for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
     ]
+
+
+def _from_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
+    """Spreads of independent maps add up, and their means meet in every pair.
+
+    With D_i the shift of a mean, (sum D_i) Y (sum D_i)' <= sum_i D_i Y D_i' / w_i for weights w of sum 1, which are as
+    the sizes of the shifts; the spread about the nominal means is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
+    """
+    every = range(len(parts))
+    mean = channel.in_places({i: parts[i].mean for i in every}, 1)
+    mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
+    noise = _certain(channel.noise.covariance[..., None, None] * _corner(channel.inputs + 1))
+    of_mean = _certain(_of_signal(symmetric_product(mean, mean)))
+    own = _plus(_summed(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
+    sizes = [_size(bounds.shift) for bounds in parts]
+    total = sum(sizes)
+    if is_zero(total):
+        return Bounds(mean, own, _scaled(noise, 0.0), _plus(_signal(own), of_mean), own)
+    inverse = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
+    shift = _summed(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
+    cross = _summed(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
+    # Power of the mean, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
+    sure = _size(of_mean)
+    ratio = total / library(sure).where(sure > 0, sure, 1.0)
+    power = _plus(_signal(own), _scaled(of_mean, 1 + ratio), _scaled(_signal(shift), 1 + 1 / ratio))
+    nominal = _plus(_summed(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
+    return Bounds(mean, _plus(own, cross), shift, power, nominal)
+
+
+def _signal(bound: QuadraticMap) -> QuadraticMap:
+    return QuadraticMap(_of_signal(bound.center), _of_signal(bound.radius))
+
+
+def _size(shift: QuadraticMap) -> Any:
+    """Root of the power that the map gives of unit signals; it weighs bounds, and has no derivative."""
+    tensor = _still(shift.center + shift.radius)
+    return library(tensor).sqrt(library(tensor).einsum("iiaa->", tensor))
+
+
+def _summed(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
+    """Weighted sum of the maps of parts, each at the places of what its part takes."""
+    parts = {i: _scaled(part, weight) for i, (part, weight) in weighted.items()}
+    center = channel.in_places({i: part.center for i, part in parts.items()}, 2)
+    return QuadraticMap(center, channel.in_places({i: part.radius for i, part in parts.items()}, 2))
+
+
+def _plus(*maps: QuadraticMap) -> QuadraticMap:
+    return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
+
+
+def _scaled(part: QuadraticMap, factor: Any) -> QuadraticMap:
+    return QuadraticMap(factor * part.center, factor * part.radius)
+
+
+def _corner(size: int) -> np.ndarray:
+    """Matrix of zeros, but 1 as its last entry."""
+    return np.outer(np.eye(size)[-1], np.eye(size)[-1])
 
 
 def _on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:

@@ -19,6 +19,7 @@ from heliograph.random_affine.delay import Delayed, DelayLine
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes
+from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.claims import beliefs
 from heliograph.simulation.description.single import rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
@@ -163,6 +164,7 @@ def _words(channel: AbstractRandomAffine) -> str:
         GainAndNoise: lambda hop, _: _hop(hop),
         Series: lambda _, parts: ARROW.join(filter(None, parts)),
         Stack: lambda _, parts: _stack([words or DIRECT for words in parts]),
+        Superposed: lambda _, parts: f"sum of {_stack([words or DIRECT for words in parts])}",
         Erasure: lambda loss, parts: f"{parts[0] or DIRECT}, {_percent(1 - loss.arrival)} lost",
         Mixture: lambda mixture, parts: _mixture(mixture, [words or DIRECT for words in parts]),
         # Links that deliver late, and those whose modes remember.

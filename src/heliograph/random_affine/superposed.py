@@ -1,0 +1,234 @@
+"""Maps that add up: independent maps of parts of y, or of all of it, whose sum is received with one noise."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.caching import cached, cached_arrays
+from heliograph.numerics.check import check_count, fail, instance, items, shown
+from heliograph.numerics.traced import library, placed
+from heliograph.numerics.types import PyTree
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.combine import AbstractCombination, Corners, GainAndNoise, Series, Stack, known
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.moments.monomials import (
+    Moments,
+    count,
+    exponents,
+    factors,
+    place,
+    position,
+    refuse_if_too_large,
+    sum_plan,
+    times_one,
+)
+from heliograph.random_affine.noise import AbstractNoise, noise_vector
+
+Places = tuple[int, ...]  # of what a map takes, among the components of y
+
+
+class Superposed(AbstractCombination):
+    """Sum z = sum_i H_i y_i + n of independent maps, each of its own components y_i of y, which may be the same ones.
+
+    The sum is a fixed row [I ... I] over the stack of the maps, but its moments need no moments of the stack:
+    E[z^a | y] = sum_{b <= a} C(a, b) E[t^b | y] E[r^(a-b) | y] for a sum z = t + r of two halves, each done likewise.
+
+    Args:
+        maps: the maps, of one number of outputs.
+        noise: law of n.
+        places: of the components that each map takes.
+        inputs: length of y.
+
+    Raises:
+        ValueError: maps of other numbers of outputs than the noise, places that are none of a map's inputs.
+    """
+
+    maps: tuple[AbstractRandomAffine, ...]
+    noise: AbstractNoise
+    places: tuple[Places, ...] = eqx.field(static=True)
+    taken: int = eqx.field(static=True)
+
+    def __init__(
+        self, maps: Sequence[AbstractRandomAffine], noise: AbstractNoise, places: Sequence[Places], inputs: int
+    ):
+        self.maps, self.taken = as_maps("sum", maps), check_count("inputs of a sum", inputs)
+        self.noise = instance("noise of a sum", noise, AbstractNoise, "a law of a noise vector")
+        self.places = tuple(
+            tuple(check_count("place in the input of a sum", i, 0) for i in items("places of a map", chosen, "places"))
+            for chosen in items("places of the maps of a sum", places, "places of each map")
+        )
+        if [len({i for i in chosen if i < inputs}) for chosen in self.places] != [m.inputs for m in self.maps]:
+            expected = f"distinct ones below {inputs}, as many as each map has inputs"
+            raise fail("places of the maps of a sum", expected, shown(places))
+        if sizes := {m.outputs for m in self.maps} - {noise.dimension}:
+            raise fail("sum", f"maps of {noise.dimension} outputs, as the noise has", f"maps of {sorted(sizes)}")
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of each map."""
+        return self.noise.dimension
+
+    @property
+    def inputs(self) -> int:
+        """Length of y."""
+        return self.taken
+
+    @property
+    def selection(self) -> np.ndarray:
+        """Matrix from y to (y_1, y_2, ...)."""
+        rows: np.ndarray = np.eye(self.inputs)[[i for chosen in self.places for i in chosen]]
+        return rows
+
+    @property
+    def as_stack(self) -> Series:
+        """The same map as the sum of the outputs of a stack, for what knows only these; its moments are larger."""
+        rows = np.eye(self.inputs)
+        stack = Stack([Series([known(rows[list(at)]), m]) for m, at in zip(self.maps, self.places, strict=True)])
+        total = np.tile(np.eye(self.outputs), (1, len(self.maps)))
+        return Series([stack, GainAndNoise(Constant(1.0), total, self.noise)])
+
+    def in_places(self, parts: Mapping[int, jax.Array | np.ndarray], axes: int) -> jax.Array | np.ndarray:
+        """Sum of arrays of some of the maps, whose last `axes` (1 or 2) are of what each takes and 1, in those of y."""
+        size = self.inputs + 1
+        where = [np.array([*self.places[i], self.inputs]) for i in parts]
+        if axes == 2:
+            where = [(size * at[:, None] + at).reshape(-1) for at in where]
+        if not parts:
+            return np.zeros((self.outputs,) * axes + (size,) * axes)
+        flat = [part.reshape(*part.shape[:-axes], -1) for part in parts.values()]
+        values = library(flat).concatenate(flat, axis=-1)
+        whole = placed(
+            (size**axes, *values.shape[:-1]), np.concatenate(where), values.transpose(-1, *range(values.ndim - 1))
+        )
+        return whole.transpose(*range(1, whole.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw each map and the noise, and add up."""
+        keys = jax.random.split(key, len(self.maps) + 1)
+        state, drawn = self._draw_each(state, keys[:-1])
+        gains = jnp.concatenate([h[:-1, :-1] for h in drawn], axis=1) @ self.selection
+        offset = sum((h[:-1, -1] for h in drawn), self.noise.sample(keys[-1]))
+        top = jnp.concatenate([gains, offset[:, None]], axis=1)
+        return state, jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
+
+    @cached
+    def moments(self, order: int) -> Moments:
+        """E[z^a | y] by halves."""
+        check_forgets("moments of a map", self)
+        parts = [m.moments(order).matrix[None] for m in self.maps]
+        return Moments(self._added(parts, order)[0], self.outputs, self.inputs, order)
+
+    @cached
+    def corner_moments(self, order: int) -> Corners:
+        """The same with every combination of the maps' corners."""
+        return self._added([m.corner_moments(order) for m in self.maps], order)
+
+    def _added(self, parts: Sequence[Corners], order: int) -> Corners:
+        """E[Sym^order] of the sum from those of the parts, each (corners, rows, columns)."""
+        columns = count(self.inputs + 1, order)
+        refuse_if_too_large(count(self.outputs + 1, order), columns, f"moments of order {order}")
+        terms = [
+            _terms(matrix, m.outputs, chosen, order)
+            for matrix, m, chosen in zip(parts, self.maps, self.places, strict=True)
+        ]
+        law = noise_vector(self.noise, order)[None, :, None]
+        whole = _plus(_halves(terms, self.outputs), _terms(law, self.outputs, (), order), self.outputs)
+        return _whole(whole, self.outputs, self.inputs, order)
+
+
+class _Powers(NamedTuple):
+    """E[t^a | y] of a sum t of maps at each corner, by degree |a| = 0, 1, ...: homogeneous polynomials in (y, 1).
+
+    places: of the components of y on which t depends, in order; by_degree: each (corners, monomials of t, monomials).
+    """
+
+    places: Places
+    by_degree: list[Corners]
+
+
+def _terms(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers:
+    """Polynomials of one map from its E[Sym^order(H)] at each corner."""
+    ordered = tuple(sorted(places))
+    ones = library(matrix).ones((len(matrix), 1, 1))
+    where = [ordered.index(i) for i in places] + [len(places)]  # of each variable of the map, and of 1
+    by_degree = [ones]
+    for degree in range(1, order + 1):
+        rows, columns = _of_degree(outputs, degree, order), times_one(len(places) + 1, degree, order)
+        target = np.argsort(place(np.array(where)[factors(len(places) + 1, degree)], len(places) + 1))
+        by_degree.append(matrix[:, rows[:, None], columns[target]])
+    return _Powers(ordered, by_degree)
+
+
+@cached_arrays
+def _of_degree(outputs: int, degree: int, order: int) -> np.ndarray:
+    """Positions at `order` of the monomials of z alone of this degree, times powers of 1."""
+    alone = factors(outputs, degree)
+    return place(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
+
+
+def _halves(terms: Sequence[_Powers], outputs: int) -> _Powers:
+    """The sum of terms, from those of its halves: polynomials of few variables are multiplied first."""
+    if len(terms) == 1:
+        return terms[0]
+    middle = len(terms) // 2
+    return _plus(_halves(terms[:middle], outputs), _halves(terms[middle:], outputs), outputs)
+
+
+def _plus(a: _Powers, b: _Powers, outputs: int) -> _Powers:
+    """E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y], at each pair of corners, the first slowest."""
+    places = tuple(sorted({*a.places, *b.places}))
+    size, corners = len(places) + 1, len(a.by_degree[0]) * len(b.by_degree[0])
+    left_variables, right_variables = ((*(places.index(i) for i in part.places), size - 1) for part in (a, b))
+    by_degree = [library(a.by_degree[0], b.by_degree[0]).ones((corners, 1, 1))]
+    for degree in range(1, len(a.by_degree)):
+        total: Corners = np.zeros((count(size, degree), count(outputs, degree), corners))
+        for first, (row, mine, other, ways) in enumerate(_ways(outputs, degree)):
+            left = a.by_degree[first][:, None, mine, :, None] * ways[:, None, None]
+            right = b.by_degree[degree - first][None, :, other, None, :]
+            products = (left * right).reshape(corners, len(row), -1)
+            where = _products(left_variables, right_variables, first, degree - first, size).reshape(-1)
+            rows = placed((count(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
+            total = total + placed((count(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
+        by_degree.append(total.transpose(2, 1, 0))
+    return _Powers(places, by_degree)
+
+
+@cached_arrays
+def _ways(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
+    """Terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
+    names, ways = exponents(outputs + 1, degree), [[] for _ in range(degree + 1)]  # type: ignore[var-annotated]
+    for c, b, rest, weight in zip(*sum_plan(outputs, degree), strict=True):
+        if not names[c][-1]:
+            at = [position(outputs, sum(names[i][:-1]))[names[i][:-1]] for i in (c, b, rest)]
+            ways[sum(names[b][:-1])].append((*at, weight))
+    return tuple(tuple(np.array(column) for column in zip(*terms, strict=True)) for terms in ways)
+
+
+@cached_arrays
+def _products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
+    """Positions of the products of monomials of two sets of variables among those of all `size`."""
+    left, right = np.array(a)[factors(len(a), first)], np.array(b)[factors(len(b), second)]
+    shape = len(left), len(right)
+    both = [np.broadcast_to(left[:, None], (*shape, first)), np.broadcast_to(right, (*shape, second))]
+    return place(np.concatenate(both, axis=-1), size)
+
+
+def _whole(powers: _Powers, outputs: int, inputs: int, order: int) -> Corners:
+    """E[Sym^order(H)] at each corner from the polynomials of each degree."""
+    size, corners = len(powers.places) + 1, len(powers.by_degree[0])
+    names = np.array([*powers.places, inputs])
+    xp = library(powers.by_degree)
+    matrix: Corners = xp.zeros((corners, count(outputs + 1, order), count(inputs + 1, order)))
+    for degree, polynomials in enumerate(powers.by_degree):
+        rows = _of_degree(outputs, degree, order)
+        chosen = np.pad(names[factors(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
+        columns = place(chosen, inputs + 1)
+        if xp is np:
+            matrix[:, rows[:, None], columns] = polynomials
+        else:
+            matrix = jnp.asarray(matrix).at[:, rows[:, None], columns].set(polynomials)
+    return matrix
