@@ -33,7 +33,6 @@ ORDER = [
         "filters.gaussian.transform",
         "filters.gaussian.scalars",
         "filters.gaussian.precise",
-        "filters.gaussian.correction",
         "filters.gaussian.signal",
         "filters.gaussian.bounds",
         "filters.gaussian.update",

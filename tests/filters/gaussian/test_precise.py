@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.gaussian.precise import precise_update
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian, given, observe
 from tests.follow import follow
 
 A, C = [[1, 1], [0, 1]], [[1, 0]]
@@ -320,6 +321,13 @@ def exact_after_dropout(matrix, mean, tenths):
     return [[float(int(i == j) - p * p * inverse[i][j]) for j in range(2)] for i in range(2)]
 
 
+def updated(x, rows, variances):
+    """Gain, and x given what rows (m, n) with uncorrelated noises of these variances show of it."""
+    noise = Columns(np.eye(len(rows)), jnp.asarray(variances))
+    ways = jax.vmap(lambda z: observe(x, rows @ x.root, z, noise)[0])(jnp.eye(len(rows)))
+    return ways.mean.T, jax.tree.map(lambda leaf: leaf[0], ways)
+
+
 def test_noise_counts_next_to_a_precise_output():
     """A prior twenty decades above: K is judged by (I - K H) P (I - K H)' + K R K' in exact fractions.
 
@@ -332,11 +340,11 @@ def test_noise_counts_next_to_a_precise_output():
         order = [1, 0] if swap else [0, 1]
         rows, variances = rows[order], variances[np.ix_(order, order)]
         with jax.enable_x64(True):
-            gain, after = jax.jit(precise_update)(np.array([[prior]]), rows, variances, np.zeros(2))
+            gain, after = jax.jit(updated)(given(np.zeros(1), np.array([[prior]])), rows, np.diag(variances))
         k, h = [Fraction(float(x)) for x in gain[0]], [Fraction(float(x)) for x in rows[:, 0]]
         left = 1 - sum(a * b for a, b in zip(k, h, strict=True))
         of_noise = sum(a * a * Fraction(float(v)) for a, v in zip(k, np.diag(variances), strict=True))
-        assert float(left**2 * Fraction(prior) + of_noise) == pytest.approx(float(after[0, 0]), rel=0.25)
+        assert float(left**2 * Fraction(prior) + of_noise) == pytest.approx(float(after.covariance[0, 0]), rel=0.25)
 
 
 def test_a_random_gain_of_noise_that_outputs_share_leaves_a_tenth():
@@ -359,8 +367,8 @@ def test_outputs_that_say_the_same_of_a_tied_state_say_it_once():
     """
     rng = np.random.default_rng(0)
     ties, seen = 10.0 ** rng.uniform(-4, 4, size=(2, 300)), 10.0 ** rng.uniform(-4, 4, size=(2, 300))
-    prior, output = ties[:, None] * ties[None], np.stack([np.zeros((2, 300)), seen], axis=1)
+    each = jax.jit(jax.vmap(lambda x, shown, noise: updated(x, jnp.stack([0 * shown, shown], axis=1), noise)[0]))
     with jax.enable_x64(True):
-        gain, _ = jax.jit(precise_update)(prior, output, np.zeros_like(prior), (1e-14 * seen * ties[1]) ** 2)
-    moved = np.max(np.abs(np.asarray(gain) * seen), axis=1)
-    assert np.max(np.abs(moved / (ties / ties[1]) - 1)) < 1e-6
+        state = Gaussian(np.zeros((300, 2)), (ties[1] / ties[0])[:, None], np.stack([ties[0] ** 2, 0 * ties[0]], 1))
+        gain = each(state, seen.T, (1e-14 * seen * ties[1]).T ** 2)
+    np.testing.assert_allclose(np.einsum("bio,ob->ib", gain, seen), ties / ties[1], rtol=1e-6)

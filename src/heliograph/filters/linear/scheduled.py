@@ -220,8 +220,8 @@ def _factored(system: LinearSystem) -> SystemNoises:
         def of_step(own: Columns, seconds: jax.Array) -> Columns:
             return triangular(joined(own, rounding_of(seconds)))
 
-        with_rounding: Callable[..., Columns] = jax.vmap(of_step)
-        factors = with_rounding(columns_of_each(covariances), rounding)
+        each: Callable[..., Columns] = jax.vmap(of_step)
+        factors = each(columns_of_each(covariances), rounding)
         return Columns(np.asarray(factors.matrix), np.asarray(factors.weights))
 
     return SystemNoises(columns(np.asarray(s.process), start), columns(np.asarray(s.noise), sizes))
