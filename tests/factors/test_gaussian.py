@@ -139,21 +139,37 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same():
     np.testing.assert_allclose(np.transpose(found), np.array(gain, dtype=float), rtol=1e-10)
 
 
-@pytest.mark.parametrize("state_noise", [0.0, 1.0])
-def test_smoothing_is_rauch_s(state_noise):
+@pytest.mark.parametrize(("n", "state_noise"), [(4, 0.0), (4, 1.0), (18, 1.0)])
+def test_smoothing_is_rauch_s(n, state_noise):
     """Of x given x+ known better: m + J (m_s - m+), P + J (P_s - P+) J' with J = P F' (P+)^-1."""
-    mean, p, _, _, _ = problem(4, 1)
+    mean, p, _, _, _ = problem(n, 1)
     rng = np.random.default_rng(3)
-    f, q = rng.normal(size=(4, 4)), state_noise * covariance(rng, 4)
+    f, q = rng.normal(size=(n, n)), state_noise * covariance(rng, n)
     x = given(mean, p)
-    ahead = move(x, f, np.zeros(4), columns_of(q))
-    back = backwards(x, f @ x.root, ahead.mean, columns_of(q))
+    ahead = move(x, f, np.zeros(n), columns_of(q))
+    back = backwards(x, f @ x.root, ahead.mean, triangular(columns_of(q)))
     later = given(np.asarray(ahead.mean) + 0.3, 0.4 * np.asarray(ahead.covariance))
     known = smoothed(back, later)
     prior = f @ p @ f.T + q
     gain = np.linalg.solve(prior, f @ p).T
-    np.testing.assert_allclose(known.mean, mean + gain @ np.full(4, 0.3), rtol=1e-9)
+    np.testing.assert_allclose(known.mean, mean + gain @ np.full(n, 0.3), rtol=1e-9)
     np.testing.assert_allclose(known.covariance, p + gain @ (0.4 * prior - prior) @ gain.T, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [3, 18])
+def test_a_part_that_others_determine_says_nothing_of_the_state_before(n):
+    """The last part of x+ is the sum of the first two, to rounding: its innovation is that, and its gain is zero."""
+    mean, p, _, _, _ = problem(n, 1)
+    rng = np.random.default_rng(5)
+    f, x = rng.normal(size=(n, n)), given(mean, p)
+    f[-1] = f[0] + f[1]
+    rounding = triangular(rounding_of(np.diagonal(f @ p @ f.T)))
+    back = backwards(x, f @ x.root, f @ mean, rounding)
+    assert np.all(np.asarray(back.gain)[:, -1] == 0) and np.all(np.any(np.asarray(back.gain)[:, :-1], axis=0))
+    known = smoothed(back, Gaussian(jnp.asarray(f @ mean), back.lower, jnp.zeros(n)))
+    part = f[:-1]  # x given its first parts exactly
+    gain = np.linalg.solve(part @ p @ part.T, part @ p).T
+    np.testing.assert_allclose(known.covariance, p - gain @ part @ p, rtol=0, atol=1e-10)
 
 
 def test_a_mixture_has_its_moments():

@@ -5,6 +5,7 @@ measurement H x they are H L. Sums of independent terms are columns side by side
 difference of two variances, and none has a branch: a component of variance zero has a reciprocal of zero.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +14,8 @@ import numpy as np
 from jax import lax
 
 from heliograph.factors.columns import (
+    UNITS,
+    WRITTEN,
     Columns,
     below_diagonal,
     decorrelated,
@@ -265,41 +268,80 @@ def merge(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
 
 
 class Backwards(NamedTuple):
-    """Law of x given the next state x+: m + J (x+ - m+) + a noise that is uncorrelated with x+.
+    """Law of x given the next state x+ = m+ + L e: m + K e + a noise that is uncorrelated with e.
 
-    Shapes: mean m, ahead m+ = E x+ (n,), gain J (n, n), noise (n, columns).
+    J = K L^-1 of Rauch's form is never formed: a part of e that is nearly nothing has a large column of K, which would
+    be spread over all of J, to cancel again.
+
+    Shapes: left the Gaussian of mean m and the covariance of the noise, gain K (n, n), ahead m+ = E x+ (n,), lower
+    (n (n - 1) / 2,) of L.
     """
 
-    mean: Float[jax.Array, "*time n"]
+    left: Gaussian
     gain: Float[jax.Array, "*time n n"]
     ahead: Float[jax.Array, "*time n"]
-    noise: Columns
+    lower: Float[jax.Array, "*time entries"]
+
+    def mean_given(self, later: jax.Array) -> jax.Array:
+        """E x, from that of x+."""
+        return self.left.mean + self.gain @ self.apart((later - self.ahead)[:, None])[:, 0]
+
+    def apart(self, rows: jax.Array) -> jax.Array:
+        """L^-1 times rows (n, ...)."""
+        return decorrelated(unit_lower(self.lower), rows)
 
 
 def backwards(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) -> Backwards:
-    """Law of x = m + L xi given x+ = ahead + slopes xi + w: factors of the joint covariance of (x+, x).
+    """Law of x = m + L_x xi given x+ = ahead + slopes xi + N omega: the next state measures this one, part by part.
 
-    [x+; x] has the factors [[L+, 0], [K, L_s]] and (d+, d_s): J = K (L+)^-1, and L_s diag(d_s) L_s' is the covariance
-    of x given x+. Sums of squares alone. Shapes: slopes (n, n) are F L of x+ = F x + b + w.
+    (x, x+) has the factors [[L_x, 0], [slopes, N]] and (d, r). Each part of x+, without a noise but omega, is measured:
+    its innovation, given those before it, is a part of e, its gain a column of K and, of the parts to come, of L. Where
+    those before it determine a part, its slopes are the rounding of n^3 products, UNITS eps each, and count as zero.
+
+    Shapes: slopes (n, n); noise N (n, n), unit lower, as `triangular` makes it, and r (n,).
     """
-    n = len(x.mean)
-    top = joined(Columns(slopes, x.variances), noise)
-    low = jnp.concatenate([x.root, jnp.zeros((n, noise.matrix.shape[1]))], axis=1)
-    factors = triangular(Columns(jnp.concatenate([top.matrix, low]), top.weights))
-    # J L+ = K, columns from the last one back.
-    lower, columns = factors.matrix[:n, :n], list(factors.matrix[n:, :n].T)
-    for j in reversed(range(n - 1)):
-        columns[j] = columns[j] - lower[j + 1 :, j] @ jnp.stack(columns[j + 1 :])
-    return Backwards(x.mean, jnp.stack(columns, axis=1), ahead, Columns(factors.matrix[n:, n:], factors.weights[n:]))
+    n, zero = len(x.mean), jnp.zeros((), x.variances.dtype)
+    top = jnp.concatenate([x.root, jnp.zeros((n, n), x.variances.dtype)], axis=1)
+    next_, d = jnp.concatenate([slopes, noise.matrix], axis=1), jnp.concatenate([x.variances, noise.weights])
+    rounding = (UNITS * n**3 * unit_of(slopes)) ** 2 * (next_**2 @ d)
+
+    def measured(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        f = root[n + i]
+        heard = f[:n] @ (d[:n] * f[:n]) > rounding[i]
+        return _measured(root, d, jnp.concatenate([jnp.where(heard, f[:n], 0.0), f[n:]]), zero)[:3]
+
+    root, d, gains = _one_by_one(measured, n, jnp.concatenate([top, next_]), d)
+    left = Gaussian(x.mean, below_diagonal(root[:n, :n]), d[:n])
+    return Backwards(left, gains[:n], ahead, below_diagonal(gains[n:]))
+
+
+def _one_by_one(
+    measured: Callable[..., tuple[jax.Array, jax.Array, jax.Array]], n: int, root: jax.Array, d: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Rows, variances d and gains (rows, n) after n measurements, of many as a loop."""
+    gains = list[jax.Array]()
+    if n > WRITTEN:
+
+        def body(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            root, d, gain = measured(i, *carry[:2])
+            return root, d, carry[2].at[:, i].add(gain)
+
+        start = root, d, jnp.zeros((len(root), n), root.dtype)
+        looped: tuple[jax.Array, jax.Array, jax.Array] = lax.fori_loop(0, n, body, start)
+        return looped
+    for i in range(n):
+        root, d, gain = measured(i, root, d)
+        gains.append(lax.expand_dims(gain, (1,)))
+    return root, d, lax.concatenate(gains, 1)
 
 
 def smoothed(back: Backwards, later: Gaussian) -> Gaussian:
-    """Law of x given all data, from that of the next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+).
+    """Law of x given all data, from that of the next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+), J = K L^-1.
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
-    mean = back.mean + back.gain @ (later.mean - back.ahead)
-    return of_columns(mean, joined(Columns(back.gain @ later.root, later.variances), back.noise))
+    known = Columns(back.gain @ back.apart(later.root), later.variances)
+    return of_columns(back.mean_given(later.mean), joined(known, back.left.columns))
 
 
 def _vector(entries: list[jax.Array]) -> jax.Array:

@@ -13,8 +13,7 @@ from typing_extensions import TypeAliasType
 from heliograph.engine.choice import compiled
 from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.rows import Filtered, filtered
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import with_nis
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
@@ -153,7 +152,7 @@ class AbstractFilter(Module):
 
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
-    ) -> tuple[PyTree, AbstractSmootherStep]:
+    ) -> tuple[PyTree, SmootherStep]:
         """Step like `step`, and return the smoother step in place of the estimate.
 
         Raises:
@@ -162,7 +161,7 @@ class AbstractFilter(Module):
         z, u = measured(self, z), given(self, u)
         return _with_state(self, state, _step_with_smoother, z, u, step_number(self, k))
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return what the backward pass needs of a step, from the filter's states around it.
 
         Raises:
@@ -178,7 +177,7 @@ class AbstractFilter(Module):
         """Return the same filter for these inputs and complete data, with all that does not depend on z precomputed."""
         return self
 
-    def with_past(self, steps: AbstractSmootherStep) -> "AbstractFilter":
+    def with_past(self, steps: SmootherStep) -> "AbstractFilter":
         """Return a planned filter that can be smoothed, given the smoother `steps` of the original filter over time."""
         return self
 
@@ -285,7 +284,7 @@ def step_with_judgement(
 @compiled
 def _step_with_smoother(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
-) -> tuple[PyTree, AbstractSmootherStep]:
+) -> tuple[PyTree, SmootherStep]:
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     return after, with_nis(filter.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.engine.choice import chosen, of_arrays, setting
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step import SmootherStep
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate, with_sound_claim
 from heliograph.numerics.check import InputError, fail
@@ -24,6 +24,8 @@ from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.plausible_step import reasons
 from heliograph.simulation.rows.row_step import NetworkStep
 from heliograph.simulation.stepping import AllFilters
+
+NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by kind, and by name
 
 
 class History(NamedTuple):
@@ -63,11 +65,6 @@ class History(NamedTuple):
         return jnp.where(there, received, jnp.nan), u
 
 
-SmootherStep: TypeAlias = (
-    "tuple[dict[int, AbstractSmootherStep], dict[str, AbstractSmootherStep]]"  # by kind, and by name
-)
-
-
 class Sweep(Module):
     """The filters of a network that can be smoothed, by `kinds`, and their fusions."""
 
@@ -77,7 +74,7 @@ class Sweep(Module):
 
     def step(
         self, history: History, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
-    ) -> tuple[PyTree, SmootherStep]:
+    ) -> tuple[PyTree, NetworkSmootherStep]:
         """Step all filters into a row, without implausible measurements; return also their smoother steps."""
         by_kind, central = reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
@@ -89,16 +86,16 @@ class Sweep(Module):
         by_kind, central, *_ = history.known(row)
         return by_kind, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
 
-    def outputs(self, steps: SmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
+    def outputs(self, steps: NetworkSmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""
-        by_kind, central = _over_filters(lambda step, later: step.estimate_from(step.smoothed(later)), steps, later)
+        by_kind, central = _over_filters(lambda step, later: step.estimate_from(later), steps, later)
         parts = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:
             central |= fusion.step((), parts, jnp.asarray(0))[1]
         return by_kind, central
 
 
-def _over_filters(function: Callable[..., object], steps: SmootherStep, *rest: PyTree) -> PyTree:
+def _over_filters(function: Callable[..., object], steps: NetworkSmootherStep, *rest: PyTree) -> PyTree:
     """Map a function of one filter's step over the filters of each kind, (filter, node, ...), and the central ones."""
     by_kind = {
         kind: jax.vmap(jax.vmap(function))(step, *(tree[0][kind] for tree in rest)) for kind, step in steps[0].items()
@@ -106,12 +103,8 @@ def _over_filters(function: Callable[..., object], steps: SmootherStep, *rest: P
     return by_kind, {name: function(step, *(tree[1][name] for tree in rest)) for name, step in steps[1].items()}
 
 
-def _back(step: AbstractSmootherStep, later: PyTree, before: AbstractSmootherStep) -> PyTree:
-    return step.back(later, before.mean, before.covariance)
-
-
 StepOfRow: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
-Into: TypeAlias = "Callable[[Sweep, History, StepOfRow], SmootherStep]"
+Into: TypeAlias = "Callable[[Sweep, History, StepOfRow], NetworkSmootherStep]"
 
 
 @lru_cache
@@ -138,15 +131,16 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
 
         # One step back: x_k|N from x_(k+1)|N and the smoother step into row k + 1; at the last row x_N|N.
         def single(
-            i: jax.Array, carry: tuple[StepOfRow, SmootherStep, PyTree]
-        ) -> tuple[StepOfRow, SmootherStep, PyTree]:
+            i: jax.Array, carry: tuple[StepOfRow, NetworkSmootherStep, PyTree]
+        ) -> tuple[StepOfRow, NetworkSmootherStep, PyTree]:
             now, steps, later = carry
             before = into(sweep, history, now)
-            passed, ends = _over_filters(_back, steps, later, before), _over_filters(lambda step: step.end(), before)
+            passed = _over_filters(lambda step, later: step.back(later), steps, later)
+            ends = _over_filters(lambda step: step.after, before)
             later = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), ends, passed)
             return earlier(history, now), before, later
 
-        begun = last, blank, _over_filters(lambda step: step.end(), blank)
+        begun = last, blank, _over_filters(lambda step: step.after, blank)
         _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
         return sweep.outputs(steps, later)
 
@@ -154,7 +148,7 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
 
 
 def _into_row(dt: int) -> Into:
-    def into(sweep: Sweep, history: History, at: StepOfRow) -> SmootherStep:
+    def into(sweep: Sweep, history: History, at: StepOfRow) -> NetworkSmootherStep:
         row, _ = at
         state, received = sweep.start(history, row - 1), history.parts(row)[0]
         return sweep.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
@@ -166,7 +160,7 @@ def _earlier_row(history: History, at: StepOfRow) -> StepOfRow:
     return at[0] - 1, history.step[at[0] - 1]
 
 
-def _into_step(sweep: Sweep, history: History, at: StepOfRow) -> SmootherStep:
+def _into_step(sweep: Sweep, history: History, at: StepOfRow) -> NetworkSmootherStep:
     """Compute the smoother step at step k, by way of the steps without measurements since the row before."""
     row, k = at
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, step_with_judgement
 from heliograph.filters.innovation import Weighed
 from heliograph.filters.plausibility import Judgement, Reason
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step import SmootherStep
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
@@ -24,7 +24,7 @@ class StepOutput(NamedTuple):
     """
 
     estimate: Estimate
-    steps: AbstractSmootherStep | None = None
+    steps: SmootherStep | None = None
     judgement: Judgement | None = None
     weighed: Weighed | None = None
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compiled
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point
+from heliograph.filters.smoother_step import Point, SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, instance
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 T = TypeVar("T")
@@ -24,7 +24,7 @@ def smoother_steps(
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     state: PyTree | None = None,
     first_step: int = 0,
-) -> "tuple[PyTree, AbstractSmootherStep]":
+) -> "tuple[PyTree, SmootherStep]":
     """Step a filter over rows of data: its state after them, and its smoother steps stacked along time.
 
     Args:
@@ -44,12 +44,10 @@ def smoother_steps(
 
 
 @compiled
-def stepped(
-    filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
-) -> tuple[PyTree, AbstractSmootherStep]:
+def stepped(filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array) -> tuple[PyTree, SmootherStep]:
     """Step a filter over rows of data inside a compiled computation, like `smoother_steps`."""
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractSmootherStep]:
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
         return filter.step_with_smoother(state, *row)
 
     rows = jnp.asarray(z), jnp.asarray(u), jnp.asarray(first + jnp.arange(len(z)))
@@ -64,106 +62,92 @@ def planned_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
     return planned.with_past(quiet_steps(filter, inputs))
 
 
-def quiet_steps(filter: AbstractFilter, inputs: Array) -> AbstractSmootherStep:
+def quiet_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
     """Smoother steps for measurements of zero: right but for means, if no gain depends on data."""
     quiet = jnp.zeros((len(inputs), filter.received))
-    steps: AbstractSmootherStep = stepped(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
+    steps: SmootherStep = stepped(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
     return steps
 
 
-def swept(steps: AbstractSmootherStep) -> Estimate:
+def swept(steps: SmootherStep) -> Estimate:
     """Estimate each step's state given all data: one backward pass."""
-    return Estimate(*_both(steps), steps.claim)
 
-
-def swept_means(steps: AbstractSmootherStep) -> jax.Array:
-    """Means of each step's state given all data."""
-    return _means(steps)
-
-
-@runs_last
-def _both(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
-    return _back(steps)
-
-
-@runs_last
-def _means(steps: AbstractSmootherStep) -> jax.Array:
-    return _back(steps)[0]
-
-
-def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
-    """Smoothed means and covariances; any further axes are carried along, so that runs may be the last."""
-
-    def estimate_from(step: AbstractSmootherStep, moments: Moments) -> tuple[jax.Array, jax.Array]:
-        estimate = step.estimate_from(moments)
-        return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
-
-    # One step back: the adjoint or the moments, and the smoothed state before the step.
-    def body(carry: PyTree, pair: tuple[AbstractSmootherStep, AbstractSmootherStep]) -> tuple[PyTree, PyTree]:
-        (later, known), (before, step) = carry, pair
-        earlier = step.back(later, before.mean, before.covariance)
-        moments = step.before(before, earlier, known)
-        return (earlier, moments), estimate_from(before, moments)
+    def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
+        """Pass from the state after a step to the one before it, after the step before."""
+        previous, step = pair
+        law = step.back(later)
+        return law, previous.estimate_from(law)
 
     # From the last step, whose smoothed state is the filtered one.
     last = row(steps, -1)
-    start = last.end(), last.smoothed(last.end())
-    if len(steps.mean) == 1:
-        mean, covariance = estimate_from(last, start[1])
-        return mean[None], covariance[None]
-    rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
-    shapes, _ = jax.eval_shape(body, start, row(rows, -1))  # of what runs share, their axis is 1 long
-    end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), start, shapes)
-    _, smoothed = jax.lax.scan(body, end, rows, reverse=True)
-    mean, covariance = (
-        jnp.concatenate([a, b[None]]) for a, b in zip(smoothed, estimate_from(last, end[1]), strict=True)
-    )
-    return mean, covariance
+    _, earlier = jax.lax.scan(body, last.after, _pairs(steps), reverse=True)
+    return _appended(earlier, last.estimate_from(last.after))
 
 
-def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Estimate:
+def swept_means(steps: SmootherStep) -> jax.Array:
+    """Means of each step's state given all data."""
+
+    def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
+        previous, step = pair
+        mean = step.before.mean_given(later)
+        return mean, _mean(previous, mean)
+
+    last = row(steps, -1)
+    end = jnp.asarray(last.mean)
+    _, earlier = jax.lax.scan(body, end, _pairs(steps), reverse=True)
+    return _appended(earlier, _mean(last, end))
+
+
+def swept_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
     last = len(steps.mean) - 1
     times = jnp.arange(last + 1)
-    # Begin at the newest step that each one may use.
-    ends = rows_of(steps, jnp.minimum(times + lag, last))
-    newest = jax.vmap(lambda step: step.end())(ends)
-    start = newest, jax.vmap(lambda step, later: step.smoothed(later))(ends, newest)
 
-    def body(done: jax.Array, carry: tuple[PyTree, Moments]) -> tuple[PyTree, Moments]:
+    def body(done: jax.Array, later: Gaussian) -> Gaussian:
         """Pass from the state after step k + lag - done to the one before it, unless the data end earlier."""
-        later, known = carry
         ahead = times + lag - done
-        index = jnp.minimum(ahead, last)
-        here, before = rows_of(steps, index), rows_of(steps, jnp.maximum(index - 1, 0))
-        earlier = jax.vmap(lambda step, *rest: step.back(*rest))(here, later, before.mean, before.covariance)
-        moments = jax.vmap(lambda step, *rest: step.before(*rest))(here, before, earlier, known)
-        both: tuple[PyTree, Moments] = jax.tree.map(
-            lambda a, b: jnp.where((ahead <= last).reshape(-1, *[1] * (a.ndim - 1)), a, b), (earlier, moments), carry
+        before = jax.vmap(lambda step, law: step.back(law))(rows_of(steps, jnp.minimum(ahead, last)), later)
+        passed: Gaussian = jax.tree.map(
+            lambda a, b: jnp.where((ahead <= last).reshape(-1, *[1] * (a.ndim - 1)), a, b), before, later
         )
-        return both
+        return passed
 
-    # As many steps back as the lag has.
-    _, outcome = jax.lax.fori_loop(0, lag, body, start)
-    estimate: Estimate = jax.vmap(lambda step, moments: step.estimate_from(moments))(steps, outcome)
+    # From the newest step that each one may use, as many steps back as the lag has.
+    newest = rows_of(steps.after, jnp.minimum(times + lag, last))
+    estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(
+        steps, jax.lax.fori_loop(0, lag, body, newest)
+    )
     return estimate
 
 
-def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
+def carried_ahead(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
-    def body(point: Point, step_and_prior: tuple[AbstractSmootherStep, jax.Array]) -> tuple[Point, Moments]:
-        here, before = step_and_prior
-        after = here.ahead(point, before)
-        return after, Moments(after.mean, after.covariance)
+    def body(point: Point, here: SmootherStep) -> tuple[Point, Estimate]:
+        after = here.ahead(point)
+        return after, start.estimate_from(here.reached(after))
 
-    rows = rows_of(steps, slice(step + 1, None)), steps.covariance[step:-1]
-    _, outcome = jax.lax.scan(body, start.start(), rows)
-    first = Moments(start.mean, start.covariance)
-    whole = jax.tree.map(lambda leaf, rest: jnp.concatenate([leaf[None], rest]), first, outcome)
-    estimate: Estimate = jax.vmap(start.estimate_from)(whole)
-    return estimate
+    _, later = jax.lax.scan(body, start.start(), rows_of(steps, slice(step + 1, None)))
+    whole: Estimate = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest]), start.estimate_from(start.after), later
+    )
+    return whole
+
+
+def _mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
+    """Mean of the plant's state, from that of the filter's."""
+    return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
+
+
+def _pairs(steps: SmootherStep) -> tuple[SmootherStep, SmootherStep]:
+    """Steps and those after them."""
+    return rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
+
+
+def _appended(rows: T, last: T) -> T:
+    whole: T = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, last)
+    return whole
 
 
 def row(steps: T, k: int) -> T:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compiled
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step import SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
@@ -23,7 +23,7 @@ EXCESS = 1.05  # times the expected NIS: less does little harm
 
 
 @compiled
-def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
+def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
     """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
@@ -61,7 +61,7 @@ A = TypeVar("A", jax.Array, np.ndarray)
 class AbstractSmoothing(Module):
     """Choice of the states to be estimated, and of the later data that they are estimated from."""
 
-    def estimates(self, steps: AbstractSmootherStep) -> Estimate:
+    def estimates(self, steps: SmootherStep) -> Estimate:
         """Estimates along time from smoother steps stacked along time, with the claim that remains.
 
         Warns where the NIS of the filter says that it is not consistent: later data then make estimates worse.
@@ -69,11 +69,11 @@ class AbstractSmoothing(Module):
         warn_of("smoothing", np.asarray(nis_sums(steps)))
         return _swept(self, steps)
 
-    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
+    def sweep(self, steps: SmootherStep) -> Estimate:
         """Compute the estimates of one run, like `estimates`, inside a compiled computation."""
         raise unwritten(self, "sweep")
 
-    def means(self, steps: AbstractSmootherStep) -> jax.Array:
+    def means(self, steps: SmootherStep) -> jax.Array:
         """Means alone, where covariances are known from elsewhere."""
         return jnp.asarray(self.sweep(steps).mean)
 
@@ -86,18 +86,18 @@ class AbstractSmoothing(Module):
 
 
 @compiled
-def _swept(smoothing: AbstractSmoothing, steps: AbstractSmootherStep) -> Estimate:
+def _swept(smoothing: AbstractSmoothing, steps: SmootherStep) -> Estimate:
     return smoothing.sweep(steps)
 
 
 class FixedInterval(AbstractSmoothing):
     """Smoothing of every state given all data of the run."""
 
-    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
+    def sweep(self, steps: SmootherStep) -> Estimate:
         """Estimates (time, ...)."""
         return swept(steps)
 
-    def means(self, steps: AbstractSmootherStep) -> jax.Array:
+    def means(self, steps: SmootherStep) -> jax.Array:
         """Means (time, ...)."""
         return swept_means(steps)
 
@@ -117,7 +117,7 @@ class FixedLag(AbstractSmoothing):
     def __init__(self, lag: int):
         self.lag = check_count("lag", lag, 0)
 
-    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
+    def sweep(self, steps: SmootherStep) -> Estimate:
         """Estimates (time, ...)."""
         return swept_over_lag(steps, self.lag)
 
@@ -137,7 +137,7 @@ class FixedPoint(AbstractSmoothing):
     def __init__(self, step: int):
         self.step = check_count("step of a fixed point", step, 0)
 
-    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
+    def sweep(self, steps: SmootherStep) -> Estimate:
         """Estimates (time from that step on, ...)."""
         return carried_ahead(steps, self.step)
 

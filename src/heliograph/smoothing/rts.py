@@ -51,8 +51,7 @@ def rts_smoother(
     Raises:
         ValueError: data of another size than the filter's, no rows, a filter that cannot be smoothed.
 
-    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965); Bryson and Frazier
-        (1963) for the form that divides by no covariance.
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     rows, inputs = data_of(filter, z, u)

@@ -14,13 +14,13 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimat
 from heliograph.filters.event.ball import cut_to_ball
 from heliograph.filters.event.moments import Link, arriving, augmented, moved, pinned, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
-from heliograph.filters.gaussian.belief import moments_around, start_of
+from heliograph.filters.gaussian.belief import smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at
+from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractThreshold
@@ -348,9 +348,9 @@ class EventFilter(AbstractSizedFilter):
         whole = self._whole(state)
         return Estimate(whole.mean, whole.covariance, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """The moments of the joined sums around the update."""
-        return moments_around(self, step, self._whole)
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """The one of the joined sums' moments around the update."""
+        return smoother_step_by_transform(self, step, first(self.plant), self._whole)
 
     def _whole(self, state: EventBelief) -> Gaussian:
         """Mean and covariance of the state by the whole sum."""

@@ -12,16 +12,16 @@ from heliograph.factors.columns import eliminated, joined
 from heliograph.factors.gaussian import Gaussian, given, observe
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
-from heliograph.filters.gaussian.belief import moments_around, predicted, start_of
+from heliograph.filters.gaussian.belief import predicted, smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.multiple_model import receive, repeated
 from heliograph.filters.modes.side_information import SideInformation, append_flag
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at
+from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import Periodic, StochasticTrigger
@@ -220,9 +220,9 @@ class StochasticEventFilter(AbstractSizedFilter):
         """The Gaussian."""
         return Estimate(state.mean, state.covariance, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """The moments around the update."""
-        return moments_around(self, step)
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """The Gaussian's, around the update."""
+        return smoother_step_by_transform(self, step, first(self.plant))
 
 
 def _alone(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> Parts:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.columns import Columns, columns_of, joined, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, Image, given, move
+from heliograph.factors.gaussian import Gaussian, Image, given, move, of_sum
 from heliograph.factors.gaussian import transform as transformed
 from heliograph.filters.base import (
     AbstractSizedFilter,
@@ -20,8 +20,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import MomentsSmootherStep, moments_smoother_step
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
@@ -63,9 +62,9 @@ class AbstractBeliefFilter(AbstractSizedFilter):
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the moments around the update."""
-        return moments_around(self, step)
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of the state before the step given its prediction, and that after the update."""
+        return smoother_step_by_transform(self, step, self)
 
 
 class HasStart(Protocol):
@@ -113,17 +112,23 @@ class PredictsByTransform(Protocol):
     claim: Claim
 
 
-def moments_around(
+def smoother_step_by_transform(
     filter: PredictsByTransform,
     step: StepTrace,
+    start: HasStart,
     whole: Callable[[PyTree], Gaussian] | None = None,
-) -> MomentsSmootherStep:
-    """Smoother step by the moments around an update; `whole` reads them off a state that has others than its own."""
-    plant = at(filter.plant, step.k)
+) -> SmootherStep:
+    """Smoother step of x+ = f(x, u) + w; `whole` reads Gaussians off states of another form.
+
+    `start`: whose law of the first state says how large numbers are.
+    """
+    plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     before, prior, after = step[:3] if whole is None else map(whole, step[:3])
-    slopes = image_of(plant, filter.transform, before, jnp.asarray(step.u)).slopes
-    cross = (before.root * before.variances) @ slopes.T
-    return moments_smoother_step(after, prior, cross, filter.claim, plant.angles)
+    image = image_of(plant, filter.transform, before, u)
+    noise = process_noise(plant, u, start_of(start))
+    if len(image.curvature.weights):  # summed as the prediction by a transform is
+        noise = of_sum(image.mean, noise, image.curvature).columns
+    return smoother_step_of(before, prior, after, (image.slopes, noise), filter.claim, plant.angles)
 
 
 def prior_of(

@@ -13,13 +13,10 @@ from heliograph.filters.base import (
     sized,
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
-from heliograph.filters.gaussian.precise import state_rounding
 from heliograph.filters.gaussian.signal import Received, Signal, corrected_by, received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import linear_smoother_step, observed_through
 from heliograph.model.channel import Channel, check_link, mean_gain, perfect, received_angles
 from heliograph.model.estimate import Innovation, given_bounds
 from heliograph.model.fading import memory_matters, without_memory
@@ -62,16 +59,6 @@ class GaussianFilter(AbstractBeliefFilter):
         signal = signal_of(at(self.plant, k), sensor, self.transform, state, start_of(self))
         unknown = signal.about_mean() if self.linear else signal
         return corrected(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
-
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the linear update itself where it is linear, else the moments around it."""
-        if not self.linear:
-            return super().smoother_step(step)
-        plant, sensor, channel = at((self.plant, self.sensor, self.channel), step.k)
-        u = jnp.asarray(step.u)
-        output = observed_through(channel.mean_gain, sensor.matrix)
-        model = plant.transition_matrix(u), plant.noise_covariance(u), output
-        return linear_smoother_step(step, model, state_rounding(start_of(self)), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""

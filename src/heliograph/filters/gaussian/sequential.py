@@ -18,9 +18,9 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.belief import moments_around
+from heliograph.filters.gaussian.belief import smoother_step_by_transform
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.agreement import joined
 from heliograph.model.estimate import Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
@@ -86,9 +86,9 @@ class SequentialFilter(AbstractSizedFilter):
         posterior = self.filters[0].estimate(state)
         return Estimate(posterior.mean, posterior.covariance, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the moments around all nodes' updates."""
-        return replace(moments_around(self.filters[0], step), claim=self.claim)
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the one around all nodes' updates."""
+        return replace(smoother_step_by_transform(self.filters[0], step, self.filters[0]), claim=self.claim)
 
 
 def _joined(parts: Sequence[Innovation]) -> Innovation:

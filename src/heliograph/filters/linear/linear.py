@@ -9,9 +9,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.bounds import bounded_covariance
 from heliograph.filters.gaussian.gaussian import corrected, describe
-from heliograph.filters.gaussian.precise import state_rounding
 from heliograph.filters.gaussian.signal import Signal, size_of
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, move_of, predicted, prior_belief
@@ -19,11 +17,10 @@ from heliograph.filters.linear.plan import plan
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
 from heliograph.filters.modes.uncertain import uncertain_modal_filter
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.delay import as_current, behind_delays
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation, given_bounds
+from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -85,20 +82,15 @@ class LinearFilter(AbstractSizedFilter):
         """Mean and covariance of the estimate."""
         return Estimate(state.mean, state.covariance, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the linear update itself, or the moments around it where E[G] is uncertain."""
-        (plant, sensor, channel), u = at((self.plant, self.sensor, self.channel), step.k), jnp.asarray(step.u)
-        transition = plant.transition_matrix(u)
-        if not self.mean_known:
-            return moments_smoother_step(step.after, step.prior, step.before.covariance @ transition.T, "nominal")
-        rounded = state_rounding(start_of(at(self.plant, 0)))
-        if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
-            y = signal_before_data(step.prior, sensor, rounded)
-            total = bounded_covariance(y, channel, ~jnp.isnan(jnp.asarray(step.z)))
-            step = step._replace(innovation=replace(step.innovation, covariance=total))
-        # F = A, process noise Q, H = M C.
-        output = observed_through(channel.mean_gain, sensor.matrix)
-        return linear_smoother_step(step, (transition, plant.noise_covariance(u), output), rounded, self.claim)
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of the state before the step given its prediction: the state moves with a white noise.
+
+        That no random gain and no draw of the past tells of, so that Rauch's recursion is the best linear one.
+        """
+        move = move_of(at(self.plant, step.k), jnp.asarray(step.u), start_of(at(self.plant, 0)))
+        moved = move.matrix @ step.before.estimate.root, move.noise
+        claim: Claim = self.claim if self.mean_known else "nominal"
+        return smoother_step_of(step.before, step.prior, step.after, moved, claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

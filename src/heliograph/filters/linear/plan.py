@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from heliograph.engine.choice import SHORT, computed
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
@@ -89,15 +89,14 @@ class PlannedFilter(AbstractSizedFilter):
         """Mean of the state, with the planned covariance of step k, common to all runs."""
         return self._estimate(state.mean, 2 * k + 2)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the planned smoother step with the mean and the innovation of these data."""
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the planned smoother step with the means of these data."""
         if self.past is None:
             return super().smoother_step(step)
-        p, planned = at(self.steps, step.k), cast(AbstractSmootherStep, at(self.past, step.k))
-        residual = jnp.asarray(step.z) - _affine(p.output, step.prior.mean, p.offset)
-        return planned.with_data(jnp.asarray(step.after.mean), jnp.asarray(step.prior.mean), residual)
+        planned = cast(SmootherStep, at(self.past, step.k))
+        return planned.with_data(*(jnp.asarray(state.mean) for state in (step.before, step.prior, step.after)))
 
-    def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
+    def with_past(self, steps: SmootherStep) -> AbstractFilter:
         """Return the filter with smoother steps, which are the same for all data."""
         return replace(self, past=OverTime(steps))
 

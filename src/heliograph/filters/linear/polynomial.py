@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.linear.lift import check_model, lifted_system
 from heliograph.linear.polynomial import memory_system
 from heliograph.linear.recursion import lmmse
@@ -163,7 +163,7 @@ class PolynomialFilter(AbstractSizedFilter):
         """Estimate of the inner filter after step k, plus the mean."""
         return _moved(self.inner.after_step(state.inner, k), state.mean)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the lifted system, about the mean."""
         z = monomials(_without_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
         before, prior, after = (state.inner for state in step[:3])
@@ -174,7 +174,7 @@ class PolynomialFilter(AbstractSizedFilter):
         """Precompute the inner filter."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
 
-    def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
+    def with_past(self, steps: SmootherStep) -> AbstractFilter:
         """Return the filter with the smoother steps of its inner filter."""
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 

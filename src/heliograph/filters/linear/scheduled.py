@@ -11,18 +11,15 @@ from heliograph.engine.choice import compiled
 from heliograph.factors.columns import Columns, columns_of_each, joined, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, given, move
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.gaussian.precise import state_rounding
 from heliograph.filters.gaussian.signal import corrected_by
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import linear_smoother_step
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.lapack import pseudo_solve
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
@@ -182,19 +179,10 @@ class LinearSystemFilter(AbstractSizedFilter):
         projection = jnp.asarray(self.projection)
         return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the linear update, with the innovation of all of z, of which a filter around this one keeps a part."""
-        s: Steps = at(self.steps, step.k)
-        residual = jnp.asarray(step.z) - s.output @ step.prior.mean - s.offset
-        total = s.output @ step.prior.covariance @ s.output.T + s.noise
-        step = step._replace(innovation=Innovation(residual, total, jnp.zeros(())))
-        model = s.transition, s.process, s.output
-        rounded = state_rounding(self._size())
-        return linear_smoother_step(step, model, rounded, self.claim, self.projection, pseudo_solve)
-
-    def _size(self) -> jax.Array:
-        """E[y_i^2] at the start, (N,)."""
-        return jnp.asarray(self.mean) ** 2 + jnp.diag(jnp.asarray(self.covariance))
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of the system's state before the step given its prediction."""
+        moved = at(self.steps, step.k).transition @ step.before.root, at(self.noises, step.k).process
+        return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=self.projection)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
@@ -210,9 +198,9 @@ class SystemNoises(NamedTuple):
 
 @in_float64
 def _factored(system: LinearSystem) -> SystemNoises:
-    """Factors of both noises at each step; rounding is of numbers as large as at the start."""
-    s, start = system.steps, system.mean**2 + np.diagonal(system.covariance)
-    sizes = (np.abs(s.output) @ np.sqrt(start) + np.abs(s.offset)) ** 2
+    """Factors of both noises at each step, with the rounding of numbers as large as the system makes them."""
+    s = system.steps
+    moved, sent = _sizes(system)
 
     def columns(covariances: np.ndarray, seconds: np.ndarray) -> Columns:
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
@@ -224,4 +212,23 @@ def _factored(system: LinearSystem) -> SystemNoises:
         factors = each(columns_of_each(covariances), rounding)
         return Columns(np.asarray(factors.matrix), np.asarray(factors.weights))
 
-    return SystemNoises(columns(np.asarray(s.process), start), columns(np.asarray(s.noise), sizes))
+    return SystemNoises(columns(np.asarray(s.process), moved), columns(np.asarray(s.noise), sent))
+
+
+def _sizes(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
+    """(|A| root E[y y'] + |a|)^2 of what the state becomes at each step (time, N), and the same of what is received.
+
+    By the moments before any data, since parts of a system that start at zero do not stay there.
+    """
+    s, mean, covariance = system.steps, system.mean, system.covariance
+    largest = float(np.finfo(float).max) ** 0.5
+    moved, sent = [], []
+    for k in range(len(s.transition)):
+        reach = np.sqrt(mean**2 + np.diagonal(covariance))
+        moved.append(np.minimum(np.abs(s.transition[k]) @ reach + np.abs(s.drift[k]), largest**0.5) ** 2)
+        mean = np.clip(s.transition[k] @ mean + s.drift[k], -(largest**0.5), largest**0.5)
+        moved_covariance = s.transition[k] @ covariance @ s.transition[k].T + s.process[k]
+        covariance = np.clip(moved_covariance, -largest, largest)
+        reach = np.sqrt(mean**2 + np.diagonal(covariance))
+        sent.append(np.minimum(np.abs(s.output[k]) @ reach + np.abs(s.offset[k]), largest**0.5) ** 2)
+    return np.stack(moved), np.stack(sent)

@@ -23,8 +23,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.belief import process_noise, start_of
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -261,12 +260,11 @@ class MixtureFilter(AbstractSizedFilter):
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the moments around the update."""
-        plant = at(self.plant, step.k)
-        x, slopes = step.before.gaussian, plant.transition_matrix(jnp.asarray(step.u)) @ step.before.gaussian.root
-        cross = (x.root * x.variances) @ slopes.T
-        return moments_smoother_step(step.after, step.prior, cross, "nominal", plant.angles)
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of the state before the step given its prediction."""
+        plant, u, (before, prior, after, *_) = at(self.plant, step.k), jnp.asarray(step.u), step
+        moved = plant.transition_matrix(u) @ before.gaussian.root, process_noise(plant, u, start_of(at(self.plant, 0)))
+        return smoother_step_of(before, prior, after, moved, "nominal", plant.angles)
 
 
 def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:

@@ -22,14 +22,14 @@ from heliograph.factors.columns import (
     outer,
     rounding_of,
     side_by_side,
+    triangular,
 )
 from heliograph.factors.gaussian import Gaussian, given, of_columns
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import process_noise, start_of
 from heliograph.filters.gaussian.signal import corrected_by, eliminated_spread
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import linear_smoother_step
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -159,16 +159,13 @@ class ModalFilter(AbstractModalFilter):
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
         (move, noise, centre), rows = moved_about(at(self.plant, k), u, state.centre), self._rows(state, k)
-        law, x = state.law @ rows, state.gaussian
+        law = state.law @ rows
         # F zeta about the moving centre.
-        root = moved_by_mode(x.root, move, rows)
-        known = x.mean - known_part(state.law, state.centre)
+        known = state.mean - known_part(state.law, state.centre)
         mean = moved_by_mode(known[:, None], move, rows)[:, 0] + known_part(law, centre)
-        # Columns of F P F' and of the covariance above.
-        carried = jax.vmap(lambda a: move @ a @ move.T)(state.moments)
-        fresh = joined(spread_of_moves(carried, rows), self.moved_noise(u, k, Columns(jnp.eye(len(law)), law)))
-        moments = jnp.einsum("ij,iab->jab", rows, carried) + law[:, None, None] * noise
-        after = of_columns(mean, joined(Columns(root, x.variances), fresh))
+        root, fresh = self._moves(state, u, k)
+        after = of_columns(mean, joined(Columns(root, state.variances), fresh))
+        moments = jnp.einsum("ij,iab->jab", rows, _carried(state, move)) + law[:, None, None] * noise
         return ModalBelief(*after, moments, centre, jnp.asarray(True))
 
     @corrects
@@ -186,6 +183,13 @@ class ModalFilter(AbstractModalFilter):
         """Transition matrix of the chain (M, M)."""
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
+    def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
+        """Return F L of zeta = E zeta + L xi, and the columns of Cov(zeta+ - F zeta)."""
+        move, rows = moved_about(at(self.plant, k), u, state.centre)[0], self._rows(state, k)
+        own = self.moved_noise(u, k, Columns(jnp.eye(len(rows)), state.law @ rows))
+        fresh = joined(spread_of_moves(_carried(state, move), rows), own)
+        return moved_by_mode(state.gaussian.root, move, rows), fresh
+
     def _output(self, state: ModalBelief, k: Step) -> Output:
         """Return what is measured of zeta, less the mean output."""
         channel, sensor = at(self.channel, k), at(self.sensor, k)
@@ -197,16 +201,17 @@ class ModalFilter(AbstractModalFilter):
         rounding = rounding_of_received(jnp.asarray(channel.mean), sent)
         return Output(beside(matrix), common, joined(known, rounding, eliminated_spread(random)))
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the linear update of zeta."""
-        before, output = step.before, self._output(step.prior, step.k).matrix
-        move, rows = moved_about(at(self.plant, step.k), step.u, before.centre)[0], self._rows(before, step.k)
-        transition = moved_by_mode(jnp.eye(len(before.mean)), move, rows)
-        carried = jax.vmap(lambda a: move @ a @ move.T)(before.moments)
-        own = self.moved_noise(step.u, step.k, Columns(jnp.eye(len(rows)), before.law @ rows))
-        model = transition, joined(spread_of_moves(carried, rows), own).covariance, output
-        rounded = np.zeros(len(before.mean))  # it is part of the noise
-        return linear_smoother_step(step, model, rounded, self.claim, self._projection())
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of zeta before the step given its prediction."""
+        slopes, fresh = self._moves(step.before, step.u, step.k)
+        moved, projection = (slopes, triangular(fresh)), self._projection()
+        return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
+
+
+def _carried(state: ModalBelief, move: jax.Array) -> jax.Array:
+    """A~ E_i A~' (M, n + 1, n + 1)."""
+    carried: jax.Array = jax.vmap(lambda a: move @ a @ move.T)(state.moments)
+    return carried
 
 
 def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: LinearPlant) -> Columns:

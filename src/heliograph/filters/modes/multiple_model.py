@@ -25,12 +25,12 @@ from heliograph.filters.base import (
     predicts,
     sized,
 )
-from heliograph.filters.gaussian.belief import moments_around, predicted, process_noise, start_of
+from heliograph.filters.gaussian.belief import predicted, process_noise, smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.signal import Signal, corrected_by, noise_through, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.modes.side_information import SideInformation, by_pattern, pattern_of
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -272,9 +272,9 @@ class MultipleModelFilter(AbstractSizedFilter):
         mean, covariance = moments_of_mixture(state.mean, state.covariance, jnp.sum(state.weight, axis=1))
         return Estimate(wrapped(mean, first(self.plant).angles), covariance, self.claim)
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the moments of the whole mixture around the update; modes are not smoothed."""
-        return moments_around(self, step, _whole)
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return that of the whole mixture's moments around the update; modes are not smoothed."""
+        return smoother_step_by_transform(self, step, first(self.plant), _whole)
 
 
 def _whole(state: ModalBeliefs) -> Gaussian:

@@ -5,13 +5,12 @@ Sigma- <= (1 + b) F Sigma F' + (1 + 1/b) D + W with D >= sum_i p_i Delta_i Delta
 Terms that depend on the law p of the modes are bounded over the interval of possible p.
 """
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, joined
+from heliograph.factors.columns import Columns, joined, triangular
 from heliograph.factors.gaussian import Gaussian, of_columns
 from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.gaussian.signal import eliminated_spread
@@ -31,8 +30,7 @@ from heliograph.filters.modes.modal import (
     rounding_of_received,
     without_common,
 )
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
-from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import at
@@ -88,26 +86,37 @@ class UncertainModalFilter(AbstractModalFilter):
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
         """Propagate the bound on Sigma-; at the first prediction the mode has its initial law."""
-        channel, x = at(self.channel, k), state.gaussian
+        (rows, radius), x = self._chain(state, k), state.gaussian
         move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
-        # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
+        root, young, fresh = self._moves(state, u, k)
+        known, law = x.mean - known_part(state.law, state.centre), state.law @ rows
+        mean = moved_by_mode(known[:, None], move, rows)[:, 0] + known_part(law, centre)
+        after = of_columns(mean, joined(Columns(root, (1 + young) * x.variances), fresh))
+        # E[x~ x~'] and nominal law one step later.
+        second, (low, high) = move @ state.second @ move.T + noise, _bounds(rows, radius, state.low, state.high)
+        return UncertainBelief(*after, second, centre, law, low, high, jnp.asarray(True))
+
+    def _chain(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
+        """Chain of the modes and the radius of its entries; before the first prediction the mode stays as it is."""
+        channel = at(self.channel, k)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
-        radius = jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
+        return rows, jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
+
+    def _moves(self, state: UncertainBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, jax.Array, Columns]:
+        """Return F L, b, and the columns of (1 + 1/b) D + W, of Sigma- = (1 + b) F Sigma F' + (1 + 1/b) D + W."""
+        move, (rows, radius) = moved_about(at(self.plant, k), u, state.centre)[0], self._chain(state, k)
+        # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
         carried = move @ state.second @ move.T
         chosen, wandering = (_worst(items, *_middle(state.low, state.high)) for items in _each_row(rows, radius))
         # Young's inequality, b = root(tr D / tr F Sigma F').
-        root = moved_by_mode(x.root, move, rows)
-        young = jnp.sqrt(_ratio(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ x.variances)))
+        root = moved_by_mode(state.gaussian.root, move, rows)
+        young = jnp.sqrt(_ratio(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ state.variances)))
         wide = chosen + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * wandering
-        # Columns of (1 + b) F Sigma F', of (1 + 1 / b) D and of the bound W on the covariance of the noise.
+        # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
         low, high = _bounds(rows, radius, state.low, state.high)
         among = apart_by_mode(jnp.einsum("jl,ab->jalb", wide[:-1, :-1], carried))
         own = self.moved_noise(u, k, eliminated_spread(_worst_diagonal(low, high)))
-        known, law = x.mean - known_part(state.law, state.centre), state.law @ rows
-        mean = moved_by_mode(known[:, None], move, rows)[:, 0] + known_part(law, centre)
-        after = of_columns(mean, joined(Columns(root, (1 + young) * x.variances), among, own))
-        # E[x~ x~'] and nominal law one step later.
-        return UncertainBelief(*after, carried + noise, centre, law, low, high, jnp.asarray(True))
+        return root, young, joined(among, own)
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
@@ -124,14 +133,12 @@ class UncertainModalFilter(AbstractModalFilter):
         after, innovation = observe_modes(state.gaussian, known, output, z)
         return UncertainBelief(*after, *state[3:]), innovation
 
-    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
-        """Return the moments of zeta around the update; the filter's bound is not proved for smoothed estimates."""
-        before, k = step.before, step.k
-        move, _, _ = moved_about(at(self.plant, k), step.u, before.centre)
-        rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
-        cross = before.covariance @ jnp.kron(rows.T, move).T
-        moments = moments_smoother_step(step.after, step.prior, cross, "nominal")
-        return replace(moments, projection=jnp.asarray(self._projection()))
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of zeta before the step; the filter's bound is not proved for smoothed estimates."""
+        slopes, young, fresh = self._moves(step.before, step.u, step.k)
+        noise = triangular(joined(Columns(slopes, young * step.before.variances), fresh))
+        moved, projection = (slopes, noise), self._projection()
+        return smoother_step_of(step.before, step.prior, step.after, moved, "nominal", projection=projection)
 
 
 def _ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:

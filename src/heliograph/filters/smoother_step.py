@@ -1,0 +1,171 @@
+"""Smoother step of a filter: what the way back, or the way ahead of one earlier state, needs of a step forward."""
+
+from dataclasses import replace
+from typing import NamedTuple, Protocol, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, decorrelated, joined, triangular, unit_lower
+from heliograph.factors.gaussian import Backwards, Gaussian, backwards, of_columns, smoothed
+from heliograph.filters.plausibility import innovation_distance
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.numerics.angle import Angles, wrapped
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+
+class StepTrace(NamedTuple):
+    """States of a filter around step k: `before` it, `prior` after the prediction, `after` the correction with z.
+
+    Also the innovation of the correction, the measurement z (received,) and the input u (inputs,).
+    """
+
+    before: PyTree
+    prior: PyTree
+    after: PyTree
+    innovation: Innovation
+    z: ArrayLike
+    u: ArrayLike
+    k: int | np.integer | Int[jax.Array, ""]
+
+
+class Point(NamedTuple):
+    """An earlier state x_j given the data so far, by the state x now: x_j = mean + M L^-1 (x - E x) + noise.
+
+    Shapes: mean (N,), link M (N, N), lower (N (N - 1) / 2,) of L, noise (N, columns), uncorrelated with x.
+    """
+
+    mean: Float[jax.Array, " N"]
+    link: Float[jax.Array, "N N"]
+    lower: Float[jax.Array, " entries"]
+    noise: Columns
+
+    def through(self, rows: jax.Array) -> jax.Array:
+        """M L^-1 times rows (N, ...)."""
+        return self.link @ decorrelated(unit_lower(self.lower), rows)
+
+
+class SmootherStep(Module):
+    """Smoother step: the law of the filter's state, of N numbers, after a step, and that of the state before it.
+
+    The latter is given the state after the prediction and the data up to there, of which the step's measurement says
+    nothing more. Rauch, Tung and Striebel's recursion passes from the one to the other for all that moves by a
+    prediction with a white noise, whatever the correction. The plant's state is projection y + shift of the filter's
+    state y, y itself without them. Stacked along time, and over runs, it describes a whole run of a filter.
+
+    claim: of estimates given later data too. angles: which of the plant's states are wrapped to between -pi and pi in
+    estimates; a backward pass never wraps them. nis: e' S^-1 e of the step's innovation, with mean `received`, the
+    number of components that arrived.
+
+    Shapes: projection (n, N), shift (n,).
+    """
+
+    after: Gaussian
+    before: Backwards
+    projection: Float[jax.Array, "*time n N"] | None = eqx.field(default=None, kw_only=True)
+    shift: Float[jax.Array, "*time n"] | None = eqx.field(default=None, kw_only=True)
+    nis: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
+    received: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
+    claim: Claim = eqx.field(static=True, kw_only=True)
+    angles: Angles = eqx.field(static=True, default=(), kw_only=True)
+
+    @property
+    def mean(self) -> Float[Array, "*time N"]:
+        """Mean of the filter's state after the step."""
+        return self.after.mean
+
+    def back(self, later: Gaussian) -> Gaussian:
+        """Law of the filter's state before the step, from that after the step, both given the same later data."""
+        return smoothed(self.before, later)
+
+    def start(self) -> Point:
+        """Return the state after this step as a point to be carried ahead."""
+        n = len(self.after.mean)
+        return Point(self.after.mean, jnp.eye(n), jnp.zeros_like(self.after.lower), Columns(jnp.eye(n), jnp.zeros(n)))
+
+    def ahead(self, point: Point) -> Point:
+        """Return an earlier state given this step's data too.
+
+        Before the step x = m + K e + d, so that x_j = mean + M L^-1 (K e + d) + noise, of which the data tell e alone.
+        """
+        before = self.before
+        noise = Columns(point.through(before.left.root), before.left.variances)
+        after = Point(point.mean, point.through(before.gain), before.lower, triangular(joined(point.noise, noise)))
+        return after._replace(mean=point.mean + after.through((self.after.mean - before.ahead)[:, None])[:, 0])
+
+    def reached(self, point: Point) -> Gaussian:
+        """Law of an earlier state that was carried to this step."""
+        now = Columns(point.through(self.after.root), self.after.variances)
+        return of_columns(point.mean, joined(now, point.noise))
+
+    def with_data(self, mean_before: jax.Array, mean_prior: jax.Array, mean_after: jax.Array) -> Self:
+        """Return the same step with other data of the same arrivals: other means."""
+        before = self.before._replace(left=self.before.left._replace(mean=mean_before), ahead=mean_prior)
+        return replace(self, after=self.after._replace(mean=mean_after), before=before)
+
+    def estimate_from(self, law: Gaussian) -> Estimate:
+        """Estimate of the plant's state from the law of the filter's."""
+        mean, columns = law.mean, law.columns
+        if self.projection is not None:
+            mean, columns = self.projection @ mean, columns.through(self.projection)
+        mean = mean if self.shift is None else mean + self.shift
+        return Estimate(wrapped(mean, self.angles), columns.covariance, self.claim)
+
+
+class Believed(Protocol):
+    """A filter's state with mean (N,) and factors of its covariance, as `Gaussian` has them."""
+
+    @property
+    def mean(self) -> Float[Array, " N"]:
+        """Mean of the state."""
+
+    @property
+    def lower(self) -> Float[Array, " entries"]:
+        """Entries of L below its diagonal."""
+
+    @property
+    def variances(self) -> Float[Array, " N"]:
+        """Variances d."""
+
+
+def smoother_step_of(
+    before: Believed,
+    prior: Believed,
+    after: Believed,
+    moved: tuple[Array, Columns],
+    claim: Claim,
+    angles: Angles = (),
+    projection: Array | None = None,
+) -> SmootherStep:
+    """Build the step from the filter's states around it, `before` it, `prior` to the correction and `after` it.
+
+    Args:
+        before: with mean m and factors L, d.
+        prior: of the state x+.
+        after: of the same, given the step's data.
+        moved: slopes (N, N) and noise (N, columns) of the move x+ = E x+ + slopes xi + w from x = m + L xi.
+        claim: of smoothed estimates.
+        angles: places of angles among the plant's states.
+        projection: from the filter's state to the plant's (n, N).
+    """
+    slopes, noise = moved
+    return SmootherStep(
+        _law(after),
+        backwards(_law(before), jnp.asarray(slopes), jnp.asarray(prior.mean), noise),
+        claim=claim,
+        angles=angles,
+        projection=None if projection is None else jnp.asarray(projection),
+    )
+
+
+def with_nis(step: SmootherStep, innovation: Innovation) -> SmootherStep:
+    """Return the step with the normalised innovation squared, e' S^-1 e."""
+    nis, count = innovation_distance(innovation)
+    return replace(step, nis=nis, received=count)
+
+
+def _law(state: Believed) -> Gaussian:
+    return Gaussian(*map(jnp.asarray, (state.mean, state.lower, state.variances)))

@@ -1,1 +1,0 @@
-"""Smoother steps: data of a filter step that a backward pass needs."""
