@@ -11,7 +11,7 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.premise import Premise, believing
-from heliograph.model.sensor import AnySensor, check_linear
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.linalg import with_rounding
@@ -24,6 +24,7 @@ from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, cou
 from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
 from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
+from heliograph.random_affine.superposed import sensed_by_link
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -320,12 +321,26 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
 def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
     """The maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
     plants = _maps(each_step(plant, horizon), order)
-    sensors = _maps(each_step(sensor, horizon), order)
-    channels = each_step(channel, horizon)
-    fixed = not isinstance(sensor, OverTime) and not isinstance(channel, OverTime)
-    route = Series([sensors[0], channels[0]])
-    measurements = [route if fixed else Series(pair) for pair in zip(sensors, channels, strict=True)]
+    sensors, channels = each_step(sensor, horizon), each_step(channel, horizon)
+    if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
+        measurements = [_measurements(sensors[:1], channels[:1], order)[0]] * horizon
+    else:
+        measurements = _measurements(sensors, channels, order)
     return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
+
+
+def _measurements(
+    sensors: Sequence[AnySensor], channels: Sequence[AbstractRandomAffine], order: int
+) -> list[AbstractRandomAffine]:
+    """Maps from the state to what arrives; a sum of links whose sensors' noises are independent is one of x itself."""
+    apart = list[AbstractRandomAffine]()
+    for sensor, channel in zip(sensors, channels, strict=True):
+        assert isinstance(sensor, LinearSensor)  # checked before
+        by_link = sensed_by_link(sensor.matrix, sensor.noise, channel)
+        apart += [] if by_link is None else [by_link]
+    if len(apart) == len(sensors):
+        return apart
+    return [Series(pair) for pair in zip(_maps(sensors, order), channels, strict=True)]
 
 
 def _maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:

@@ -199,6 +199,24 @@ class Independent(AbstractNoise):
         return value
 
 
+def in_groups(noise: AbstractNoise, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
+    """Return the noise of each group of components, where groups in order are independent and complete; else None."""
+    if [i for group in groups for i in group] != list(range(noise.dimension)) or is_traced(noise):
+        return None
+    label = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    match noise:
+        case Gaussian() if not np.any(np.asarray(noise.covariance)[label[:, None] != label]):
+            blocks = [np.ix_(group, group) for group in groups]
+            parts = [Gaussian(noise.covariance[block], noise.mean[block[0][:, 0]]) for block in blocks]
+            return list[AbstractNoise](parts)
+        case Independent():
+            owners = np.repeat(np.arange(len(noise.parts)), [part.dimension for part in noise.parts])
+            owned = [[noise.parts[i] for i in dict.fromkeys(owners[list(group)].tolist())] for group in groups]
+            whole = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
+            return [Independent(parts) for parts in owned] if whole else None
+    return None
+
+
 class Shaped(AbstractNoise):
     """Noise n = B u: a noise u that enters through a known matrix B, as process noise does.
 

@@ -13,7 +13,15 @@ from heliograph.numerics.check import check_count, fail, instance, items, shown
 from heliograph.numerics.traced import library, placed
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
-from heliograph.random_affine.combine import AbstractCombination, Corners, GainAndNoise, Series, Stack, known
+from heliograph.random_affine.combine import (
+    AbstractCombination,
+    Corners,
+    GainAndNoise,
+    Series,
+    Stack,
+    known,
+    maps_in_series,
+)
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.monomials import (
     Moments,
@@ -26,7 +34,7 @@ from heliograph.random_affine.moments.monomials import (
     sum_plan,
     times_one,
 )
-from heliograph.random_affine.noise import AbstractNoise, noise_vector
+from heliograph.random_affine.noise import AbstractNoise, Matrix, in_groups, noise_vector
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y
 
@@ -232,3 +240,19 @@ def _whole(powers: _Powers, outputs: int, inputs: int, order: int) -> Corners:
         else:
             matrix = jnp.asarray(matrix).at[:, rows[:, None], columns].set(polynomials)
     return matrix
+
+
+def sensed_by_link(matrix: Matrix, noise: AbstractNoise, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
+    """Return a sum of links of y = C x + v as one of links of x, C_i x + v_i through link i, whose moments are smaller.
+
+    That holds where the parts of v that links carry are independent; else, and for another channel, there is none.
+    """
+    first, *rest = maps_in_series(channel)
+    if not isinstance(first, Superposed) or (parts := in_groups(noise, first.places)) is None:
+        return None
+    links = [
+        Series([GainAndNoise(Constant(1.0), np.asarray(matrix)[list(at)], part), link])
+        for at, part, link in zip(first.places, parts, first.maps, strict=True)
+    ]
+    everything = tuple(range(np.shape(matrix)[1]))
+    return Series([Superposed(links, first.noise, [everything] * len(links), len(everything)), *rest])

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.model.agreement import CHANNEL
+from heliograph.model.agreement import CHANNEL, matrix_of
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
@@ -18,6 +18,8 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import InputError
 from heliograph.numerics.traced import DOUBLE
 from heliograph.numerics.types import Float
+from heliograph.random_affine.modes import forgetful
+from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
 from heliograph.simulation.description.diagram import listed, rounded_in_words, shared
@@ -26,6 +28,7 @@ from heliograph.simulation.description.wide_angles import wide_at_the_start
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
+CANCELLED = 1e-12  # of the largest mean gain: what is left where gains cancel
 HIDDEN = 1e-9  # of the largest singular value of the observability matrix: what is smaller is rounding
 NODES_LIMIT = 12  # nodes of which each is judged alone
 SEED = 0  # of the state at which a nonlinear plant is judged
@@ -44,7 +47,8 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     Args:
         network: the network.
     """
-    lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network), *_other_worlds(network)]
+    lines = [*_unobservable(network), *_unbounded(network), *_unheard(network)]
+    lines += [*_forgotten(network), *_other_worlds(network)]
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in rounded_in_words(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
@@ -133,6 +137,24 @@ def _bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
         yield Doubt(serious, f"unbounded: {what} grows without end: {boundedness.reason}")
     elif boundedness.verdict == "undecided":
         yield Doubt(False, f"boundedness of {what}: undecided: {boundedness.reason}")
+
+
+def _unheard(network: Network) -> Iterator[Doubt]:
+    """Yield sums of links whose mean gains cancel, and links of mean gain zero; linear filters hear nothing of them."""
+    for name, node in network.nodes.items():
+        if not isinstance(node, Node) or not isinstance(channel := first(node.channel), Superposed):
+            continue
+        links = [np.asarray(forgetful(link).moments(1).mean)[:-1, :-1] for link in channel.maps]
+        matrix = matrix_of(first(node.sensor)) if not channel.past else None
+        sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)
+        heard = [mean @ sensed[list(at)] for mean, at in zip(links, channel.places, strict=True)]
+        if not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard)):
+            say = "a linear filter learns nothing of it; compensate phases and signs at the transmitters"
+            yield Doubt(True, f"unheard: what adds up at {name!r} has mean gain 0: {say}")
+            continue
+        silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
+        if silent:
+            yield Doubt(False, f"unheard: {listed(silent)} at {name!r}: of mean gain 0, which only adds noise")
 
 
 def _other_worlds(network: Network) -> Iterator[Doubt]:
