@@ -17,7 +17,8 @@ class CheckedFates(Fates):
 
 JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
 CHOSEN = 2.0  # of a packet that arrived, and is an end of its stretch for that reason
-COPY = 50  # a number received again within so many is a copy
+COPY = 50  # a number received again may be a copy within so many
+FEW = 2  # numbers in a row that come again: more are those of a sender that restarted
 MOST = 2.0**53  # whole numbers up to here are doubles
 
 
@@ -61,9 +62,9 @@ def fates_of_sequence(
 ) -> Fates:
     """Fates of the packets of one sender from the sequence numbers that were received: what is missing was lost.
 
-    A number that leaps ahead by `jump` or falls back starts a new stretch (the sender restarted); a copy is dropped.
-    Packets that overtake each other look like restarts: with their times of sending they are put in order first, and a
-    copy is what has number and time of another.
+    A number that leaps ahead by `jump` or falls back starts a new stretch (the sender restarted). Copies are dropped:
+    one or two numbers again within 50, or all again from a number on. Packets that overtake each other look like
+    restarts: with their times of sending they are put in order first, and a copy has number and time of another.
 
     The first and the last packet of a stretch are its ends because they arrived: they are no trials (for `learn_losses`
     and the laws of losses), though those between them are, given that both arrived.
@@ -89,14 +90,35 @@ def fates_of_sequence(
         received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
     # a new stretch at each restart, copies dropped
     stretches: list[list[int]] = [[]]
-    for number in received.tolist():
-        stretch = stretches[-1]
-        if sent is None and number in stretch[-COPY:]:
-            continue
-        if stretch and (number <= stretch[-1] or number - stretch[-1] >= jump):
+    for run in _rising(received):
+        again = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
+        if again and not (sent is None and _are_copies(again, run, stretches[-1])):
             stretches.append([])
-        stretches[-1].append(number)
-    return [_gaps(np.array(numbers)) for numbers in stretches]
+            again = []
+        for number in run[len(again) :]:
+            if stretches[-1] and number - stretches[-1][-1] >= jump:
+                stretches.append([])
+            stretches[-1].append(number)
+    return [_gaps(np.array(numbers)) for numbers in stretches if numbers]
+
+
+def _rising(received: np.ndarray) -> list[list[int]]:
+    """Split numbers where they fall back; of equal ones in a row one stays."""
+    numbers = received[np.concatenate([[True], np.diff(received) != 0])]
+    return [run.tolist() for run in np.split(numbers, np.flatnonzero(np.diff(numbers) < 0) + 1)]
+
+
+def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
+    """Test whether numbers that came again, at the begin of a rising run, are copies, not those of a sender anew.
+
+    A few may be, if all came lately. Many are where all that came from a number on comes again, and goes on from
+    there, as from a broker to which nobody said that it had come; but not from the first number on.
+    """
+    lately = stretch[-COPY:]
+    if not set(again) <= set(lately):
+        return False
+    replayed = len(run) > len(again) and again[0] != stretch[0] and stretch[-len(again) :] == again
+    return len(again) <= FEW or replayed
 
 
 def _gaps(received: np.ndarray) -> BetweenArrivals:

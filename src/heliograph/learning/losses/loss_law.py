@@ -5,7 +5,7 @@ from typing import TypeVar
 import numpy as np
 
 from heliograph.learning.losses.fates import CHOSEN, Fates, as_fates, as_history, is_trial
-from heliograph.learning.losses.shares import logits, maximum
+from heliograph.learning.losses.shares import logits, maximum, shares_at
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
@@ -111,17 +111,20 @@ class MarkovLosses(AbstractLossLaw):
     Args:
         counts: (arrived, lost) after each past (2^order, 2); a past is a number whose bits are the last fates, the
             latest one lowest.
+        given_ends: P(lost | arrived) and P(arrived | lost) with likelihood intervals, of a chain between ends
+            that arrived for being ends; none where counts say all.
     """
 
     counts: np.ndarray
+    given_ends: tuple[Share, Share] | None = None
 
     @staticmethod
-    def fit(fates: object, order: int = 1) -> "MarkovLosses":
+    def fit(fates: object, order: int = 1, intervals: bool = True) -> "MarkovLosses":
         """Count, over packets of which the last `order` fates are known.
 
         Between ends that arrived for being ends the chain is one given its end. For order 1 the counts are then such
-        that their shares are the maximum of that likelihood, with as many packets as know as much; for higher orders
-        packets between the ends are counted.
+        that their shares are the maximum of that likelihood, with as many packets as know as much, and intervals are
+        by its profile; for higher orders packets between the ends are counted.
 
         Raises:
             ValueError: what is no fates, or an order that is not from 1 to 12.
@@ -136,7 +139,7 @@ class MarkovLosses(AbstractLossLaw):
             full = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
             np.add.at(counts, (past[full], as_history(stretch)[full].astype(int)), 1.0)
         spans = _spans(parts)
-        return MarkovLosses(_given_ends(counts, spans) if order == 1 and len(spans) else counts)
+        return _given_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 
     @property
     def order(self) -> int:
@@ -144,7 +147,12 @@ class MarkovLosses(AbstractLossLaw):
         return len(self.counts).bit_length() - 1
 
     def shares(self) -> dict[str, Share]:
-        """Shares P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past)."""
+        """Shares P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past).
+
+        Between ends that arrived for being ends the intervals are the likelihood's.
+        """
+        if self.given_ends is not None:
+            return dict(zip(("fail", "recover"), self.given_ends, strict=True))
         if self.order == 1:
             (stayed, failed), (recovered, lost) = self.counts
             return {"fail": wilson(failed, stayed + failed), "recover": wilson(recovered, recovered + lost)}
@@ -188,8 +196,8 @@ def _spans(parts: Fates) -> np.ndarray:
     return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
 
 
-def _given_ends(counts: np.ndarray, spans: np.ndarray) -> np.ndarray:
-    """Counts whose shares are the most likely fail a and recover b of chains that are known to end arrived.
+def _given_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
+    """The law of counts whose shares are the most likely fail a and recover b of chains that are known to end arrived.
 
     l = sum n log p - sum_spans log P_m, P_m = (b + a (1 - a - b)^m) / (a + b) the probability to arrive again after m
     steps. A count in all is p (1 - p) / variance of p: as many packets as would know as much alone.
@@ -207,7 +215,7 @@ def _given_ends(counts: np.ndarray, spans: np.ndarray) -> np.ndarray:
         score = np.array([failed / a - stayed / (1 - a) - by_a.sum(), recovered / b - lost / (1 - b) - by_b.sum()])
         return float(value - np.sum(np.log(again / total))), score * shares * (1 - shares)
 
-    top, _ = maximum(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
+    top, value = maximum(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
     shares = 1 / (1 + np.exp(-top))
     # variances of the logits, 1 / (n p (1 - p)) of n packets alone, from differences of the score
     steps = 1e-4 * np.eye(2)
@@ -215,7 +223,10 @@ def _given_ends(counts: np.ndarray, spans: np.ndarray) -> np.ndarray:
     variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
     size = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
     fails, recovers = shares
-    return np.asarray(size[:, None] * np.array([[1 - fails, fails], [recovers, 1 - recovers]]))
+    alone = size[:, None] * np.array([[1 - fails, fails], [recovers, 1 - recovers]])
+    fail, recover = shares_at(likelihood, top, value, intervals)
+    recover = recover if counts[1].any() else wilson(0, 0)  # without losses nothing tells how they end
+    return MarkovLosses(np.asarray(alone), (fail, recover))
 
 
 def _past(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:

@@ -111,7 +111,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
-        "markov": MarkovLosses.fit(parts),
+        "markov": MarkovLosses.fit(parts, intervals=intervals),
         f"markov_{LONG}": MarkovLosses.fit(parts, LONG),
         HIDDEN: HiddenModeLosses.fit(parts, intervals),
         RUNNING: RunningRateLosses.fit(parts, intervals),
@@ -143,7 +143,7 @@ def loss_memory(fates: object) -> LossMemory:
         ValueError: what is no fates (see `heliograph.learning`).
     Source: Anderson and Goodman (1957); Wald and Wolfowitz (1940), given the losses of each unbroken stretch.
     """
-    counts = MarkovLosses.fit(fates).counts
+    counts = MarkovLosses.fit(fates, intervals=False).counts
     both = counts.sum(axis=0)
     ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
     # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance

@@ -10,7 +10,9 @@ from scipy.special import expit, logit
 from heliograph.numerics.shares import Share as Share
 
 FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
-FALL_AT_END = 1.352772  # where the maximum lies at 0 or 1 only one side is left: half its 90 % point
+FALL_AT_END = (
+    2.995732  # where the maximum lies at 0 or 1, as of events that never came: n of them fail with 5 %, log 20
+)
 END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
 
 Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient of a log-likelihood of logits
