@@ -5,12 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import heliograph as hg
-from heliograph.engine.choice import engine_of
 from straightline.graph import Graph
 from straightline.lowering import Lowering, scalars, traced
 from straightline.nodes import Unsupported
 from straightline.program import lower, needed
+from tests.straightline.over_runs import over_runs
 
 
 def folded(function, *arguments):
@@ -76,13 +75,6 @@ def test_factors_and_triangular_systems():
     assert np.isnan(folded(jnp.linalg.cholesky, -S)[0, 0])
 
 
-def test_a_filter_step_folds_to_its_numbers():
-    plant = hg.LinearPlant([[1, 0.1], [0, 1]], np.diag([1e-3, 1e-2]), [0, 1], np.eye(2))
-    kalman = hg.kalman_filter(plant, hg.LinearSensor([[1, 0]], 0.01))
-    agree(lambda z: kalman.step(kalman.init(), z)[1].mean, np.array([0.3]))
-    agree(lambda z: kalman.step(kalman.init(), z)[1].covariance, np.array([np.nan]))
-
-
 def test_equal_expressions_are_one_node_and_what_nothing_needs_is_dropped():
     program = lower(lambda x: (x[0] * x[1] + x[1] * x[0], jnp.sin(x[2]))[0], np.zeros(3))
     nodes = needed(scalars(program.outputs[0]))
@@ -119,9 +111,8 @@ def test_a_loop_over_an_axis_ends_for_each_entry_when_its_condition_fails():
     draw = np.random.default_rng(0)
     limits, words = draw.uniform(0, 50, (5, 2, 3)), draw.integers(0, 9, (5, 2, 3, 2), dtype=np.uint32)
     limits[0, 0, 0] = np.nan
-    assert engine_of(doubled, limits, words).startswith("native: ")
     with jax.enable_x64(True):
         expected = [np.asarray(x) for x in jax.jit(jax.vmap(doubled))(limits, words)]
-    for x, y in zip(hg.simulation.over_runs(doubled, limits, words), expected, strict=True):
+    for x, y in zip(over_runs(doubled, limits, words), expected, strict=True):
         np.testing.assert_array_equal(x, y)  # doubling and adding small integers is exact
     assert len(np.unique(expected[1])) > 3

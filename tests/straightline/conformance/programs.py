@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.numerics.over_runs import runs_last
 from straightline import present
 from tests.straightline.conformance.case import Case
 
@@ -99,7 +98,6 @@ CASES: dict[str, list[Case]] = {
     "remat2": _of(jax.checkpoint(lambda x: x + 1)),
     "call_hi_primitive": _of(lambda x: jnp.frexp(x)[0]),
     "platform_index": _of(lambda x: lax.platform_dependent(x, cpu=lambda v: v + 1, default=lambda v: v - 1)),
-    "runs_last": _of(runs_last(lambda x: 2 * x)),
     "present": _of(present),
     "copy": _of(jnp.copy),
     "copy_p": _of(jnp.copy),

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.engine.choice import chosen
+from tests.straightline.over_runs import over_runs
 
 RANDOM = np.random.default_rng(0)
 TABLES, STATES, PLACES = RANDOM.normal(size=(30, 9, 9)), RANDOM.normal(size=(5, 9)), np.arange(5)
@@ -47,6 +47,6 @@ def guarded(tables, x, at):
 def test_what_runs_share_in_a_loop_is_that_of_each_turn(function):
     """Of each row of the tables, not of the last; sums of nine products differ by their order: 30 steps, 1e-12."""
     with jax.enable_x64(True):
-        computed = chosen(function, [TABLES, STATES, PLACES], [False, True, True]).results()
+        computed = over_runs(function, TABLES, STATES, PLACES, shared=[0])
         expected = np.stack([jax.jit(function)(TABLES, x, at) for x, at in zip(STATES, PLACES, strict=True)])
     assert np.max(np.abs(computed - expected)) < 1e-12
