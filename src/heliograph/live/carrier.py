@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.layout import fits, moved, parts_of, placed, with_covariances
-from heliograph.live.plant_codec import PlantParts, plant_bytes, plant_from
+from heliograph.live.plant_codec import BEFORE_LEAP, PlantParts, plant_bytes, plant_from
 from heliograph.live.rows import BEFORE
 from heliograph.live.snapshot import Identity
 from heliograph.numerics.check import fail
@@ -156,14 +156,15 @@ class Carrier:
         new_index = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
         received = sum(old["nodes"].values())
         parts = PlantParts.of(body, old["state"] + old["outputs"] + 2 * old["given"] + received + 2)
-        # Rows, the base first, in the order of their keys; a row of a node that is gone goes with it.
-        joint = self.fleet.rows_are_joint
+        # Rows in the order of their keys; one of a node that is gone goes with it. First stands the base, or a row kept
+        # from before a leap and then the base.
+        joint, ahead = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
         rows = [
             (float(parts.table[i, -1]), int(a) if joint or a == BEFORE else new_index.get(int(a), BEFORE), int(b), i)
             for i, (a, b) in enumerate(parts.keys)
-            if i == 0 or joint or int(a) in new_index
+            if i < ahead or joint or int(a) in new_index
         ]
-        rows = [rows[0], *sorted(rows[1:])]
+        rows = [*rows[:ahead], *sorted(rows[ahead:])]
         number = {row[-1]: i for i, row in enumerate(rows)}
         table = self._rows(parts.table[[row[-1] for row in rows]], new_index, names)
         assert table.shape[1] == self.fleet.pool.table.shape[1]

@@ -2,14 +2,15 @@
 
 from collections.abc import Iterable, Sequence
 from datetime import datetime
-from math import nan
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.lanes import Lanes
-from heliograph.live.plant import Leap, Plant, Withdrawn
+from heliograph.live.leap import ARRIVAL, Leap, beside
+from heliograph.live.plant import Plant, Withdrawn
 from heliograph.live.pool import Pool, legs_of, rounds_of
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
@@ -27,7 +28,7 @@ class Options(NamedTuple):
     Args:
         window: how late an event may be, in the unit of time of the network (default 10).
         ahead: how much later than its arrival the time of an event may be (default 0).
-        leap: how much later than all before it an event may be that no second one has confirmed (default 10,000).
+        leap: how much later than all before it an event may be that no other clock has confirmed (default 10,000).
         capacity: greatest number of rows held for each plant (default 1000).
         step: seconds of a step, where time counts steps and messages carry dates; None where they carry steps.
     """
@@ -114,7 +115,7 @@ class Fleet:
     def end(self, plant: Plant) -> None:
         """Remove a plant and free its slots."""
         self.end_silence(plant)
-        self.pool.give([row.slot for row in plant.rows.held])
+        self.pool.give(plant.slots)
 
     def pass_silence(self, plants: Iterable[tuple[Plant, float]]) -> None:
         """Predict each plant to a step at which nothing came; `silence` of the plant is the row there.
@@ -203,15 +204,30 @@ class Fleet:
         said = limits.why(values, self.network.nodes[node].received_names)
         return event._replace(values=np.where(outside, nan, values).tolist()), int(outside.sum()), said
 
-    def take(self, plant: Plant, event: Known, clock: float | None = None) -> Verdict:
+    def take(
+        self, plant: Plant, event: Known, given: bool = False, wall: float | None = None, clock: str | None = None
+    ) -> Verdict:
         """Judge an event and hold it if it is used.
 
-        An event more than `leap` after all before it is used, but nothing becomes final by it until another one, or
-        `clock`, the time by another clock than the sender's, says the same. If the next goes on from before it, it is
-        withdrawn.
+        An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
+        the same; if the next goes on from before it, it is withdrawn (`Leap` says it in full).
+
+        Args:
+            plant: the plant.
+            event: the event.
+            given: whether its arrival is known, by another clock than the sender's.
+            wall: time by the clock on the wall, if it is known.
+            clock: name of the node by whose clock it is dated (None: its own).
         """
         if self.lanes.dt is None and event.time > LAST_STEP:
             return "future"
+        leap, said = self.options.leap, event.arrival if given else event.time
+        clock = ARRIVAL if given else clock or self._names[event.node_index]
+        sure = (wall is not None and abs(said - wall) <= leap) or (given and abs(said - event.time) <= leap)
+        if plant.leap is not None and event.time <= event.arrival + self.options.ahead:
+            plant.judge_clock(clock, said, leap, sure, self._names)
+            if not given:
+                event = event._replace(arrival=max(plant.confirmed, event.time))
         rows, now = plant.rows, max(plant.confirmed, event.arrival)
         key = rows.key(event)
         verdict = rows.verdict(event, key, now - self.options.window, self.options.ahead)
@@ -219,16 +235,15 @@ class Fleet:
             return verdict
         self.end_silence(plant)
         plant.take(event, key, self.pool.take, self.width, self._lost_column(event.node_index))
-        leap = self.options.leap
-        sure = clock is not None and abs(event.arrival - clock) <= leap
-        plant.pass_time(event.time, now, leap, sure, self._names)
+        plant.pass_time(clock, said, now, leap, sure)
         return verdict
 
     def advance(self, plant: Plant, now: float) -> None:
         """Advance the time of a plant by a clock; a leap that contradicts it is withdrawn."""
-        if plant.leap is not None and plant.leap.now < now < plant.leap.time - self.options.leap:
-            plant.contradict(self._names)
-        elif plant.leap is not None and now >= plant.leap.time - self.options.leap:
+        leap, most = plant.leap, self.options.leap
+        if leap is not None and (found := beside(leap, plant.now, now, most)) is not None and found[0].now > -inf:
+            plant.take_back(found[0], most, self._names)
+        elif leap is not None and now >= leap.time - most:
             plant.leap = None
         plant.now = max(plant.now, now)
 
@@ -241,10 +256,8 @@ class Fleet:
         """Step what is due, and let what is older than the window, or all, become final."""
         plants = list(touched)
         self.step(plants)
-        withdrawn = [plant.withdraw() for plant in plants]
-        self.step(plants)  # what came after a row that is gone
-        ends = [plant.finalise(plant.now + np.inf if all_ else plant.confirmed - self.options.window)
-                for plant in plants]  # fmt: skip
+        withdrawn, window, leap = [plant.withdraw() for plant in plants], self.options.window, self.options.leap
+        ends = [plant.finalise(plant.now + np.inf if all_ else plant.confirmed - window, leap) for plant in plants]
         return [Finalised(plant, final, plant.rows.held[-1], left + slots, events)
                 for plant, (final, left), (events, slots) in zip(plants, ends, withdrawn, strict=True)]  # fmt: skip
 

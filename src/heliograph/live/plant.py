@@ -3,13 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from math import inf
 from typing import NamedTuple, TypeAlias
 
-from heliograph.live.event import Known, Verdict
+from heliograph.live.event import INPUTS, Known, Verdict
+from heliograph.live.leap import ARRIVAL, Leap, Moments, beside
 from heliograph.live.rows import HeldRow, Key, Rows
-
-Position: TypeAlias = tuple[int, int, float, int, float]  # of a node's running count: first, newest, at, lost, latest
-
 
 GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
 
@@ -65,9 +64,9 @@ class Link:
             self.first, self.newest, self.at = sequence, sequence, time
         # A gap above the newest count: its messages are lost, until they arrive.
         elif sequence > self.newest:
-            if time >= self.at:
+            if time >= self.at or sequence - 1 == self.newest:  # the next in any case, if its clock was set back
                 self.lost += sequence - self.newest - 1
-                self.newest, self.at = sequence, time
+                self.newest, self.at = sequence, max(time, self.at)
         elif verdict != "used":
             return  # it may have been counted when it first came
         elif sequence < self.first:
@@ -85,27 +84,10 @@ class Link:
             return self.newest + ahead if ahead <= GAP else sequence
         return self.newest - behind if behind <= min(GAP, self.newest) else sequence
 
-    @property
-    def position(self) -> Position:
-        """Return where the running count stands."""
-        return self.first, self.newest, self.at, self.lost, self.latest
-
-    def withdraw(self, sequence: int, time: float, before: Position | None) -> None:
-        """Count a message of a wrong clock, which was used, as one from the future; `before`: the position before."""
-        self.used -= self.newest == sequence
-        self.first, self.newest, self.at, self.lost, self.latest = before or Link().position
-        self.count("future", sequence, time)
-
-
-class Leap(NamedTuple):
-    """A leap in time of which one message speaks: its time, the newest arrival before it, and the counts before it.
-
-    Any later message of that time or after it confirms it. One that goes on from before it contradicts it.
-    """
-
-    time: float
-    now: float
-    links: dict[str, Position]
+    def withdraw(self, count: int, before: Moments | None) -> None:
+        """Count messages of a wrong clock, which were used, as ones from the future; `before`: the moments before."""
+        self.at, self.latest = before or (0.0, -1.0)
+        self.used, self.future = max(self.used - count, 0), self.future + count
 
 
 class Withdrawn(NamedTuple):
@@ -118,6 +100,26 @@ class Withdrawn(NamedTuple):
 
 # A row that took an event, with its numbers and events before; None if the row is new.
 Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
+
+
+class Kept(NamedTuple):
+    """The newest row before a leap, and the newest arrival before it."""
+
+    row: HeldRow
+    now: float
+
+
+class Aside(NamedTuple):
+    """Rows that a leap took with it: what was held and kept before, after how many changes, and what goes.
+
+    `rows` are those that go of which no estimate is final.
+    """
+
+    held: list[HeldRow]
+    kept: Kept | None
+    changes: int
+    gone: list[HeldRow]
+    rows: list[HeldRow]
 
 
 @dataclass
@@ -134,9 +136,10 @@ class Plant:
         forced: number of rows that became final early, for lack of room.
         links: counts of the messages, by node.
         changes: changes since the last finalisation, for `undo`.
-        leap: a leap in time that no second message has confirmed; None if there is none.
+        leap: a leap in time that no other clock has confirmed; None if there is none.
         silence: row of the newest step at which nothing came, which is no row of the history; None if there is none.
-        contradicted: times of leaps that were contradicted, whose rows go at the next finalisation.
+        kept: row before a leap, after which all rows held are; None where that is among them, or there is no leap.
+        aside: what was taken back since the last finalisation, for `undo`.
     """
 
     name: str
@@ -150,66 +153,107 @@ class Plant:
     changes: list[Change] = field(default_factory=list)
     leap: Leap | None = None
     silence: HeldRow | None = None
-    contradicted: list[float] = field(default_factory=list)
+    kept: Kept | None = None
+    aside: list[Aside] = field(default_factory=list)
 
     @property
     def confirmed(self) -> float:
-        """Return the newest arrival of which more than one message, or another clock, speaks."""
-        return self.now if self.leap is None else self.leap.now
+        """Return the newest arrival of which another clock speaks too, or which is believed."""
+        return self.now if self.leap is None or self.leap.believed else self.leap.now
 
     @property
     def clock(self) -> tuple[float, Leap | None]:
-        """Return the newest arrival, and a leap to it that nothing has confirmed."""
+        """Return the newest arrival, and a leap to it that no other clock confirms."""
         return self.now, self.leap
 
     @clock.setter
     def clock(self, clock: tuple[float, Leap | None]) -> None:
-        """Set the newest arrival and the leap to what they were; nothing is contradicted."""
+        """Set the newest arrival and the leap to what they were."""
         self.now, self.leap = clock
-        self.contradicted = []
 
-    def pass_time(self, time: float, now: float, most: float, sure: bool, names: Sequence[str]) -> None:
-        """Let time pass to `now` by an event at `time`; more than `most` at once is a leap, unless it is sure.
+    def judge_clock(self, clock: str, time: float, most: float, sure: bool, names: Sequence[str]) -> None:
+        """Take back a leap that is contradicted by what a clock says.
 
         Args:
-            time: time of the event.
-            now: its arrival.
-            most: longest gap that needs no second message.
+            clock: name of the node that says so, or `ARRIVAL`.
+            time: what it says.
+            most: longest gap that is no leap.
             sure: whether another clock says the same.
             names: names of the nodes in their order, then that of the inputs.
         """
-        leap, before = self.leap, self.confirmed
-        if leap is not None and not sure and (time == leap.time or time <= before):
-            return  # of the same message, or of the same moment; or late, which says nothing of now
-        if leap is not None and now < leap.time - most:
-            self.contradict(names)
-        elif leap is not None:
-            before = self.now
-        positions = {node: link.position for node, link in self.links.items()}
-        self.leap = Leap(time, before, positions) if now > before + most and not sure else None
-        self.now = max(before, now)
+        found = beside(self.leap, self.now, time, most)
+        if self.leap is None or found is None:
+            return
+        leap, newest = found
+        if sure or leap.taken_back_by(clock, time, newest):
+            self.take_back(leap, most, names)
+        elif clock == leap.clock:
+            self.leap = self.leap.with_back(leap, time)
 
-    def contradict(self, names: Sequence[str]) -> None:
-        """Take back a leap: its rows go with the next finalisation, and counts and time are what they were."""
-        assert self.leap is not None
-        for row in self.rows.held[1:]:
-            for node, sequence, time in row.events if row.key[0] == self.leap.time else ():
-                self.link(names[node]).withdraw(sequence, time, self.leap.links.get(names[node]))
-        self.contradicted.append(self.leap.time)
-        self.now, self.leap = self.leap.now, None
+    def pass_time(self, clock: str, time: float, now: float, most: float, sure: bool) -> None:
+        """Let time pass to `now` by an event that was used; more than `most` at once is a leap, unless it is sure.
+
+        Args:
+            clock: name of the node whose event it is, or `ARRIVAL` if its arrival was given.
+            time: what that clock says.
+            now: its arrival.
+            most: longest gap that needs no other clock.
+            sure: whether another clock says the same.
+        """
+        leap, before = self.leap, self.now
+        if leap is not None and not sure:
+            if time < leap.time - most or (time == leap.time and clock == leap.clock):
+                return  # from before it, which says nothing of now; or of the same message
+            leap = self._confirmed_by(clock, leap, time, most)
+        elif sure:
+            leap = None
+        if now > before + most and not sure and (leap is None or leap.believed):
+            moments = {node: (link.at, link.latest) for node, link in self.links.items()}
+            leap = Leap(time, time, before, moments, clock, earlier=leap)
+        self.now, self.leap = max(before, now), leap
+
+    def _confirmed_by(self, clock: str, leap: Leap, time: float, most: float) -> Leap | None:
+        """Return what is left of a leap after an event on its farther side."""
+        if clock != leap.clock:
+            return None
+        if leap.is_over(self.now):
+            return leap.earlier
+        others = (link.latest for node, link in self.links.items() if node not in (clock, INPUTS))
+        if clock != ARRIVAL and any(latest >= max(leap.now - most, 0.0) for latest in others):
+            return leap  # which another node is there to confirm
+        return leap.as_believed()
+
+    def take_back(self, leap: Leap, most: float, names: Sequence[str]) -> bool:
+        """Go back to before a leap: its rows go with the next finalisation, and time is what it was.
+
+        Returns False, and changes nothing, if the row before it is not known any more.
+        """
+        held, cut = self.rows.held, self.rows.first_from(leap.time - most)
+        if cut == 0 and self.kept is None:
+            return False
+        rows = held[max(cut, 1) :]
+        counts: dict[str, int] = {}
+        for row in rows:
+            for node, _, _ in row.events:
+                counts[names[node]] = counts.get(names[node], 0) + 1
+        for name, count in counts.items():
+            self.link(name).withdraw(count, leap.moments.get(name))
+        self.aside.append(Aside(held, self.kept, len(self.changes), held[cut:], rows))
+        self.rows.hold([self.kept.row] if cut == 0 and self.kept is not None else held[:cut])
+        self.kept = self.kept if cut else None
+        self.dirty = None if self.dirty is None or self.dirty >= len(self.rows.held) else self.dirty
+        self.now, self.leap = leap.now, leap.earlier
+        return True
+
+    def holds(self, leap: Leap, time: float, most: float) -> bool:
+        """Return whether a row from before a leap is held after which a time comes."""
+        return self.rows.first_from(leap.time - most) > 0 and time > self.rows.keys[0][0]
 
     def withdraw(self) -> tuple[list[Withdrawn], list[int]]:
-        """Remove the rows of contradicted leaps; return their events, and their slots."""
-        if not self.contradicted:
-            return [], []
-        rows = [row for row in self.rows.held[1:] if row.key[0] in self.contradicted]
-        self.contradicted = []
-        for row in rows:
-            index = self.rows.index(row.key)
-            self.rows.remove(index)
-            if index < len(self.rows.held):
-                self.dirty = index if self.dirty is None else min(self.dirty, index)
-        return [Withdrawn(*name) for row in rows for name in row.events], [row.slot for row in rows]
+        """Return the events of leaps that were taken back since the last call, and the slots of their rows."""
+        aside, self.aside = self.aside, []
+        events = [Withdrawn(*name) for one in aside for row in one.rows for name in row.events]
+        return events, [row.slot for one in aside for row in one.gone]
 
     def take(
         self, event: Known, key: Key, slot: Callable[[], int], width: int, numbered: tuple[str, int] | None
@@ -239,16 +283,27 @@ class Plant:
 
     def undo(self) -> list[int]:
         """Undo the recorded changes; return the slots that are free again. Rows that had been stepped become dirty."""
+        slots, keys = list[int](), [row.key for row, _ in self.changes]
+        for one in reversed(self.aside):
+            slots += self._undo_since(one.changes)
+            self.rows.hold(one.held)
+            self.kept = one.kept
+        slots += self._undo_since(0)
+        self.aside = []
+        index = max(min(map(self.rows.index, keys), default=len(self.rows.held)), 1)
+        self.dirty = index if index < len(self.rows.held) else None
+        return slots
+
+    def _undo_since(self, count: int) -> list[int]:
+        """Undo the changes but for the first ones; return the slots that are free again."""
         slots = []
-        for row, before in reversed(self.changes):
+        for row, before in reversed(self.changes[count:]):
             if before is None:
                 self.rows.remove(self.rows.index(row.key))
                 slots.append(row.slot)
             else:
                 row.numbers, row.events = before
-        index = min((self.rows.index(row.key) for row, _ in self.changes), default=len(self.rows.held))
-        self.dirty = index if index < len(self.rows.held) else None
-        self.changes = []
+        del self.changes[count:]
         return slots
 
     def link(self, node: str) -> Link:
@@ -264,12 +319,32 @@ class Plant:
         self.dirty = None
         return chain
 
-    def finalise(self, watermark: float) -> tuple[list[HeldRow], list[int]]:
-        """Make rows up to the watermark final; return them and the slots that are no longer needed."""
+    def finalise(self, watermark: float, most: float) -> tuple[list[HeldRow], list[int]]:
+        """Make rows up to the watermark final; return them and the slots that are no longer needed.
+
+        `most`: longest gap that is no leap; of the rows before a leap the newest is kept.
+        """
         self.changes = []
         base, forced = self.rows.finalise(watermark)
-        if not base:
-            return [], []
-        self.forced += forced
-        final, left = self.rows.drop(base)
+        self.forced += forced if base else 0
+        final, left = self.rows.drop(base) if base else ([], [])
+        # Of leaps that are not confirmed the oldest one, but for that with which the plant began.
+        leap = next((one for one in reversed([*self.leap.chain()] if self.leap else []) if one.now > -inf), None)
+        if self.kept is not None and (leap is None or leap.now != self.kept.now):
+            left, self.kept = [*left, self.kept.row], None
+        if leap is not None and self.kept is None and left:
+            before = [row for row in left if row.key[0] < leap.time - most]
+            if before and self.rows.held[0].key[0] >= leap.time - most:
+                self.kept = Kept(before[-1], leap.now)
+                left = [row for row in left if row is not before[-1]]
         return final, [row.slot for row in left]
+
+    @property
+    def slots(self) -> list[int]:
+        """Return all slots of the plant."""
+        rows = [
+            *self.rows.held,
+            *([] if self.kept is None else [self.kept.row]),
+            *(r for a in self.aside for r in a.gone),
+        ]
+        return [row.slot for row in rows]

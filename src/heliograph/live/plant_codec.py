@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import Leap, Link, Plant
+from heliograph.live.leap import Leap
+from heliograph.live.plant import Kept, Link, Plant
 from heliograph.live.rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
 TYPES = ("<i8", "<i8", "<f8", "<f8", "<f8")  # of the parts after the head
+BEFORE_LEAP = "before a leap"  # in the head: the arrival before a leap if the first row is the one kept from before it
 KEPT = "kept"  # in the head: how many numbers of the table are there, behind a bit for each; all, where it is absent
 
 
@@ -59,12 +61,19 @@ class PlantParts(NamedTuple):
 
 def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
     """Serialise a plant that has no pending changes."""
-    rows = plant.rows.held
+    rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
     origin = None if plant.origin is None else plant.origin.isoformat()
     links = {node: list(vars(link).values()) for node, link in plant.links.items()}
     names = [(i, *name) for i, row in enumerate(rows) for name in row.events]
     return _joined(
-        {"now": plant.now, "forced": plant.forced, "origin": origin, "links": links, "leap": plant.leap},
+        {
+            "now": plant.now,
+            "forced": plant.forced,
+            "origin": origin,
+            "links": links,
+            "leap": None if plant.leap is None else _leap_parts(plant.leap),
+            BEFORE_LEAP: None if plant.kept is None else plant.kept.now,
+        },
         [number for row in rows for number in row.key[1:]],
         [number for i, node, sequence, _ in names for number in (i, node, sequence)],
         fleet.pool.table[[row.slot for row in rows]].ravel(),
@@ -106,12 +115,28 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
         end = begin + fleet.size(node)
         rows[i].events[node, sequence, time] = values[begin:end].tolist()
         begin = end
+    before = head.get(BEFORE_LEAP)
+    kept = None if before is None else Kept(rows.pop(0), before)
     held = fleet.rows(rows[0])
     held.hold(rows)
     links = {node: Link(*numbers) for node, numbers in head["links"].items()}
     origin = head["origin"] and datetime.fromisoformat(head["origin"])
-    leap = None if head["leap"] is None else Leap(*head["leap"])
-    return Plant(name, held, head["now"], origin, forced=head["forced"], links=links, leap=leap)
+    leap = None if head["leap"] is None else _leap(head["leap"])
+    return Plant(name, held, head["now"], origin, forced=head["forced"], links=links, leap=leap, kept=kept)
+
+
+def _leap_parts(leap: Leap) -> dict[str, Any]:
+    """Return a leap as a table of its parts."""
+    return leap._asdict() | {"earlier": None if leap.earlier is None else _leap_parts(leap.earlier)}
+
+
+def _leap(parts: Any) -> Leap:
+    """Read a leap; until version 0.3.0 it was a list: its time, the arrival before it, five numbers of each node."""
+    if isinstance(parts, list):
+        time, now, links = parts
+        return Leap(time, time, now, {node: (numbers[2], numbers[4]) for node, numbers in links.items()})
+    moments = {node: (at, latest) for node, (at, latest) in parts["moments"].items()}
+    return Leap(**parts | {"moments": moments, "earlier": parts["earlier"] and _leap(parts["earlier"])})
 
 
 def _row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:

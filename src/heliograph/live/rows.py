@@ -55,6 +55,10 @@ class Rows:
         """Return the index of the first row after a time."""
         return bisect_left(self.keys, (time, inf))
 
+    def first_from(self, time: float) -> int:
+        """Return the index of the first row from a time on."""
+        return bisect_left(self.keys, (time,))
+
     def verdict(self, event: Known, key: Key, watermark: float, ahead: float) -> Verdict:
         """Judge an event of the row with this key, for this watermark."""
         if event.time > event.arrival + ahead:

@@ -158,7 +158,7 @@ class Timeline:
         """
         event, dropped, beyond = self._fleet.within(node, self._known(node, sequence, time, values, arrival))
         plant, before = self._plant, self._plant.clock
-        verdict = self._fleet.take(plant, event, None if arrival is None else event.arrival)
+        verdict = self._fleet.take(plant, event, arrival is not None)
         if verdict == "used":
             nothing = dropped and np.isnan(event.values).all()
             why = beyond if nothing else self._refuses(event, plant.changes[-1][0])

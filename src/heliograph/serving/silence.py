@@ -48,7 +48,8 @@ class Silence:
         for plant in plants:
             if plant.origin is not None and plant.name not in self._resumed:
                 passed = min((now - plant.origin) // timedelta(seconds=step), self.fleet.end_step)
-                leaps = plant.leap is not None and plant.leap.now > -inf  # which the clock confirms or contradicts
+                leap = plant.leap  # which the clock confirms or contradicts
+                leaps = leap is not None and leap.now > -inf and not leap.believed
                 if passed > plant.confirmed and (leaps or passed > plant.rows.held[-1].key[0]):
                     due.append((plant, float(passed)))
         return due

@@ -11,7 +11,8 @@ import numpy as np
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.judging import Candidate, Judges
-from heliograph.live.plant import Leap, Link, Plant, Withdrawn
+from heliograph.live.leap import ARRIVAL, Leap, beginning, beside
+from heliograph.live.plant import Link, Plant, Withdrawn
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, seconds
 
@@ -98,12 +99,11 @@ class Using:
             at = self._number(at, origin, message.plant)
         now = at if plant is None else plant.confirmed
         arrival = max(now, at) if message.arrival is None else self._number(message.arrival, origin, message.plant)
-        clock = None if message.arrival is None else arrival
-        if clock is None and origin is not None:
-            clock = self._number(wall, origin, message.plant)
+        clock = None if origin is None else self._number(wall, origin, message.plant)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
-        given = message.inputs
-        inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
+        inputs = None
+        if message.inputs is not None:
+            inputs = self.fleet.known(INPUTS, message.sequence, at, message.inputs, arrival)
         # Values beyond limits do not count as received; an event of such values only is implausible.
         event, dropped, beyond = self.fleet.within(message.node, event)
         refused, why, spoilt = self._refused, beyond if beyond and np.isnan(event.values).all() else "", None
@@ -114,15 +114,20 @@ class Using:
             return None, "future", "", ()
         if plant is None and why and (inputs is None or spoilt):
             return None, "implausible", why, ()
-        plant = self._remembered(plant or self._begun(message.plant, at, origin), at)
+        given = message.arrival is not None
+        if plant is None:
+            plant = self._begun(
+                message.plant, at, origin, beginning(*((arrival, ARRIVAL) if given else (at, message.node)))
+            )
+        plant = self._remembered(plant, at)
         # Inputs and measurement are used or refused independently.
         notes: list[str] = []
         if inputs is not None and spoilt is None:
-            self._take(number, plant, inputs, clock)
+            self._take(number, plant, inputs, given, clock, message.node)
         elif spoilt is not None:
             plant.link(INPUTS).implausible += 1
-            notes.append(f"inputs {given}: {spoilt}; the rest is used")
-        verdict: Verdict = "implausible" if why else self._take(number, plant, event, clock)
+            notes.append(f"inputs {message.inputs}: {spoilt}; the rest is used")
+        verdict: Verdict = "implausible" if why else self._take(number, plant, event, given, clock, message.node)
         link = plant.link(message.node)
         link.count(verdict, message.sequence, at, self.fleet.periods.get(message.node, 0))
         if dropped and verdict in ("used", "implausible"):
@@ -149,25 +154,29 @@ class Using:
     def _going_on(self, message: AnyMessage, wall: datetime) -> Plant | None:
         """Return the plant of a message; None if it has to begin, or to begin anew since its first clock was wrong.
 
-        That is so where the only moment it has had is contradicted by an earlier one, and where it is in the future of
-        the clock on the wall, with which the message agrees.
+        That is so where the message goes on from before the leap with which the plant began, and where that is in the
+        future of the clock on the wall, with which the message agrees.
         """
         plant, leap = self.plants.get(message.plant), self.fleet.options.leap
         if plant is None or isinstance(message.time, datetime) != (plant.origin is not None):
             return plant
         at = self._number(message.time, plant.origin, plant.name)
-        if plant.leap is not None and plant.leap.now == -inf and at < plant.now - leap:
+        said = self._number(message.arrival, plant.origin, plant.name) if message.arrival is not None else at
+        first, newest = beside(plant.leap, plant.now, said, leap) or (None, at)
+        begins = first is not None and first.now == -inf and not plant.holds(first, at, leap)
+        clock = message.node if message.arrival is None else ARRIVAL
+        if first is not None and begins and first.taken_back_by(clock, said, newest):
             return None
         if plant.origin is not None:
-            clock = self._number(wall, plant.origin, plant.name)
-            if plant.confirmed > clock + leap and abs(at - clock) <= leap:
+            now = self._number(wall, plant.origin, plant.name)
+            if plant.confirmed > now + leap and abs(at - now) <= leap:
                 return None
         return plant
 
-    def _begun(self, name: str, at: float, origin: datetime | None) -> Plant:
+    def _begun(self, name: str, at: float, origin: datetime | None, leap: Leap) -> Plant:
         """Begin a plant, whose first moment is not sure yet; one that begins anew is withdrawn."""
         plant, old = self.fleet.begin(name, at, origin), self.plants.pop(name, None)
-        plant.now, plant.leap, plant.version = at, Leap(at, -inf, {}), self._anew.get(name, 0)
+        plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
         if old is not None:
             plant.version = self._anew[name] = old.version
             events = [Withdrawn(*event) for row in old.rows.held for event in row.events]
@@ -179,8 +188,8 @@ class Using:
             self.fleet.end(old)
         return plant
 
-    def _take(self, number: int, plant: Plant, event: Known, clock: float | None) -> Verdict:
-        verdict = self.fleet.take(plant, event, clock)
+    def _take(self, number: int, plant: Plant, event: Known, given: bool, wall: float | None, clock: str) -> Verdict:
+        verdict = self.fleet.take(plant, event, given, wall, clock)
         if verdict == "used":
             self._taken.append((number, plant, event, plant.changes[-1][0]))
         return verdict

@@ -1,0 +1,95 @@
+"""Leaps in time: of which clock they are, and what confirms them or takes them back."""
+
+from collections.abc import Iterator
+from math import inf
+from typing import NamedTuple, TypeAlias
+
+Moments: TypeAlias = tuple[float, float]  # of a node: time of its greatest count, and of its newest measurement
+ARRIVAL = ""  # the clock by which arrivals are dated, which is no node's
+
+
+class Leap(NamedTuple):
+    """A leap in time of which one clock speaks.
+
+    Another clock confirms it: that of another node, the one on the wall, or that of an arrival where it agrees with the
+    node's. A second message by the same clock makes it believed where no other node was heard shortly before: there is
+    nothing else that could confirm it. In the end it is confirmed by the plant having gone on after it for as long as
+    it leapt, so that whoever goes back is late for no longer than that.
+
+    What goes on from before it takes it back: one message as long as it is not believed, or if it is another node's;
+    else two in a row.
+
+    Attributes:
+        time: the first moment after it.
+        since: the first moment after the newest of several, one after the other, that are taken as one.
+        now: the newest arrival before it; -inf where the plant began with it.
+        moments: those of each node before it.
+        clock: name of the node whose message it was, or `ARRIVAL`.
+        believed: whether rows become final by it although no other clock confirms it.
+        back: time of a message that goes on from before it, where nothing that came since goes on after it; else None.
+        earlier: the believed leap after which it came.
+    """
+
+    time: float
+    since: float
+    now: float
+    moments: dict[str, Moments]
+    clock: str = ARRIVAL
+    believed: bool = False
+    back: float | None = None
+    earlier: "Leap | None" = None
+
+    def chain(self) -> Iterator["Leap"]:
+        """Yield this leap, and those before it that are believed."""
+        leap: Leap | None = self
+        while leap is not None:
+            yield leap
+            leap = leap.earlier
+
+    def is_over(self, now: float) -> bool:
+        """Return whether the plant has gone on after it for as long as it leapt."""
+        return now - self.since >= self.since - self.now
+
+    def as_believed(self) -> "Leap":
+        """Return this leap where it is believed; with an earlier one that is not the plant's beginning it is one."""
+        if self.earlier is None or self.earlier.now == -inf:
+            return self._replace(believed=True, back=None)
+        return self.earlier._replace(since=self.since, back=None)
+
+    def with_back(self, of: "Leap", back: float | None) -> "Leap":
+        """Return this leap with `back` noted in the leap `of` of its chain."""
+        if self is of:
+            return self._replace(back=back)
+        return self._replace(earlier=self.earlier and self.earlier.with_back(of, back))
+
+    def taken_back_by(self, clock: str, time: float, now: float) -> bool:
+        """Return whether what `clock` says of `time`, between the two sides of the leap, takes it back.
+
+        `now`: the newest arrival after it.
+        """
+        if not self.believed:
+            return True
+        if now - self.since >= self.since - time:
+            return False  # it is late for no longer than the plant has gone on
+        return clock != self.clock or (self.back is not None and self.back < time < self.back + self.time - time)
+
+
+def beside(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
+    """Return the leap of a chain before which a time goes on, and the newest arrival after it; None if there is none.
+
+    Args:
+        leap: the newest of the chain, None if there is none.
+        now: the newest arrival.
+        time: the time.
+        most: the longest gap that is no leap.
+    """
+    for one in leap.chain() if leap else ():
+        if one.now < time < one.time - most:
+            return one, now
+        now = one.now
+    return None
+
+
+def beginning(time: float, clock: str) -> Leap:
+    """Return the leap with which a plant begins."""
+    return Leap(time, time, -inf, {}, clock)
