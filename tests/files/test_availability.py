@@ -9,6 +9,8 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.files.sources import Sources
 from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.storage.store import Store
+from heliograph.serving.words import KeepingWords
 
 json_field, Available = hg.files.json_field, hg.files.Available
 NETWORK = """
@@ -140,6 +142,40 @@ def test_a_service_hears_the_words(network):
     assert came(*value) == []
     assert translator.line(b"zigbee2mqtt/garden/availability online") == [] and len(came(*value)) == 1
     assert translator.left_out() == ["messages left out, of devices offline: zigbee2mqtt/garden (2)"]
+
+
+def test_a_word_is_kept_over_a_restart(network, tmp_path):
+    """Nothing but a change of it is written; a later word takes its place, also for conditions with other words."""
+
+    class Silent:
+        def take(self, payloads):
+            return []
+
+    here = [Available("zigbee2mqtt/+/availability"), Available("zigbee2mqtt/+/availability", "offline", "online")]
+    here.append(Available("heater/status"))
+
+    def begun():
+        translator = Translator(table(here[0]) | {"other/+": table(here[1:])["zigbee2mqtt/+"]}, network)
+        return translator, KeepingWords(Silent(), translator.sources.words, store)
+
+    identity = {"states": "temperature", "description": "{}"}
+    value = b'{"temperature": 1}'
+    for said, left_out in ((b"offline", True), (b"online", False)):
+        store = Store(str(tmp_path / "words.db"), identity)
+        translator, service = begun()
+        translator.read("zigbee2mqtt/garden/availability", said, NOW, True)
+        service.take([])
+        writes = []
+        store.keep_words = writes.append
+        translator.read("zigbee2mqtt/garden/availability", said, NOW, True)
+        service.take([])
+        assert not writes
+        store.close()
+        store = Store(str(tmp_path / "words.db"), identity)
+        translator, _ = begun()
+        assert (translator.read("zigbee2mqtt/garden", value, NOW) == []) == left_out
+        assert (translator.read("other/garden", value, NOW) == []) != left_out
+        store.close()
 
 
 @pytest.mark.parametrize("form", ["-v", "-F %j", "csv"])

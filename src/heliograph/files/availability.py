@@ -1,6 +1,6 @@
 """Availability of devices: the last word, online or offline, that came on a topic beside that of their values."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from typing_extensions import TypeAliasType
@@ -83,7 +83,7 @@ class LastWords:
         for condition in dict.fromkeys(conditions):
             self._by_pattern.setdefault(condition.topic, []).append(condition)
         self._offline = set[tuple[Available, str]]()
-        self._heard = set[Available]()
+        self._heard, self._changed = set[Available](), set[str]()
 
     @property
     def topics(self) -> list[str]:
@@ -114,12 +114,30 @@ class LastWords:
         conditions = self.about(topic)
         if not conditions:
             return False
-        said = _said(payload, where)
+        said, before = _said(payload, where), self._number(topic)
         for condition in conditions:
             offline = said != "" and condition.says_offline(said, where)
             self._heard.add(condition)
             (self._offline.add if offline else self._offline.discard)((condition, topic))
+        if self._number(topic) != before:
+            self._changed.add(topic)
         return True
+
+    def changed(self) -> dict[str, int]:
+        """Return the topics on which a word has changed since the last call, each with a number that says it."""
+        changed, self._changed = self._changed, set()
+        return {topic: self._number(topic) for topic in changed}
+
+    def restore(self, words: Mapping[str, int]) -> None:
+        """Take words that were kept, as `changed` gives them."""
+        for topic, number in words.items():
+            for i, condition in enumerate(self.about(topic)):
+                self._heard.add(condition)
+                (self._offline.add if number >> i & 1 else self._offline.discard)((condition, topic))
+
+    def _number(self, topic: str) -> int:
+        """Return the word of a topic as a number, a bit for each condition that it is about: 1 if it is offline."""
+        return sum(1 << i for i, condition in enumerate(self.about(topic)) if (condition, topic) in self._offline)
 
     def offline(self, condition: Available, topic: str) -> bool:
         """Return whether the device of a topic of values has said that it is offline."""

@@ -83,7 +83,7 @@ class Sources:
         self._table = {topic: self._checked(topic, items) for topic, items in table.items()}
         self._known: dict[str, list[Mapped]] = {}
         mapped = [single for several in self._table.values() for single in several]
-        self._words = LastWords(condition for single in mapped for condition in single.source.available)
+        self.words = LastWords(condition for single in mapped for condition in single.source.available)
         steps = {single.source.step for single in mapped}
         if len(steps) > 1:
             raise fail("sources, step", "the same of all", sorted(map(str, steps)))
@@ -97,7 +97,7 @@ class Sources:
     @property
     def subscribed(self) -> list[str]:
         """Return the topics of the table, and those on which devices say whether they are online."""
-        return list(dict.fromkeys([*self._table, *self._words.topics]))
+        return list(dict.fromkeys([*self._table, *self.words.topics]))
 
     @property
     def notes(self) -> list[str]:
@@ -107,7 +107,7 @@ class Sources:
             if counts:
                 named = ", ".join(f"{topic} ({number})" for topic, number in counts.most_common(LISTED))
                 lines.append(f"messages {why}: {named}{_more(len(counts))}")
-        if silent := self._words.unheard:
+        if silent := self.words.unheard:
             lines.append(f"no word of online or offline came: {', '.join(silent[:LISTED])}{_more(len(silent))}")
         return lines
 
@@ -147,7 +147,7 @@ class Sources:
         Raises:
             ValueError: a word that is neither online nor offline; one line.
         """
-        return self._words.hear(topic, payload, where)
+        return self.words.hear(topic, payload, where)
 
     def read(self, topic: str, message: object, where: str) -> list[Reading]:
         """Read the message of a topic, one reading for each source; none, and counted, if the topic is unknown.
@@ -196,7 +196,7 @@ class Sources:
             if at(message, field, where) not in allowed:
                 self.excluded[topic] += 1
                 return None
-        if any(self._words.offline(condition, topic) for condition in source.available):
+        if any(self.words.offline(condition, topic) for condition in source.available):
             self.offline[topic] += 1
             return None
         # Node, plant and count name a measurement.

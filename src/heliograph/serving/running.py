@@ -24,6 +24,7 @@ from heliograph.serving.loop import Takes, serve_until, signals
 from heliograph.serving.patience import Patient, patiently
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import AwayError, Damage, InMemoryStore, StoreProtocol, identity
+from heliograph.serving.words import KeepingWords
 from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
 
@@ -307,7 +308,8 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
             broker = settings.broker
             transport = Pipe(translator=reads) if broker is None else connected(broker, translator=reads)
             patience = None if step is None else max(step, SHORTEST)
-            await serve_until(stop, Patient(look(service), stop), transport, patience)
+            looked = look(service) if reads is None else KeepingWords(look(service), reads.sources.words, store)
+            await serve_until(stop, Patient(looked, stop), transport, patience)
         finally:
             store.close()
     # What was not used, in words.

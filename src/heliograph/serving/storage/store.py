@@ -5,23 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from shlex import quote
 from typing import Any
-from zlib import crc32
 
-from sqlalchemy import (
-    BigInteger,
-    Column,
-    Connection,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    Text,
-    delete,
-    func,
-    inspect,
-    select,
-    update,
-)
+from sqlalchemy import Column, Connection, Table, delete, func, inspect, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -31,46 +16,23 @@ from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
 from heliograph.serving.storage.database import engine_at, is_away
 from heliograph.serving.storage.store_protocol import AwayError, ConflictError, Damage, Entry, StoredPlant
-
-# Of these tables: those of layout 1 had no checksums, of 2 no description of the network, of 3 covariances in states.
-LAYOUT, CARRIED = "4", ("3", "4")  # that of now, and those whose plants can be carried over
-LAYOUT_KEY = "layout of the store"
-TABLES = MetaData()
-PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
-               Column("body", LargeBinary), Column("checksum", BigInteger))  # fmt: skip
-JOURNAL = Table("journal", TABLES, Column("last", BigInteger, primary_key=True, autoincrement=False),
-                Column("process", String(200)), Column("lines", Text), Column("checksum", BigInteger))  # fmt: skip
-NUMBERS = Table("numbers", TABLES, Column("name", String(220), primary_key=True), Column("value", BigInteger),
-                Column("checksum", BigInteger))  # fmt: skip
-IDENTITY_TABLE = Table("whose", TABLES, Column("name", String(20), primary_key=True), Column("value", Text))
-
-
-def checksum(name: str | int, *values: str | int | bytes) -> int:
-    """Return the CRC-32 of a row's name in the upper 31 of 63 bits, and of the name and all columns in the lower 32."""
-    return (crc32(f"{name}".encode()) >> 1) << 32 | _sum(name, values)
-
-
-def is_whole(written: object, name: object, *values: object) -> bool:
-    """Return whether a row is as it was written; a damaged row may contain anything."""
-    if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
-        return False
-    return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
-
-
-def is_named(written: object, name: object) -> bool:
-    """Return whether the name of a row is as it was written, whatever became of its values."""
-    return isinstance(name, str) and isinstance(written, int) and written >> 32 == crc32(name.encode()) >> 1
-
-
-def _sum(name: str | int, values: Sequence[str | int | bytes]) -> int:
-    checksum = crc32(f"{name}".encode())
-    for value in values:
-        data = value if isinstance(value, bytes) else f"{value}".encode()
-        checksum = crc32(data, crc32(f"\0{len(data)}\0".encode(), checksum))
-    return checksum
-
+from heliograph.serving.storage.tables import (
+    CARRIED,
+    IDENTITY_TABLE,
+    JOURNAL,
+    LAYOUT,
+    LAYOUT_KEY,
+    NUMBERS,
+    PLANTS,
+    TABLES,
+    checksum,
+    is_named,
+    is_whole,
+    with_checksum,
+)
 
 PUBLISHED, NEWEST, MALFORMED = "published to the reader of {}", "journal", "malformed"
+WORD, TOPIC = "last word on ", 200  # longest topic of which a word is kept
 IDENTITY = "identity"
 AT_ONCE = 500  # names in one question
 MEND = "its plants go on in a new store with --store NEW --from-snapshot"
@@ -269,15 +231,15 @@ class Store:
             # Plants with their next version, the batch in the journal, and the counts.
             if plants:
                 after = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
-                self._put(connection, PLANTS, [_row(PLANTS, *row) for row in after])
+                self._put(connection, PLANTS, [with_checksum(PLANTS, *row) for row in after])
             if outputs:
                 lines = b"\n".join([output.body for output in outputs]).decode()
-                connection.execute(JOURNAL.insert(), [_row(JOURNAL, newest, self.process, lines)])
+                connection.execute(JOURNAL.insert(), [with_checksum(JOURNAL, newest, self.process, lines)])
                 connection.execute(delete(JOURNAL).where(JOURNAL.c.last <= newest - self.journal))
             if malformed:
                 self._count(connection, MALFORMED, malformed)
             if published is not None:
-                self._put(connection, NUMBERS, [_row(NUMBERS, PUBLISHED.format(self.process), published)])
+                self._put(connection, NUMBERS, [with_checksum(NUMBERS, PUBLISHED.format(self.process), published)])
         return outputs
 
     def unpublished(self) -> list[Output]:
@@ -312,6 +274,20 @@ class Store:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
         return 0 if row is None else self._counted(*row)
 
+    def words(self) -> dict[str, int]:
+        """Return the last words of devices that are kept, as numbers by topic."""
+        mine = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
+        with self._saying("a database that can be read"), self._engine.connect() as connection:
+            rows = connection.execute(mine).all()
+        return {name.removeprefix(WORD): self._counted(name, value, written) for name, value, written in rows}
+
+    def keep_words(self, words: Mapping[str, int]) -> None:
+        """Keep the last words of devices, by topic; a topic that is longer than a name may be is left out."""
+        rows = [with_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
+        if rows:
+            with self._saying("a database that can be written"), self._engine.begin() as connection:
+                self._put(connection, NUMBERS, rows)
+
     def _counted(self, name: str, value: int, written: int) -> int:
         if not is_whole(written, name, value):
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
@@ -326,7 +302,7 @@ class Store:
             for i in range(0, len(names), AT_ONCE):
                 rows = {row[0]: row[1:3] for row in _of(connection, list(PLANTS.c), names[i : i + AT_ONCE])}
                 bodies = carrier.carried({name: body for name, (_, body) in rows.items()})
-                after = [_row(PLANTS, name, rows[name][0] + 1, body) for name, body in bodies.items()]
+                after = [with_checksum(PLANTS, name, rows[name][0] + 1, body) for name, body in bodies.items()]
                 self._put(connection, PLANTS, after)
             this = IDENTITY_TABLE.c.name == IDENTITY
             connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
@@ -362,7 +338,7 @@ class Store:
 
     def _count(self, connection: Connection, name: str, more: int) -> int:
         """Add to a stored count, which locks it until the commit; return the new value."""
-        new = self._insert(NUMBERS).values(_row(NUMBERS, name, more))
+        new = self._insert(NUMBERS).values(with_checksum(NUMBERS, name, more))
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
         if written != checksum(name, value):  # it was there, with the checksum of what it was
@@ -384,12 +360,6 @@ def _of(connection: Connection, columns: Sequence[Column[object]], names: list[s
     for i in range(0, len(names), AT_ONCE):
         results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
     return results
-
-
-def _row(table: Table, *values: Any) -> dict[str, object]:
-    """Add the checksum to a row."""
-    columns = [column.name for column in table.c]
-    return dict(zip(columns, (*values, checksum(*values)), strict=True))
 
 
 def _output(line: str) -> Output:

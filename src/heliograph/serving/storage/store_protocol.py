@@ -82,6 +82,12 @@ class StoreProtocol(Protocol):
     def names(self) -> list[str]:
         """Return the names of all stored plants."""
 
+    def words(self) -> dict[str, int]:
+        """Return the last words of devices that are kept, as numbers by topic."""
+
+    def keep_words(self, words: Mapping[str, int]) -> None:
+        """Keep the last words of devices, as numbers by topic."""
+
     def close(self) -> None:
         """Release the resources of the store."""
 
@@ -129,6 +135,13 @@ class InMemoryStore:
     def names(self) -> list[str]:
         """Return no names: no plants are stored."""
         return []
+
+    def words(self) -> dict[str, int]:
+        """Return no words: none are kept."""
+        return {}
+
+    def keep_words(self, words: Mapping[str, int]) -> None:
+        """Keep nothing."""
 
     def close(self) -> None:
         """Do nothing: the store holds no resources."""

@@ -1,0 +1,48 @@
+"""Last words of devices, online or offline, kept in the store with the state of the plants."""
+
+from collections.abc import Sequence
+
+from heliograph.files.availability import LastWords
+from heliograph.serving.loop import Takes
+from heliograph.serving.message import Payload
+from heliograph.serving.output import Output
+from heliograph.serving.storage.store_protocol import StoreProtocol
+
+
+class KeepingWords:
+    """A service that keeps the last words of devices: a device that was offline is so after a restart.
+
+    Args:
+        service: the service.
+        words: the words, which begin with those that are kept.
+        store: where they are kept.
+    """
+
+    def __init__(self, service: Takes, words: LastWords, store: StoreProtocol):
+        self._service, self._words, self._store = service, words, store
+        self._unkept = dict[str, int]()
+        words.restore(store.words())
+
+    def unpublished(self) -> list[Output]:
+        """Return outputs that were committed before a restart and may not have been published."""
+        return self._service.unpublished()
+
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
+        """Use messages and commit, and the words that came before them; return the outputs to publish."""
+        self._keep()
+        return self._service.take(payloads)
+
+    def published(self, outputs: Sequence[Output]) -> None:
+        """Note that these outputs were published; the next commit records it."""
+        self._service.published(outputs)
+
+    def finish(self, ended: bool) -> list[Output]:
+        """Commit everything; return the last outputs."""
+        self._keep()
+        return self._service.finish(ended)
+
+    def _keep(self) -> None:
+        self._unkept |= self._words.changed()  # until the store has them: it may be away
+        if self._unkept:
+            self._store.keep_words(self._unkept)
+            self._unkept = {}
