@@ -1,6 +1,6 @@
 """Interface of every filter: deterministic predictions and corrections of an explicit state, with sizes and a claim."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, NoReturn, ParamSpec, Protocol, TypedDict, TypeVar, cast
 
@@ -179,6 +179,10 @@ class AbstractFilter(Module):
 
     def with_past(self, steps: SmootherStep) -> "AbstractFilter":
         """Return a planned filter that can be smoothed, given the smoother `steps` of the original filter over time."""
+        return self
+
+    def as_large_as(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":
+        """Return the same filter with arrays of the lengths that the other ones have, so that one program steps all."""
         return self
 
     def angles_used(self) -> FilterAngles | None:

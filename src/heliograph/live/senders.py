@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.model.over_time import first
-from heliograph.model.trigger import AbstractTrigger
+from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import joint_modes
 from heliograph.simulation.node import Node
@@ -72,7 +72,13 @@ def sender_status(trigger: AbstractTrigger, losses: LossChain, last: int | None,
     begun = -1 if last is None else last
     silent, provisional = max(final - begun, 0), max(now - max(final, begun), 0)
     missed = missed_heartbeats(trigger, last, silent, final)
-    return SenderStatus(last, silent, provisional, missed, losses.in_a_row(trigger.heartbeat or 1, missed))
+    return SenderStatus(
+        last,
+        silent,
+        provisional,
+        missed,
+        losses.in_a_row(1 if trigger.heartbeat is None else int(trigger.heartbeat), missed),
+    )
 
 
 def missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
@@ -81,11 +87,10 @@ def missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, f
     Between two heartbeats the sender may have transmitted on an event that was lost too: then the next one is due
     later. So of the silent steps at least every `heartbeat` steps one transmission was.
     """
-    period: int | None = getattr(trigger, "period", None)
-    if period is not None:
-        phase: int = getattr(trigger, "phase", 0)
+    if isinstance(trigger, Periodic):
+        period, phase = int(trigger.period), int(trigger.phase)
         return (final - phase) // period - (final - silent - phase) // period
     first_due = int(last is None and silent > 0 and trigger.needs_reference)
     if trigger.heartbeat is None:
         return first_due
-    return first_due + (silent - first_due) // trigger.heartbeat
+    return first_due + (silent - first_due) // int(trigger.heartbeat)

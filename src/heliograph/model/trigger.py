@@ -21,7 +21,7 @@ from heliograph.numerics.check import (
 )
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.types import Array, ArrayLike, Float, Int
 
 Reference = Literal["sent", "acknowledged", "prediction", "zero"]
 Region = Literal["box", "ball", "each"]
@@ -60,13 +60,13 @@ class AbstractTrigger(Module):
             transmissions lost since the last value (with a value), or whether one was lost now (0 or 1).
         reference: what y is compared with: the value "sent" or "acknowledged" last, a "prediction" of both
             ends, or "zero".
-        heartbeat: most steps between two transmissions; None where there is no such limit.
+        heartbeat: most steps between two transmissions, (); None where there is no such limit.
     """
 
     region: eqx.AbstractVar[Region]
     losses: eqx.AbstractVar[Losses]
     reference: eqx.AbstractVar[Reference]
-    heartbeat: eqx.AbstractVar[int | None]
+    heartbeat: eqx.AbstractVar[Int[Array, ""] | None]
 
     @property
     def needs_reference(self) -> bool:
@@ -170,7 +170,7 @@ class SendOnDelta(AbstractThreshold):
     """
 
     delta: Float[Array, "..."]
-    heartbeat: int | None = eqx.field(static=True)
+    heartbeat: Int[Array, ""] | None
     reference: Reference = eqx.field(static=True)
     region: Region = eqx.field(static=True)
     losses: Losses = eqx.field(static=True)
@@ -184,7 +184,7 @@ class SendOnDelta(AbstractThreshold):
         losses: Losses = "unknown",
     ):
         self.delta, self.region = threshold(delta), one_of("region", region, Region)
-        self.heartbeat = None if heartbeat is None else check_count("heartbeat", heartbeat)
+        self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.reference = one_of("reference", reference, Literal["sent", "acknowledged"])
         self.losses = one_of("losses", losses, Losses)
 
@@ -203,7 +203,7 @@ class SendOnPredictionError(AbstractThreshold):
     """
 
     delta: Float[Array, "..."]
-    heartbeat: int | None = eqx.field(static=True)
+    heartbeat: Int[Array, ""] | None
     region: Region = eqx.field(static=True)
     losses: Losses = eqx.field(static=True)
     reference: Reference = eqx.field(static=True)
@@ -212,7 +212,7 @@ class SendOnPredictionError(AbstractThreshold):
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
         self.delta, self.region = threshold(delta), one_of("region", region, Region)
-        self.heartbeat = None if heartbeat is None else check_count("heartbeat", heartbeat)
+        self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.losses, self.reference = one_of("losses", losses, Losses), "prediction"
 
 
@@ -234,7 +234,7 @@ class StochasticTrigger(AbstractTrigger):
     reference: Reference = eqx.field(static=True)
     losses: Losses = eqx.field(static=True)
     region: Region = eqx.field(static=True)
-    heartbeat: int | None = eqx.field(static=True)
+    heartbeat: None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -278,17 +278,17 @@ class Periodic(AbstractTrigger):
         ValueError: a period that is no whole number from 1, a phase that is none from 0 to period - 1.
     """
 
-    period: int = eqx.field(static=True)
-    phase: int = eqx.field(static=True)
+    period: Int[Array, ""]
+    phase: Int[Array, ""]
     reference: Reference = eqx.field(static=True)
     losses: Losses = eqx.field(static=True)
     region: Region = eqx.field(static=True)
-    heartbeat: int | None = eqx.field(static=True)
+    heartbeat: None = eqx.field(static=True)
 
     def __init__(self, period: int, phase: int = 0):
-        self.period, self.phase = check_count("period", period), check_count("phase", phase, 0)
-        if self.phase >= self.period:
-            raise fail("phase", f"a whole number below the period {self.period}", phase)
+        if check_count("phase", phase, 0) >= check_count("period", period):
+            raise fail("phase", f"a whole number below the period {period}", phase)
+        self.period, self.phase = np.asarray(period), np.asarray(phase)
         self.reference, self.losses, self.region, self.heartbeat = "zero", "unknown", "box", None
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:

@@ -202,7 +202,7 @@ def arrivals_of(network: Network, times: np.ndarray, received: Mapping[str, np.n
         receiver = network.nodes[node]
         declared, may_be_lost, shares = None, not receiver.complete, _stated_shares(receiver)
         if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
-            declared, may_be_lost = receiver.trigger.period, first(receiver.channel).erases
+            declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
         for i, name in enumerate(receiver.received_names):
             there = ~np.isnan(z[:, i])
             stated = None if shares is None or i >= len(shares) else float(shares[i])

@@ -80,6 +80,15 @@ def nodes_standing(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     return results
 
 
+def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
+    """Return the nodes with filters whose arrays are as large as those of the others."""
+    every = [filter for node in nodes.values() for filter in node.filters.values()]
+    return {
+        name: _with_filters(node, {f: filter.as_large_as(every) for f, filter in node.filters.items()})
+        for name, node in nodes.items()
+    }
+
+
 def fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
     """Return the fusions, with filters of all measurements as they stand in the network."""
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):

@@ -28,6 +28,7 @@ from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.claims import (
     fused_standing,
     lowered_claim,
+    nodes_alike,
     nodes_standing,
     nominal_fused,
     nominal_nodes,
@@ -132,7 +133,7 @@ class Network(Module):
         self.rows = FrozenMapping(
             {name: range(end - self.nodes[name].received, end) for name, end in zip(self.names, ends, strict=True)}
         )
-        self.nodes = nodes_standing(self)
+        self.nodes = nodes_alike(nodes_standing(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = _grouped(

@@ -94,6 +94,7 @@ def event_filter(
         lost=lost,
         delivers=all(_delivers(step) for step in steps),
         alike=all(_alike(step) for step in steps),
+        ages=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
         **shared,
         **sized("nominal", start, received),
     )

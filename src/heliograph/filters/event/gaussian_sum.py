@@ -1,5 +1,7 @@
 """A filter behind a sender that decides when to send: a sum of Gaussians over what the sender compares with."""
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +12,7 @@ import numpy as np
 from heliograph.engine.choice import compiled
 from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian, given, leading, with_rows
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import cut_to_ball
 from heliograph.filters.event.moments import Link, arriving, augmented, moved, pinned, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
@@ -71,7 +73,7 @@ class EventFilter(AbstractSizedFilter):
 
     known: parts of the interval in which y - r lay last, one Gaussian each; lost: Gaussians whose reference is a value
     that was lost. `follows`: the sender's reference may be a value that never arrived. `loses`: transmissions may be.
-    `delivers`: what arrives is y itself.
+    `delivers`: what arrives is y itself. `ages`: of the transmission before, which labels count, from 0.
     """
 
     plant: AnyPlant
@@ -86,11 +88,21 @@ class EventFilter(AbstractSizedFilter):
     delivers: bool = eqx.field(static=True)
     alike: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
+    ages: int = eqx.field(static=True)
 
     @property
     def follows(self) -> bool:
         """True if the reference may be a value that was lost."""
         return self.loses and self.trigger.reference == "sent"
+
+    def as_large_as(self, others: Sequence[AbstractFilter]) -> "EventFilter":
+        """Return the filter with room for the longest heartbeat of others that have one."""
+        ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
+        if self.trigger.heartbeat is None or ages <= self.ages:
+            return self
+        larger = copy(self)  # with what it knows of its world
+        object.__setattr__(larger, "ages", ages)
+        return larger
 
     @property
     def senders(self) -> list[slice]:
@@ -110,7 +122,7 @@ class EventFilter(AbstractSizedFilter):
         x = given(start.initial_mean, start.initial_covariance)
         both = with_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
         counts = COUNTED if self.trigger.losses == "numbered" else 1
-        label = jnp.zeros((len(self.senders), len(self.initial), (self.trigger.heartbeat or 0) + 1, counts))
+        label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
         single = Parts(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
         begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
@@ -149,7 +161,8 @@ class EventFilter(AbstractSizedFilter):
         label = jnp.einsum("hsiac,ij->hsjac", state.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
         if self.trigger.heartbeat is not None:
             older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
-            label = older.at[..., -1, :].add(label[..., -1, :])
+            age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
+            label = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, label, 0.0)
         return EventBelief(state.weight, *both, label, state.begun, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
@@ -273,7 +286,8 @@ class EventFilter(AbstractSizedFilter):
 
     def _by_age(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """A sender's label (K, M, A, C) where it sends on an event alone, and where it sends in any case."""
-        oldest = (jnp.arange(label.shape[2]) == (self.trigger.heartbeat or -1))[:, None]
+        heartbeat = self.trigger.heartbeat
+        oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
         due = jnp.where(~begun | oldest, label, 0.0)
         return label - due, due
 
