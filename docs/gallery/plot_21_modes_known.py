@@ -2,9 +2,10 @@
 What it is worth to know a link's mode
 ======================================
 
-A link stays good or bad for some twenty steps at a time. A filter that assumes a new gain at each step claims less than
-half of its error. The best linear filter that is told nothing errs hardly less, but claims what it has. A Gaussian for each
-mode halves the error, and a receiver that is told the mode, be it one step late, takes a fifth off that again.
+A link stays good or bad for some twenty steps at a time. A filter that assumes a new gain at each step claims less
+than half of its error. The best linear filter that is told nothing errs hardly less, but claims what it has. A
+Gaussian for each mode halves the error, and a receiver that is told the mode, be it one step late, takes a fifth off
+that again.
 """
 
 import matplotlib.pyplot as plt

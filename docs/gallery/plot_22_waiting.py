@@ -2,8 +2,9 @@
 Places smoothed behind two fading hops
 ======================================
 
-Places in two directions are sent with one gain over two hops that fade. How well they are known so far, some steps later,
-and once all is in: these deviations are exact, and known before any data. Below, the errors of one run within them.
+Places in two directions are sent with one gain over two hops that fade. How well they are known so far, some steps
+later, and once all is in: these deviations are exact, and known before any data. Below, the errors of one run within
+them.
 """
 
 import matplotlib.pyplot as plt

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.filters import fed_back_filter
 from heliograph.model import over_time
-from heliograph_studies.network_design.feedback import noise_of_hops
-from heliograph_studies.network_design.theory import fed_back_channel, feedback_limit
+from heliograph_studies.theory import fed_back_channel, feedback_limit
+from heliograph_studies.theory.feedback import noise_of_hops
 
 PLANT = hg.LinearPlant([[1.1]], 1.0, [0.0], [[1.0]])
 SENSOR = hg.LinearSensor([[1.0]], 0.5)

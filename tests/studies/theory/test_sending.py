@@ -10,7 +10,7 @@ import heliograph as hg
 from heliograph.numerics.check import InputError
 from heliograph.planning import Error, independent_paths, split_power
 from heliograph.planning.paths.model import path_information
-from heliograph_studies.network_design.theory import (
+from heliograph_studies.theory.sending import (
     best_schedule,
     burst_sending,
     choose_sensors,

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from heliograph.numerics.check import InputError
 from heliograph.planning import split_power
-from heliograph_studies.network_design.theory import best_relays, relay_line
+from heliograph_studies.theory.relay_line import best_relays, relay_line
 
 
 def searched(rho, exponent, hops):
