@@ -29,7 +29,6 @@ ORDER = [
         "filters.smoother_step",
         "filters.gaussian.transform",
         "filters.gaussian.scalars",
-        "filters.gaussian.precise",
         "filters.gaussian.signal",
         "filters.gaussian.bounds",
         "filters.gaussian.update",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from heliograph.numerics.linalg import times
-from heliograph.numerics.over_runs import runs_last, runs_last_of, where_any, where_each
+from heliograph.numerics.over_runs import runs_last, runs_last_of
 from straightline.program import lower
 
 RNG = np.random.default_rng(0)
@@ -78,28 +78,6 @@ def test_derivatives_are_those_of_the_arithmetic_forward_and_back_one_or_many():
             np.testing.assert_allclose(result, expected, rtol=1e-14)
         items = jax.vmap(jax.grad(lambda a: jnp.sum(product(a, b)[0] ** 2)))(jnp.asarray(A[0]))
         np.testing.assert_allclose(items, 2 * A[0] @ B @ B.T, rtol=1e-14, atol=1e-14)
-
-
-def test_costly_cases_are_said_run_by_run_and_have_derivatives():
-    def of(pick):
-        return lambda x: pick(x > 1, lambda: x**3, lambda: x)
-
-    cube = runs_last(of(where_any), of(where_each))
-    x = jnp.asarray([0.5, 2.0, 3.0])
-    np.testing.assert_allclose(jax.vmap(cube)(x), [0.5, 8.0, 27.0])
-    np.testing.assert_allclose(jax.vmap(jax.grad(cube))(x), [1.0, 12.0, 27.0])
-
-
-def test_derivatives_of_one_run_in_several_directions_compute_one_case():
-    """A condition of one run alone stays one, so that what is costly is not computed in each direction for nothing."""
-
-    def of(pick):
-        return lambda x: pick(jnp.all(x > 1), lambda: x**3, lambda: x)
-
-    cube, x = runs_last(of(where_any), of(where_each)), jnp.asarray([0.5, 2.0])
-    assert "cond" in str(jax.make_jaxpr(jax.jacfwd(cube))(x))
-    np.testing.assert_allclose(jax.jacfwd(cube)(x), np.eye(2))
-    np.testing.assert_allclose(jax.vmap(jax.jacfwd(cube))(jnp.stack([x, x + 1]))[1], np.diag([6.75, 27.0]))
 
 
 def test_names_of_arguments_may_be_given():

@@ -1,8 +1,7 @@
 """Small symmetric matrices: products, factors and solves, fast for batches of runs."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from operator import sub
 from typing import TypeVar
 
 import jax
@@ -45,11 +44,6 @@ def add(terms: Sequence[Array]) -> jax.Array:
     return jnp.asarray(sum(terms[1:], terms[0]))
 
 
-def minus(whole: jax.Array, parts: Iterable[jax.Array]) -> jax.Array:
-    """Subtract all `parts` from `whole`, one by one."""
-    return reduce(sub, parts, whole)
-
-
 def summed(a: jax.Array, axis: int) -> jax.Array:
     """Sum over a short axis, one by one."""
     return jnp.asarray(lax.squeeze(reduce(lax.add, lax.split(a, (1,) * a.shape[axis], axis)), (axis,)))
@@ -74,20 +68,6 @@ def times_vector(a: Array, x: jax.Array) -> jax.Array:
 def congruence(a: Array, p: jax.Array) -> jax.Array:
     """A P A' for a symmetric P."""
     return symmetric(times(times(a, p), transpose(a)))
-
-
-def above_products(product: jax.Array, a: Array, p: jax.Array) -> jax.Array:
-    """Return A P A' with the rounding of its sums, so that it is a covariance however much of them cancels.
-
-    The product is off by some eps |A| |P| |A|', of which n (n + 2) eps sum_j A_ij^2 P_jj on the diagonal takes care.
-    What a step leaves of that is large against the variance where states that are tied cancel, and the next steps
-    may multiply it. Where the product is zero, nothing was rounded; where little of its sums cancels, as of second
-    moments about a mean far from zero, that is no more than its last digits.
-    """
-    n, left = a.shape[1], diagonal_of(product)
-    reach = times_vector(a * a, jnp.maximum(diagonal_of(p), 0.0))
-    rounded = n * (n + 2) * float(np.finfo(product.dtype).eps) * reach
-    return product + diagonal(jnp.where((left != 0) & (left < 1e-3 * reach), rounded, 0.0))
 
 
 def inner(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -129,37 +109,6 @@ def with_rounding(p: A, terms: int) -> A:
     """
     units = (terms + 2) * float(np.finfo(p.dtype).eps)
     return p * (1 + units * np.eye(len(p), dtype=p.dtype)).reshape(p.shape[:2] + (1,) * (p.ndim - 2))
-
-
-def sum_of_squares(
-    prior: jax.Array, prior_root: jax.Array, gain: jax.Array, output: jax.Array, noise: jax.Array
-) -> jax.Array:
-    """(I - K H) P (I - K H)' + K N K', with the rounding of the mean itself, eps^2 P, added.
-
-    By roots of P and of N, so that what I - K H takes off, and what K takes of a singular N, leave the squares of their
-    rounding alone, which are not negative.
-    """
-    n = len(prior)
-    stored = identity(n, prior) - times(gain, output)
-    rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * diagonal_of(prior))
-    left = times(stored, prior_root)
-    return symmetric(times(left, transpose(left)) + spread_of(gain, noise)) + rounded
-
-
-@jax.custom_jvp
-def spread_of(gain: jax.Array, noise: jax.Array) -> jax.Array:
-    """K N K' of a positive semidefinite N as a square, by a root of N; its derivatives are those of the product."""
-    half = times(gain, root(noise))
-    return times(half, transpose(half))
-
-
-@spread_of.defjvp
-def _spread_jvp(
-    primals: tuple[jax.Array, jax.Array], tangents: tuple[jax.Array, jax.Array]
-) -> tuple[jax.Array, jax.Array]:
-    (gain, noise), (gain_dot, noise_dot) = primals, tangents
-    half = times(times(gain_dot, noise), transpose(gain))
-    return spread_of(gain, noise), half + transpose(half) + congruence(gain, noise_dot)
 
 
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -275,11 +224,6 @@ def root(a: jax.Array) -> jax.Array:
     return _long_root(a) if len(a) > UNROLL_LIMIT else lower_factor(factor(a)[0])
 
 
-def pivots(a: jax.Array) -> jax.Array:
-    """Variance of each component given those before it, (n, ...); 0 where these determine it."""
-    return diagonal_of(a) if len(a) == 1 else diagonal_of(root(a)) ** 2
-
-
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
     """x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
 
@@ -312,21 +256,6 @@ def squared_distances(
 def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
     """L^-1 x for a positive semidefinite A = L L'; NaN for a component that those before it determine."""
     return jnp.stack([jnp.where(scale == 0, jnp.nan, rest * scale) for rest, scale in _substituted(a, x)])
-
-
-def uncorrelated(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """T B and the diagonal D of T A T', for a positive semidefinite A; T has ones on its diagonal and zeros above."""
-    n, shape = len(a), jnp.broadcast_shapes(a.shape[2:], b.shape[2:])
-    b = jnp.broadcast_to(b, (*b.shape[:2], *shape))
-    if n > UNROLL_LIMIT:
-        lower = root(a)
-        scales = _reciprocals(diagonal_of(lower))
-        unit = lower * scales + diagonal(jnp.where(scales == 0, 1.0, 0.0))
-        rows = _over_matrices(partial(solve_triangular, lower=True, unit_diagonal=True), unit, b)
-    else:
-        rests, items = zip(*_substituted(a, b), strict=True)
-        rows, scales = jnp.stack(rests), jnp.stack(items)
-    return rows, _reciprocals(scales * scales)
 
 
 def _reciprocals(a: jax.Array) -> jax.Array:

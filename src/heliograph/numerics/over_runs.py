@@ -6,7 +6,7 @@ that its arithmetic is traced for one matrix, whose shapes are those of its resu
 
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -27,13 +27,11 @@ _kernel.multiple_results = True
 class _Kernel:
     """Arithmetic of one kernel and that of its derivatives; compared by identity."""
 
-    def __init__(
-        self, function: Callable[..., PyTree], source: Callable[..., PyTree], written: Callable[..., PyTree] | None
-    ):
+    def __init__(self, function: Callable[..., PyTree], written: Callable[..., PyTree] | None):
         # Traced once per shapes, however many filters use it, for the shapes of results, for XLA and for native code.
         self.function = jax.jit(lambda args, kwargs: function(*args, **kwargs))
-        self.source = source
-        self.sloped = jax.jit(partial(_sloped, source), static_argnums=(0, 1), inline=True)
+        self.source = function
+        self.sloped = jax.jit(partial(_sloped, function), static_argnums=(0, 1), inline=True)
         self.written = self.function if written is None else jax.jit(lambda args, kwargs: written(*args, **kwargs))
 
     def __repr__(self) -> str:
@@ -47,7 +45,6 @@ Shapes = Callable[..., PyTree]  # a kernel's arguments -> the shape of its resul
 
 def runs_last(
     kernel: Callable[P, R],
-    differentiable_as: Callable[P, R] | None = None,
     shapes: Shapes | None = None,
     written: Callable[P, R] | None = None,
 ) -> Callable[P, R]:
@@ -55,13 +52,10 @@ def runs_last(
 
     Args:
         kernel: arithmetic whose arrays carry the mapped axis last.
-        differentiable_as: arithmetic with the same values from which derivatives are taken; the kernel unless given. A
-            kernel that branches on all runs at once, by `where_any`, needs one, since it cannot be mapped over runs.
         shapes: shapes of the results as a function of the arguments; without it the kernel is traced to find them.
         written: the same arithmetic entry by entry, for native code; the kernel unless given.
     """
-    source = kernel if differentiable_as is None else differentiable_as
-    this = _Kernel(kernel, source, written)
+    this = _Kernel(kernel, written)
 
     @wraps(kernel)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -201,25 +195,3 @@ def _alone(kernel: Callable[..., PyTree]) -> Callable[..., PyTree]:
         )
 
     return call
-
-
-class Pick(Protocol):
-    """`where_any` or `where_each`."""
-
-    def __call__(self, needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
-        """One array or several, with the runs last."""
-
-
-def where_any(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
-    """`costly` for runs that need it and `cheap` for the others; `costly` is computed only where any run needs it."""
-    chosen: R = jax.lax.cond(jnp.any(needed), lambda: where_each(needed, costly, cheap), cheap)
-    return chosen
-
-
-def where_each(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
-    """The same run by run: of a single run one of both is computed, else both."""
-    if jnp.ndim(needed) == 0:
-        one: R = jax.lax.cond(needed, costly, cheap)
-        return one
-    chosen: R = jax.tree.map(lambda a, b: jnp.where(needed, a, b), costly(), cheap())
-    return chosen
