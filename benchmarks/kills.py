@@ -21,7 +21,7 @@ from typing import Any
 from heliograph.files.network_file import load_network
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
-from heliograph.live.plant_codec import plant_bytes, plant_from
+from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity

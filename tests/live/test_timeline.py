@@ -9,8 +9,8 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.live.plant_codec import HEAD
-from heliograph.live.snapshot import unpacked
+from heliograph.live.stored.plant_codec import HEAD
+from heliograph.live.stored.snapshot import unpacked
 from tests.live import worlds
 
 WORLDS = {

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import heliograph as hg
-from heliograph.live.plant_codec import plant_bytes, plant_from
+from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.serving import Fleet, Lanes, Options, Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity

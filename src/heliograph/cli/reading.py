@@ -121,7 +121,7 @@ def read_events(
     advance: "Advance",
 ) -> "EventTable | None":
     """Read the messages of a bag or a file; None for rows of time."""
-    from heliograph.files.bag import is_bag
+    from heliograph.files.bags.bag import is_bag
     from heliograph.files.messages import is_mapped, read_messages
     from heliograph.numerics.check import fail
 

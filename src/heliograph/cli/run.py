@@ -180,7 +180,7 @@ def _check_options(
 
 def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Write":
     """Return the function that writes estimates: to a table, or to MCAP with the pose that the network's file names."""
-    from heliograph.files.bag_output import write_bag
+    from heliograph.files.bags.output import write_bag
     from heliograph.files.recording import write_estimates
 
     origin = None if messages is None or messages.steps or messages.numbers else messages.date

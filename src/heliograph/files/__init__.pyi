@@ -3,7 +3,7 @@
 from .availability import (
     Available as Available,
 )
-from .bag_output import (
+from .bags.output import (
     Pose as Pose,
 )
 from .event_table import (

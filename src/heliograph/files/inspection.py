@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.bag import OFTEN, Progress, fields_of, opened
+from heliograph.files.bags.bag import OFTEN, Progress, fields_of, opened
+from heliograph.files.bags.mcap_chunks import messages_of as bag_messages
 from heliograph.files.fields import decoded, nanoseconds
-from heliograph.files.mcap_chunks import messages_of as bag_messages
 from heliograph.files.message_files import is_message_file, message_name, messages_of, payload_of
 from heliograph.numerics.check import InputError, fail, shown_error
 from heliograph.numerics.dates import looks_like_date

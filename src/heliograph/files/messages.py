@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from heliograph.files.bag import Progress, is_bag, parts_of, read_bag
+from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
 from heliograph.files.fields import nanoseconds
 from heliograph.files.message_files import (

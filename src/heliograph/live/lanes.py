@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.engine.choice import compiled
 from heliograph.live.later import Sweeper
-from heliograph.live.snapshot import Identity, network_identity
+from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.numerics.caching import shared

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.factors.columns import unit_lower
-from heliograph.live.layout import LOWER, VARIANCES, factors, parts_of
+from heliograph.live.stored.layout import LOWER, VARIANCES, factors, parts_of
 from heliograph.numerics.types import Float, PyTree
 
 Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row state"]]

@@ -12,10 +12,10 @@ from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.plausibility import in_words, why_inputs
-from heliograph.live.layout import fits, moved, parts_of, with_covariances
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
-from heliograph.live.snapshot import Identity, check_same, packed, unpacked, versions
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
+from heliograph.live.stored.layout import fits, moved, parts_of, with_covariances
+from heliograph.live.stored.snapshot import Identity, check_same, packed, unpacked, versions
 from heliograph.model.estimate import JudgedEstimate, with_sound_claim
 from heliograph.model.faults import function_fault
 from heliograph.model.inputs import check_inputs

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from heliograph.filters.plausibility import in_words
-from heliograph.live.carrier import DESCRIPTION, SAME, Carrier, description
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import FleetAngles, Judges
 from heliograph.live.lanes import shared_lanes
 from heliograph.live.plant import Link
-from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.senders import SenderStatus
-from heliograph.live.snapshot import check_same, packed, unpacked
+from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, description
+from heliograph.live.stored.plant_codec import plant_bytes, plant_from
+from heliograph.live.stored.snapshot import check_same, packed, unpacked
 from heliograph.model.estimate import Estimate, JudgedEstimate, with_sound_claim
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import readable

@@ -331,7 +331,7 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
         from heliograph.serving.storage.owner import owned
 
         owning.enter_context(owned(settings.store, settings.process))
-    from heliograph.live.carrier import Carrier
+    from heliograph.live.stored.carrier import Carrier
     from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)

@@ -15,8 +15,8 @@ from heliograph.live.fleet import Options as Options
 from heliograph.live.judging import FleetAngles
 from heliograph.live.lanes import Lanes as Lanes
 from heliograph.live.plant import Plant, Withdrawn
-from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.rows import HeldRow
+from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.numerics.check import instance, shown
 from heliograph.numerics.collector import no_collector
 from heliograph.serving.estimate_writer import EstimateWriter, line

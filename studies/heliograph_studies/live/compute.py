@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
 from heliograph.live.plant import Link
-from heliograph.live.plant_codec import plant_from
+from heliograph.live.stored.plant_codec import plant_from
 from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.carrier import Carrier
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
-from heliograph.live.plant_codec import plant_from
+from heliograph.live.stored.carrier import Carrier
+from heliograph.live.stored.plant_codec import plant_from
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.live.plant_codec import plant_bytes, plant_from
+from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.carrier import DESCRIPTION, Carrier
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
+from heliograph.live.stored.carrier import DESCRIPTION, Carrier
 from heliograph.numerics.check import InputError
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import LAYOUT, Store

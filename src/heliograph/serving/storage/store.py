@@ -10,8 +10,8 @@ from sqlalchemy import Column, Connection, Table, delete, func, inspect, select,
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
-from heliograph.live.carrier import DESCRIPTION, LISTED, Carrier, changes
-from heliograph.live.snapshot import Identity, check_same, versions
+from heliograph.live.stored.carrier import DESCRIPTION, LISTED, Carrier, changes
+from heliograph.live.stored.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
 from heliograph.serving.storage.database import engine_at, is_away

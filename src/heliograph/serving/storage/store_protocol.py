@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-from heliograph.live.carrier import DESCRIPTION, description
 from heliograph.live.fleet import Fleet
-from heliograph.live.snapshot import Identity, network_identity
+from heliograph.live.stored.carrier import DESCRIPTION, description
+from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.numerics.check import InputError, instance
 from heliograph.serving.output import Kind, Output
 

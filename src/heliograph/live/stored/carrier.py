@@ -10,10 +10,10 @@ import jax
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.layout import fits, moved, parts_of, placed, with_covariances
-from heliograph.live.plant_codec import BEFORE_LEAP, PlantParts, plant_bytes, plant_from
 from heliograph.live.rows import BEFORE
-from heliograph.live.snapshot import Identity
+from heliograph.live.stored.layout import fits, moved, parts_of, placed, with_covariances
+from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, plant_bytes, plant_from
+from heliograph.live.stored.snapshot import Identity
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED

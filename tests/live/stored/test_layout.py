@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.live.layout import factors, fits, moved, parts_of, placed, with_covariances
+from heliograph.live.stored.layout import factors, fits, moved, parts_of, placed, with_covariances
 
 NEW = {
     ".mean": [2, 3],

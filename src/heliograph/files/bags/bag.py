@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.bag_layout import Decoder, RawMessage
+from heliograph.files.bags.layout import Decoder, RawMessage
+from heliograph.files.bags.mcap_chunks import messages_of
 from heliograph.files.event_table import EventTable
-from heliograph.files.mcap_chunks import messages_of
 from heliograph.files.sources import Sources
 from heliograph.numerics.check import InputError, fail, shown_error
 

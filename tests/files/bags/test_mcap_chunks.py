@@ -10,7 +10,7 @@ pytest.importorskip("mcap")
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from heliograph.files.mcap_chunks import messages_of
+from heliograph.files.bags.mcap_chunks import messages_of
 from tests.files.bags import ACCEL, ODOMETRY, START, STORE, acceleration, odometry
 
 
