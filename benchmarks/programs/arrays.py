@@ -125,20 +125,22 @@ def _solved(w: Writer) -> None:
     if a is None:
         return
     n = a.shape[0]
-    # Of entries that are no finite numbers every library makes its own.
+    # Of entries that are no finite numbers, and of singular systems, every library makes its own.
     w.let(f"jnp.clip(jnp.nan_to_num({a.name}), -1e3, 1e3)", "float64", (n, n))
     a = w.known[-1]
-    square = a.name if w.random.random() < 0.3 else f"({a.name} @ {a.name}.T + {n} * jnp.eye({n}))"
+    definite = f"({a.name} @ {a.name}.T + {n} * jnp.eye({n}))"
+    square = a.name if w.random.random() < 0.3 else definite
+    regular = definite if w.random.random() < 0.5 else f"jnp.roll({definite}, 1, axis=0)"
     b = w.one("float64", (n,))
     right = f"jnp.arange({n}.0)" if b is None else b.name
-    text, shape = w.random.choice([
-        (f"jnp.linalg.solve({square}, {right})", (n,)), (f"jnp.linalg.inv({square})", (n, n)),
-        (f"jnp.linalg.cholesky({square})", (n, n)), (f"jnp.linalg.det({square})", ()),
-        (f"jax.scipy.linalg.solve_triangular({square}, {right}, lower=True)", (n,)),
-        (f"jax.scipy.linalg.cho_solve((jnp.linalg.cholesky({square}), True), {right})", (n,)),
+    text, matrix, shape = w.random.choice([
+        (f"jnp.linalg.solve({{}}, {right})", regular, (n,)), ("jnp.linalg.inv({})", regular, (n, n)),
+        ("jnp.linalg.cholesky({})", square, (n, n)), ("jnp.linalg.det({})", square, ()),
+        (f"jax.scipy.linalg.solve_triangular({{}}, {right}, lower=True)", square, (n,)),
+        (f"jax.scipy.linalg.cho_solve((jnp.linalg.cholesky({{}}), True), {right})", square, (n,)),
     ])  # fmt: skip
     w.marks += 1
-    w.let(text.replace(square, f"rounded({square}, {w.marks})", 1), "float64", shape, True)
+    w.let(text.format(f"rounded({matrix}, {w.marks})"), "float64", shape, True)
 
 
 def _drawn(w: Writer) -> None:

@@ -114,6 +114,8 @@ def reference(made: Program, columns: Sequence[np.ndarray], random: np.random.Ge
 
     relative = 8 * EPS * random.uniform(-1, 1, (DISTURBED + 1, PLACES))
     absolute = SMALL * random.choice([-1.0, 1.0], (DISTURBED + 1, PLACES))
+    half = DISTURBED // 2
+    relative[-half:] = -relative[1 : half + 1]  # what the sign of a rounding error decides is seen from both sides
     relative[0], absolute[0] = 0.0, -0.0
     with jax.enable_x64(True):
         every = jax.jit(lambda both, rows: lax.map(lambda d: lax.map(lambda row: disturbed(d, row), rows), both))

@@ -8,6 +8,8 @@ import pytest
 import heliograph as hg
 from straightline.lowering import RULES
 
+TABLE = np.array([3.0, 5.0, 7.0])
+
 
 def predicted(rule, mean):
     """The second component of the state after a step without a measurement: rule(mean)."""
@@ -26,10 +28,11 @@ def predicted(rule, mean):
         (lambda x: (jnp.asarray(2**62 + 1) // 3) % 1000 + 0 * x[0], [1.0, 2.0], 301.0),
         (lambda x: jax.lax.div(jnp.int32(-(2**31)), jnp.int32(-1)) + 0 * x[0], [1.0, 2.0], -(2.0**31)),
         (lambda x: jax.lax.div(jnp.uint32(3), jnp.uint32(0)) + 0 * x[0], [1.0, 2.0], 2.0**32 - 1),
+        (lambda x: jnp.take(TABLE, jnp.round(x[1]).astype(int)), [1.0, 2.0], 7.0),
     ],
 )
 def test_a_plant_computes_what_jax_does(rule, mean, right):
-    assert predicted(rule, mean) == right
+    np.testing.assert_array_equal(predicted(rule, mean), right)
 
 
 @pytest.mark.slow
@@ -94,3 +97,9 @@ def test_a_table_in_a_sensor_is_exported(tmp_path):
     sensor = hg.Sensor(lambda x: jnp.interp(x[0], np.linspace(0.0, 1.0, 20), volts)[None], 0.01)
     made = hg.export_c(hg.extended_filter(plant, sensor, hg.perfect()), tmp_path / "step.c")
     assert "union" in made.source.read_text()
+
+
+def test_a_gamma_mass_of_a_huge_shape_has_an_end():
+    """By its expansion, to its order a^(-1/2): one half."""
+    halves = hg.simulation.over_runs(lambda x: jax.scipy.special.gammainc(1e17 * x, 1e17 * x), np.array([1.0, 2.0]))
+    np.testing.assert_allclose(halves, 0.5, atol=1e-8)
