@@ -1,4 +1,4 @@
-"""One matrix's arithmetic over many runs: vmap's axes go last, and costly cases are computed where needed.
+"""One matrix's arithmetic over many runs: vmap's axes go last.
 
 A kernel is an operation of its own in what JAX traces: a level of vmap adds an axis to it and looks into nothing, so
 that its arithmetic is traced for one matrix, whose shapes are those of its results, and once more for all, as compiled.

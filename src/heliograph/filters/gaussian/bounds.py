@@ -118,13 +118,6 @@ def _received(signal: Signal, channel: SecondOrder, present: jax.Array) -> tuple
     return slopes, Columns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance
 
 
-def bounded_covariance(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Array:
-    """Omega of a channel whose mean gain is known: the bound on the covariance of z that gives the gain (m, m)."""
-    _, of_state, of_noise = _received(signal, channel, present)
-    spread = channel.spread(homogeneous(signal.second, signal.mean, 1.0), present)
-    return spread + of_state + of_noise + absent(present)
-
-
 def absent(present: jax.Array) -> jax.Array:
     """Unit variance for components that did not arrive, so that the reduced system keeps its full size."""
     return jnp.diag(jnp.where(present, 0.0, 1.0))
