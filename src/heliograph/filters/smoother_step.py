@@ -77,6 +77,12 @@ class SmootherStep(Module):
         """Mean of the filter's state after the step."""
         return self.after.mean
 
+    @property
+    def covariance(self) -> Float[Array, "*time N N"]:
+        """Covariance of the filter's state after the step."""
+        covariance: Array = self.after.covariance
+        return covariance
+
     def back(self, later: Gaussian) -> Gaussian:
         """Law of the filter's state before the step, from that after the step, both given the same later data."""
         return smoothed(self.before, later)
