@@ -5,13 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.factors.columns import rounding_of
+from heliograph.factors.roots import observe_root, roots_of, square
 from heliograph.linear.jump_system import moved
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.premise import believing
-from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, instance
-from heliograph.numerics.lapack import pseudo_solve, spectral_radius
-from heliograph.numerics.linalg import PRECISE, with_rounding
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Float
 
 SPAN, STILL = 100, 1e-12  # steps between comparisons, and what may be left, relatively, of a covariance's way
@@ -21,37 +22,41 @@ DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above w
 Pair = tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]  # a covariance and its rounding
 
 
+class Noises(NamedTuple):
+    """Roots of the noises of one step, with the rounding of what they are added to: Cov(w) = W W', Cov(v) = V V'."""
+
+    process: Float[np.ndarray, "N _"]
+    received: Float[np.ndarray, "m _"]
+
+
 class Corrected(NamedTuple):
-    """One step of the covariance recursion: gain, error covariance before and after the measurement."""
+    """One step of the recursion: gain, and roots of the error covariance before and after the measurement."""
 
     gain: Float[np.ndarray, "N m"]
-    predicted: Float[np.ndarray, "N N"]
-    covariance: Float[np.ndarray, "N N"]
+    predicted: Float[np.ndarray, "N _"]
+    root: Float[np.ndarray, "N N"]
 
 
-def covariance_step(
-    spread: Float[np.ndarray, "N N"], s: Steps, size: Float[np.ndarray, " N"] | float = 0.0
-) -> Corrected:
-    """P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-.
+def noises_of(s: Steps, size: Float[np.ndarray, " N"]) -> Noises:
+    """Roots of Cov(w) and Cov(v), beside those of the rounding of a state that had the second moments `size`."""
+    reach = np.abs(s.output) @ np.sqrt(size)
+    return Noises(_rounded_root(s.process, size), _rounded_root(s.noise, reach**2))
 
-    O may be singular (products of a measurement with few values repeat): then directions it does not have are skipped.
-    Of a variance of which next to nothing is left the mean cannot say ((N + 2) eps)^2 `size`, E[y^2] at the start.
+
+def _rounded_root(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Root of a noise and of the rounding of numbers with these second moments, which it is added to."""
+    rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
+    return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
+
+
+def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: Noises) -> Corrected:
+    """P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
+
+    O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
     """
-    predicted = s.transition @ spread @ s.transition.T + s.process
-    cross = s.output @ predicted
-    total = cross @ s.output.T + s.noise
-    gain = pseudo_solve(total, cross).T
-    rounded = with_rounding(predicted, len(cross))
-    variances = np.diag(s.noise)
-    if np.all(variances >= 0) and np.any(variances < PRECISE * np.diag(total)):  # P - G C P lost digits
-        keep, units = np.eye(len(gain)) - gain @ s.output, np.diag(rounded - predicted) ** 2
-        known = np.diag(units / np.where(units > 0, np.diag(predicted), 1.0))
-        after = keep @ predicted @ keep.T + gain @ s.noise @ gain.T + known
-        whole, unit = np.diag(predicted), (len(gain) + 2) * np.finfo(float).eps
-        after += np.diag(np.where(np.diag(after) < PRECISE * whole, np.minimum(unit**2 * size, whole), 0.0))
-    else:
-        after = rounded - gain @ cross
-    return Corrected(gain, predicted, (after + after.T) / 2)
+    predicted = np.concatenate([s.transition @ root, noises.process], axis=1)
+    gain, after = observe_root(predicted, s.output, noises.received)
+    return Corrected(gain, predicted, after)
 
 
 def information_step(
@@ -60,20 +65,6 @@ def information_step(
     """P = (P-^-1 + J)^-1 = (I + P- J)^-1 P- by the information J = C' Cov(v)^-1 C; P- may be singular."""
     after = np.linalg.solve(np.eye(predicted.shape[-1]) + predicted @ information, predicted)
     return np.asarray(after + after.swapaxes(-1, -2)) / 2
-
-
-def nearest_covariance(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """The positive semidefinite matrix nearest to a symmetric one, by its correlation matrix: zero for what is below.
-
-    Of noises that are differences of larger moments, the rounding of these may leave less than nothing.
-    """
-    deviation = np.sqrt(np.maximum(np.diag(a), 0.0))
-    unit = np.where(deviation > 0, deviation, 1.0)
-    values, vectors = np.linalg.eigh(np.where(np.outer(deviation, deviation) > 0, a, 0.0) / np.outer(unit, unit))
-    if values[0] >= -DEFINITENESS_TOLERANCE and np.all(np.diag(a) >= 0):
-        return a
-    root = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(root @ root.T)
 
 
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
@@ -91,26 +82,29 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
-    spread, projection, parts = system.covariance, system.projection, []
-    size = system.mean**2 + np.diag(spread)
+    root, projection, parts = roots_of(system.covariance), system.projection, []
+    size = system.mean**2 + np.diag(system.covariance)
+    noises = noises_of(system.step(0), size)
     rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
-    steady, transition = system.steady_from, np.eye(len(spread))
+    steady, transition = system.steady_from, np.eye(len(root))
     last: tuple[np.ndarray, np.ndarray] | None = None
     for k in range(system.horizon):
         if k > steady and (k - steady) % SPAN == 0:
-            if last is not None and _is_still((spread, rounding), last, transition):
+            if last is not None and _is_still((square(root), rounding), last, transition):
                 break  # what follows is the same, to rounding
-            last = spread, rounding
+            last = square(root), rounding
         s = system.step(k)
-        gain, predicted, spread = covariance_step(spread, s, size)
-        keep = np.eye(len(spread)) - gain @ s.output
+        noises = noises_of(s, size) if 0 < k <= steady else noises
+        gain, predicted, root = covariance_step(root, s, noises)
+        keep = np.eye(len(root)) - gain @ s.output
         transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
         expected = s.output @ s.transition, s.output @ s.drift + s.offset
         estimate = projection @ transition, projection @ gain, projection @ offset
-        claimed = nearest_covariance(projection @ spread @ projection.T)
-        innovation = s.output @ predicted @ s.output.T + s.noise
-        before = nearest_covariance(projection @ predicted @ projection.T), innovation
-        parts.append((transition, gain, offset, *estimate, *expected, claimed, *before))
+        claimed = square(projection @ root)
+        innovation = square(s.output @ predicted) + s.noise
+        parts.append(
+            (transition, gain, offset, *estimate, *expected, claimed, square(projection @ predicted), innovation)
+        )
         # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
         rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T
         rounding += (gain * system.received_rounding[k]) @ gain.T

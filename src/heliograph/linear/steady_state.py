@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
+from heliograph.factors.roots import observe_root, roots_of, square
 from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains
-from heliograph.linear.recursion import covariance_step
+from heliograph.linear.recursion import covariance_step, noises_of
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
@@ -170,13 +171,14 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     except (LinAlgError, ValueError) as error:
         raise _none(str(error)) from None
     # One more correction and prediction gives the gain, and must come back to where it began.
-    start = covariance_step(prior, Steps(np.eye(len(a)), zero[0], np.zeros_like(q), c, zero[1], r))
-    again = covariance_step(start.covariance, step).predicted
+    noises = noises_of(step, np.diag(prior))
+    gain, root = observe_root(roots_of(prior), c, noises.received)
+    again = square(covariance_step(root, step, noises).predicted)
     unit = standard_deviations(prior)
     moved = np.abs(again - prior) / (unit[:, None] * unit)
-    if not np.all(np.isfinite(prior)) or np.max(moved) > CLOSE or spectral_radius(a - a @ start.gain @ c) >= 1:
+    if not np.all(np.isfinite(prior)) or np.max(moved) > CLOSE or spectral_radius(a - a @ gain @ c) >= 1:
         raise _none("none that is approached")
-    return SteadyState((prior + prior.T) / 2, start.covariance, start.gain)
+    return SteadyState((prior + prior.T) / 2, square(root), gain)
 
 
 def _none(got: str) -> Exception:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.recursion import covariance_step
+from heliograph.factors.roots import roots_of, square
+from heliograph.linear.recursion import covariance_step, noises_of
 from heliograph.linear.system import LinearSystem, state_moments
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
@@ -70,10 +71,11 @@ def boundedness(system: LinearSystem, window: int | None = None) -> Boundedness:
         raise fail("window", f"from 1 to {system.horizon - 1} steps", window)
     c, before = _constants(system), state_moments(system).covariance
     # Error covariances of the best filter, and their extreme eigenvalues.
-    errors = [system.covariance]
+    roots, size = [roots_of(system.covariance)], system.mean**2 + np.diag(system.covariance)
     for k in range(system.horizon):
-        errors.append(covariance_step(errors[-1], system.step(k)).covariance)
-    values = np.linalg.eigvalsh(np.array(errors))
+        s = system.step(k)
+        roots.append(covariance_step(roots[-1], s, noises_of(s, size)).root)
+    values = np.linalg.eigvalsh(np.array([square(root) for root in roots]))
     low, high = float(values[1:, 0].min()), float(values[:, -1].max())
     lower = _lower(c, low)
     return Boundedness(

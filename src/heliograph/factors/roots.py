@@ -1,0 +1,74 @@
+"""Kalman's update of covariances that are known before any data, on their roots, by LAPACK's QR."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.factors.columns import RANK
+from heliograph.numerics.types import Float
+
+
+class Observed(NamedTuple):
+    """Gain K (..., n, m), and a root (..., n, columns) of the covariance after a measurement: W+ W+' = P - K S K'."""
+
+    gain: Float[np.ndarray, "*items n m"]
+    root: Float[np.ndarray, "*items n c"]
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "*items n n"]:
+        """W+ W+'."""
+        return square(self.root)
+
+
+def square(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarray, "*items n n"]:
+    """W W', symmetric to the last digit."""
+    product = root @ root.swapaxes(-1, -2)
+    return np.asarray(product + product.swapaxes(-1, -2)) / 2
+
+
+def roots_of(covariance: Float[np.ndarray, "*items n n"]) -> Float[np.ndarray, "*items n n"]:
+    """W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
+
+    Of a matrix that rounding made indefinite, those of the nearest covariance: what is below zero counts as zero.
+    """
+    deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+    unit = np.where(deviation > 0, deviation, 1.0)
+    scale = unit[..., :, None] * unit[..., None, :]
+    known = deviation[..., :, None] * deviation[..., None, :] > 0
+    values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0) / scale)
+    return np.asarray(unit[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def observe_root(
+    root: Float[np.ndarray, "*items n c"],
+    output: Float[np.ndarray, "*items m n"],
+    noise: Float[np.ndarray, "*items m d"],
+) -> Observed:
+    """Condition x of covariance W W' on z = C x + v, Cov v = N N'.
+
+    [[N, C W], [0, W]] = [[V, 0], [K V, W+]] U with an orthogonal U and V V' = C P C' + N N': sums of squares alone,
+    each row known to eps of its length. A component of which those before it leave less than RANK of its variance has
+    the gain zero, since a covariance that is given is not known to more, and its column stays in W+.
+
+    Source: Morf and Kailath, Square-root algorithms for least-squares estimation (1975).
+    """
+    (m, n), through = output.shape[-2:], output @ root
+    noise, root = (np.broadcast_to(part, (*through.shape[:-2], *part.shape[-2:])) for part in (noise, root))
+    nothing = np.zeros((*through.shape[:-2], n, noise.shape[-1]))
+    rows = np.concatenate(
+        [np.concatenate([noise, through], axis=-1), np.concatenate([nothing, root], axis=-1)], axis=-2
+    )
+    # At least as many columns as rows, so that the triangle is whole.
+    short = max(m + n - rows.shape[-1], 0)
+    rows = np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, short)])
+    lower = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r")).swapaxes(-1, -2)
+    # K from K V, the last column first.
+    total, moved = lower[..., :m, :m], lower[..., m:, :m]
+    pivot = np.diagonal(total, axis1=-2, axis2=-1)
+    says = pivot**2 > RANK * np.sum(total**2, axis=-1)
+    inverse, gain = np.where(says, 1 / np.where(says, pivot, 1.0), 0.0), np.zeros_like(moved)
+    for j in reversed(range(m)):
+        rest = moved[..., j] - (gain[..., j + 1 :] @ total[..., j + 1 :, j, None])[..., 0]
+        gain[..., j] = rest * inverse[..., j, None]
+    unused = np.where(says[..., None, :], 0.0, moved)
+    return Observed(gain, np.concatenate([lower[..., m:, m:], unused], axis=-1))
