@@ -14,7 +14,7 @@ from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fused, Means
 from heliograph.fusion.weights import RANK
 from heliograph.numerics.lapack import pseudo_solve
-from heliograph.numerics.linalg import rounding, symmetric, with_rounding
+from heliograph.numerics.linalg import rounding, symmetric
 from heliograph.numerics.types import Float
 
 
@@ -136,7 +136,6 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
     error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`.
     """
-    nodes, n = state.past.error.shape[1:]
     # Innovation, zero for reports that did not arrive.
     values = jnp.ravel(reports)
     output, offset = _output(state.past, len(state.mean)), jnp.ravel(state.past.offset)
@@ -144,25 +143,18 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     present = ~jnp.isnan(values)
     expected = output @ state.mean + offset
     unexpected = jnp.where(present, values - expected, 0.0)
-    # S = O P O' + N.
-    cross = output @ state.covariance
-    total = symmetric(cross @ output.T + noise)
-    if state.spill is None:
-        cross = jnp.where(present[:, None], cross, 0.0)
-        gain = pseudo_solve(_of_present(present, total), cross, rounding(0.0, total, RANK)).T
-        covariance = symmetric(with_rounding(state.covariance, nodes * n) - gain @ cross)
-        return Knowledge(state.mean + gain @ unexpected, covariance, state.past, None), Expected(expected, total)
-    # Gain for quantizers' errors as white noise of variance D^2 / 3.
+    # S = O P O' + N, with quantizers' errors as white noise of variance D^2 / 3.
+    total = symmetric(output @ state.covariance @ output.T + noise)
+    cross = jnp.where(present[:, None], output @ state.covariance, 0.0)
     push = _quantized(state.past, present)
-    cross = jnp.where(present[:, None], cross, 0.0)
     wide = push @ (jnp.ravel(state.past.error)[:, None] ** 2 / 3 * push.T)
     gain = pseudo_solve(_of_present(present, total + wide), cross, rounding(0.0, total, RANK)).T
-    # Joseph form with that gain; the errors mu themselves enter the bound (Young, Cauchy).
+    # Joseph's form, sums of squares; the errors mu themselves enter the bound (Young, Cauchy).
     keep = jnp.eye(len(state.mean)) - gain @ output
     covariance = symmetric(keep @ state.covariance @ keep.T + gain @ _of_present(present, noise) @ gain.T)
-    into = gain @ push
-    bound = _within(into, jnp.ravel(state.past.error))
-    spill = symmetric(_sum(keep @ state.spill @ keep.T, bound))
+    spill = None
+    if state.spill is not None:
+        spill = symmetric(_sum(keep @ state.spill @ keep.T, _within(gain @ push, jnp.ravel(state.past.error))))
     return Knowledge(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
 
 
