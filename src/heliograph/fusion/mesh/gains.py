@@ -15,8 +15,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from heliograph.numerics.linalg import add, diagonal, identity, root, solve, symmetric, symmetrize, times, transpose
+from heliograph.factors.columns import Columns, eliminated, square_root
+from heliograph.factors.gaussian import given, observe
+from heliograph.numerics.linalg import diagonal, solve, symmetrize, times, transpose
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, Bool, Float
 
@@ -77,23 +80,18 @@ def gains_of(weights: Weights, step: Step) -> Gains:
     return Gains(innovation @ a @ weights.front, weights.parts, corrected, innovation, corrected)
 
 
-@runs_last
 def correct(
-    predicted: Float[jax.Array, "n n *#runs"], information: Float[jax.Array, "n n *#runs"]
-) -> tuple[Float[jax.Array, "n n *#runs"], Float[jax.Array, "n n *#runs"]]:
+    predicted: Float[jax.Array, "n n"], information: Float[jax.Array, "n n"]
+) -> tuple[Float[jax.Array, "n n"], Float[jax.Array, "n n"]]:
     """P = (Pb^-1 + S)^-1 and F = I - P S of a predicted Pb, which may be singular, and of information S.
 
-    With S = L L': P = Pb - Pb L (I + L' Pb L)^-1 L' Pb, then Joseph's form P = F Pb F' + P S P.
+    With S = L diag(d) L' the measurements that were made say as much as L' x + v, Cov v = diag(d)^-1.
     """
-    n = predicted.shape[0]
-    left = root(information)
-    cross = times(predicted, left)
-    inner = jnp.asarray(identity(n, predicted)) + symmetric(times(transpose(left), cross))
-    short = predicted - times(cross, solve(inner, transpose(cross)))
-    innovation = jnp.asarray(identity(n, predicted)) - times(short, information)
-    pushed = times(short, left)
-    long = add([times(times(innovation, predicted), transpose(innovation)), times(pushed, transpose(pushed))])
-    return symmetric(long), innovation
+    n, said = len(predicted), eliminated(information)
+    rows = jnp.diag(square_root(said.weights)) @ said.matrix.T
+    x = given(np.zeros(n), predicted)
+    after, _ = observe(x, rows @ x.root, jnp.zeros(n), Columns(np.eye(n), jnp.ones(n)))
+    return after.covariance, np.eye(n) - after.covariance @ information
 
 
 @runs_last
