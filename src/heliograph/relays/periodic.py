@@ -13,7 +13,7 @@ from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import fail, instance, per_step
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.lapack import spectral_radius
-from heliograph.numerics.linalg import psd_solve
+from heliograph.numerics.linalg import psd_solve, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (
@@ -143,16 +143,20 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     side = jax.vmap(relay_side)(steps, moments, gains)
     d = side.transition.shape[-1]
 
-    # Riccati recursion of the receiver, held constant under differentiation.
     def predict(spread: jax.Array, at_slot: RelaySide) -> jax.Array:
         both = jnp.concatenate([at_slot.transition, at_slot.output])
         return both @ spread @ both.T + at_slot.noise
 
+    def corrected(z: jax.Array, gain: jax.Array) -> jax.Array:
+        """Joseph's form: affine in the covariance of the state and of what is received."""
+        close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
+        return close @ z @ close.T
+
+    # Riccati recursion of the receiver, held constant under differentiation.
     def best(spread: jax.Array, at_slot: RelaySide) -> tuple[jax.Array, jax.Array]:
         z = predict(spread, at_slot)
         gain = psd_solve(z[d:, d:], z[d:, :d]).T  # zero in a slot in which nobody transmits to the receiver
-        after = z[:d, :d] - gain @ z[d:, :d]
-        return (after + after.T) / 2, gain
+        return symmetrize(corrected(z, gain)), gain
 
     held = jax.lax.stop_gradient(side)
     converged = _solve_steady(
@@ -161,11 +165,10 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     # Best gains over one period, from the converged covariance.
     best_gains = jax.lax.stop_gradient(jax.lax.scan(best, converged, held)[1])
 
-    # Joseph form with these gains: affine in the covariance, so its fixed point is one linear solve.
+    # With these gains the fixed point is one linear solve.
     def given(spread: jax.Array, row: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
         at_slot, gain = row
-        close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
-        after = close @ predict(spread, at_slot) @ close.T
+        after = corrected(predict(spread, at_slot), gain)
         return after, after
 
     def period(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
