@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compiled
-from heliograph.factors.columns import eliminated, joined
-from heliograph.factors.gaussian import Gaussian, given, observe
+from heliograph.factors.columns import Columns, eliminated, joined
+from heliograph.factors.gaussian import Gaussian, given, observe, of_columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
 from heliograph.filters.gaussian.belief import predicted, smoother_step_by_transform, start_of
@@ -172,10 +172,11 @@ class StochasticEventFilter(AbstractSizedFilter):
         (gain, spread), mean, total = link, signal.mean, signal.covariance
         # Of y.
         silent = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)
-        solved = psd_solve(total + self._inverse_weight(), total)
-        d = (reference - mean) @ solved
+        y = of_columns(mean, joined(Columns(signal.slopes, signal.prior.variances), signal.noise))
+        quiet, _ = observe(y, y.root, reference - mean, eliminated(self._inverse_weight()))
+        d = quiet.mean - mean
         shift = -silent * d / (1 - silent)
-        about = (total - silent * (total - total @ solved + jnp.outer(d, d))) / (1 - silent) - total
+        about = (total - silent * (quiet.covariance + jnp.outer(d, d))) / (1 - silent) - total
         # Of z: the mean gain, and the spread, which acts on second moments of (y, 1).
         second = about + jnp.outer(mean, shift) + jnp.outer(shift, mean)
         second = jnp.block([[second, shift[:, None]], [shift, jnp.zeros(1)]])
