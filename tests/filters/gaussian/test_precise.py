@@ -372,3 +372,14 @@ def test_outputs_that_say_the_same_of_a_tied_state_say_it_once():
         state = Gaussian(np.zeros((300, 2)), (ties[1] / ties[0])[:, None], np.stack([ties[0] ** 2, 0 * ties[0]], 1))
         gain = each(state, seen.T, (1e-14 * seen * ties[1]).T ** 2)
     np.testing.assert_allclose(np.einsum("bio,ob->ib", gain, seen), ties / ties[1], rtol=1e-6)
+
+
+def test_the_rounding_of_a_state_that_starts_at_zero_is_that_of_its_noise():
+    """Known to be 0 at first, then moved by noise of deviation 1e3 and seen without noise: known to 4 eps of 1e3."""
+    plant = hg.LinearPlant([[0.5]], 1e6, [0.0], 0.0)
+    for item in (
+        hg.kalman_filter(plant, hg.LinearSensor([[3.0]], 0.0)),
+        hg.cubature_filter(plant, hg.LinearSensor([[3.0]], 0.0)),
+    ):
+        steps = follow(item, [[3e3], [1e3]])
+        np.testing.assert_allclose(steps.covariance[:, 0, 0], (4 * np.finfo(float).eps * 1e3) ** 2, rtol=1e-9)

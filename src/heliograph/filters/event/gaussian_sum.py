@@ -152,7 +152,7 @@ class EventFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
         """x moves and r stays, or is the prediction; modes move, and it is one step longer since the last sent."""
-        plant, u, start = at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0))
+        plant, u, start = at(self.plant, k), jnp.asarray(u), start_of(self.plant)
         both = jax.vmap(lambda x: moved(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
             expected, places = self.reference(self._whole(state).mean, u, k), len(self.states) + np.arange(self.outputs)
@@ -175,7 +175,7 @@ class EventFilter(AbstractSizedFilter):
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
-        parts, begun, start = state.parts, state.begun, start_of(at(self.plant, 0))
+        parts, begun, start = state.parts, state.begun, start_of(self.plant)
         total, value, covariance = jnp.zeros(()), [], []
         # Senders one after the other, each with its value or its silence.
         for s, those in enumerate(self.senders):

@@ -86,7 +86,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
         """x and the modes move; both ends compute the next reference."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = predicted(plant, self.transform, state.gaussian, u, start_of(at(self.plant, 0)))
+        moved = predicted(plant, self.transform, state.gaussian, u, start_of(self.plant))
         rows = jnp.asarray(at(self.channel, k).transition)
         law = jnp.where(state.moved, state.law @ rows, state.law)
         reference = state.reference
@@ -105,7 +105,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         count = self.received - self.trigger.side_information(self.outputs)
         values, down = z[:count], z[count:]
         prior = state.gaussian
-        signal = signal_of(plant, sensor, self.transform, prior, start_of(at(self.plant, 0)))
+        signal = signal_of(plant, sensor, self.transform, prior, start_of(self.plant))
 
         # A value: each mode's update, joined.
         modes = len(state.law)

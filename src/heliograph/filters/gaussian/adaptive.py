@@ -113,7 +113,7 @@ class AdaptiveFilter(AbstractSizedFilter):
         # Moments of what arrives without its noise, and the noise's law.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
-        signal = signal_without_noise(plant, sensor, base.transform, belief, start_of(base))
+        signal = signal_without_noise(plant, sensor, base.transform, belief, start_of(base.plant, base))
         before = expected_of(signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
         z = nearest(jnp.asarray(z), before.signal, angles)

@@ -55,7 +55,7 @@ class AbstractBeliefFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """Mean and covariance of f(x, u) + w."""
-        return predicted(at(self.plant, k), self.transform, state, jnp.asarray(u), start_of(self))
+        return predicted(at(self.plant, k), self.transform, state, jnp.asarray(u), start_of(self.plant, self))
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
@@ -74,10 +74,19 @@ class HasStart(Protocol):
     initial_covariance: Array
 
 
-def start_of(start: HasStart) -> Float[jax.Array, " n"]:
-    """E[x_i^2] before the first step, (n,): how large numbers are, of which the rounding stays unknown."""
+def start_of(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array, " n"]:
+    """How large numbers are, of which the rounding stays unknown: E[x_i^2] at the start, and Var w_i of a step, (n,).
+
+    Of the plant's first step, and of its law at the start or of another one; a noise that depends on inputs counts
+    where it is added.
+    """
+    first_step = at(plant, 0)
+    start = first_step if start is None else start
     mean = jnp.asarray(start.initial_mean)
-    return jnp.asarray(mean * mean + jnp.diagonal(jnp.asarray(start.initial_covariance)))
+    size = mean * mean + jnp.diagonal(jnp.asarray(start.initial_covariance))
+    if isinstance(first_step.noise, AbstractNoise):
+        size = size + jnp.diagonal(jnp.asarray(first_step.noise.covariance))
+    return jnp.asarray(size)
 
 
 def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> Columns:
@@ -125,7 +134,7 @@ def smoother_step_by_transform(
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     before, prior, after = step[:3] if whole is None else map(whole, step[:3])
     image = image_of(plant, filter.transform, before, u)
-    noise = process_noise(plant, u, start_of(start))
+    noise = process_noise(plant, u, start_of(filter.plant, start))
     if len(image.curvature.weights):  # summed as the prediction by a transform is
         noise = of_sum(image.mean, noise, image.curvature).columns
     return smoother_step_of(before, prior, after, (image.slopes, noise), filter.claim, plant.angles)

@@ -56,7 +56,7 @@ class GaussianFilter(AbstractBeliefFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        signal = signal_of(at(self.plant, k), sensor, self.transform, state, start_of(self))
+        signal = signal_of(at(self.plant, k), sensor, self.transform, state, start_of(self.plant, self))
         unknown = signal.about_mean() if self.linear else signal
         return corrected(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
 

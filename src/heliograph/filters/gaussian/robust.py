@@ -184,7 +184,7 @@ class RobustFilter(AbstractBeliefFilter):
     def expected(self, state: Gaussian, k: Step) -> tuple[Expected, jax.Array]:
         """Moments of what would arrive without the noise that may hold outliers, and the sensor's mean signal."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start_of(self))
+        signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start_of(self.plant, self))
         return expected_of(signal, channel), signal.mean
 
 

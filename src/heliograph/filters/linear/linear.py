@@ -69,12 +69,12 @@ class LinearFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
-        return predicted(state, move_of(at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0))))
+        return predicted(state, move_of(at(self.plant, k), jnp.asarray(u), start_of(self.plant)))
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Correct with the components of z that arrived."""
-        sensor, channel, start = at(self.sensor, k), at(self.channel, k), start_of(at(self.plant, 0))
+        sensor, channel, start = at(self.sensor, k), at(self.channel, k), start_of(self.plant)
         return corrected_linear(state, sensor, channel, self.rule, jnp.asarray(z), start)
 
     @estimates
@@ -87,7 +87,7 @@ class LinearFilter(AbstractSizedFilter):
 
         That no random gain and no draw of the past tells of, so that Rauch's recursion is the best linear one.
         """
-        move = move_of(at(self.plant, step.k), jnp.asarray(step.u), start_of(at(self.plant, 0)))
+        move = move_of(at(self.plant, step.k), jnp.asarray(step.u), start_of(self.plant))
         moved = move.matrix @ step.before.estimate.root, move.noise
         claim: Claim = self.claim if self.mean_known else "nominal"
         return smoother_step_of(step.before, step.prior, step.after, moved, claim)

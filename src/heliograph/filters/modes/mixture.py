@@ -224,7 +224,7 @@ class MixtureFilter(AbstractSizedFilter):
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
         """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        noise = process_noise(plant, u, start_of(at(self.plant, 0)))
+        noise = process_noise(plant, u, start_of(self.plant))
         moved = move(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
         return MixtureBelief(*moved, law, jnp.asarray(True))
@@ -233,7 +233,7 @@ class MixtureFilter(AbstractSizedFilter):
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching."""
         c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
-        prior, size = state.law[c.mode] * jnp.asarray(c.weight), jnp.sqrt(start_of(at(self.plant, 0)))
+        prior, size = state.law[c.mode] * jnp.asarray(c.weight), jnp.sqrt(start_of(self.plant))
         present = ~jnp.isnan(z)
 
         # Kalman update of one combination, with the rounding of what it says of the state.
@@ -263,7 +263,7 @@ class MixtureFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of the state before the step given its prediction."""
         plant, u, (before, prior, after, *_) = at(self.plant, step.k), jnp.asarray(step.u), step
-        moved = plant.transition_matrix(u) @ before.gaussian.root, process_noise(plant, u, start_of(at(self.plant, 0)))
+        moved = plant.transition_matrix(u) @ before.gaussian.root, process_noise(plant, u, start_of(self.plant))
         return smoother_step_of(before, prior, after, moved, "nominal", plant.angles)
 
 

@@ -128,7 +128,7 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     def moved_noise(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
         """Covariance (N, N) of the process noise and of the rounding of zeta, by E[1{next} 1{next}'] of the modes."""
-        parts = noise_in_mode(at(self.plant, k), u, at(self.plant, 0))
+        parts = noise_in_mode(at(self.plant, k), u, start_of(self.plant))
         return Columns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
 
     def _projection(self) -> Float[np.ndarray, "n N"]:
@@ -214,9 +214,9 @@ def _carried(state: ModalBelief, move: jax.Array) -> jax.Array:
     return carried
 
 
-def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: LinearPlant) -> Columns:
+def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns:
     """Covariance of the process noise of x~, with the rounding of the state and of the mode's indicator."""
-    own = process_noise(plant, jnp.asarray(u), start_of(start))
+    own = process_noise(plant, jnp.asarray(u), start)
     one = rounding_of(np.ones(1))
     return Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
 

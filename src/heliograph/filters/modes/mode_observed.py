@@ -78,7 +78,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
         """Predict both pairs of moments over step k."""
-        move = move_of(at(self.plant, k), jnp.asarray(u), start_of(at(self.plant, 0)))
+        move = move_of(at(self.plant, k), jnp.asarray(u), start_of(self.plant))
         return state._replace(belief=predicted(state.belief, move), move=move)
 
     @corrects
@@ -90,7 +90,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         z, published = observed[:m], observed[m:]
         known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         certain = jnp.nan_to_num(published)
-        start, rule = start_of(at(self.plant, 0)), Polytope()
+        start, rule = start_of(self.plant), Polytope()
         if self.late:
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
             then = _given(at(self.channel, last), certain)

@@ -249,7 +249,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         mixing, weight = self.merging.mixing(state.weight, rows)
-        moved = mixed_and_moved(plant, self.transform, state.parts, mixing, u, start_of(at(self.plant, 0)))
+        moved = mixed_and_moved(plant, self.transform, state.parts, mixing, u, start_of(self.plant))
         parts: Gaussian = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(rows), leaf.shape[1])), moved)
         parts = parts._replace(mean=together(plant, parts.mean, jnp.sum(weight, axis=1)))
         return ModalBeliefs(*parts, weight, jnp.asarray(True))
@@ -259,7 +259,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Correct each component in each mode with z, and weight them by their likelihood."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         i, j = self.merging.pairs(len(self.initial))
-        start = start_of(at(self.plant, 0))
+        start = start_of(self.plant)
         signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
         signal = jax.tree.map(lambda leaf: leaf[i], signals)
         after, weight, mixed = receive(signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles)

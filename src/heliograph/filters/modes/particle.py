@@ -96,7 +96,7 @@ class ParticleFilter(AbstractSizedFilter):
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
         drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
-        start = start_of(at(self.plant, 0))
+        start = start_of(self.plant)
         parts = jax.vmap(lambda x: predicted(plant, self.transform, x, u, start))(state.parts)
         mode = jnp.where(state.moved, drawn, state.mode)
         parts = parts._replace(mean=together(plant, parts.mean, state.weight))
@@ -106,7 +106,7 @@ class ParticleFilter(AbstractSizedFilter):
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
-        start = start_of(at(self.plant, 0))
+        start = start_of(self.plant)
         signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
         after, weight, mixed = receive(signals, channel, state.mode, state.weight, z, self.observed_angles)
         after = after._replace(mean=together(plant, after.mean, weight))

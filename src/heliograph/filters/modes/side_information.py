@@ -162,7 +162,7 @@ class SideInformationFilter(AbstractSizedFilter):
             return jnp.concatenate([e + kron(chosen[:, None], x), x])
 
         # From all modes to each: their columns side by side, and the process noise.
-        noise = noise_in_mode(plant, u, at(self.plant, 0))
+        noise = noise_in_mode(plant, u, start_of(self.plant))
 
         def into(j: jax.Array, chances: jax.Array, law: jax.Array) -> Columns:
             moved = Columns(jax.vmap(to)(j - rows, errors, x), weights)
@@ -193,7 +193,7 @@ class SideInformationFilter(AbstractSizedFilter):
         told = jnp.asarray(weight - 1)[:, None] * state.variances
         links = jax.tree.map(lambda part: jnp.asarray(part)[:, kind], (known.mean, known.gain_spread, known.noise))
         after, innovations, innovation = _projected(
-            prior, told, _received(prior, sensor, size_of(sensor, start_of(at(self.plant, 0))), *links), z
+            prior, told, _received(prior, sensor, size_of(sensor, start_of(self.plant)), *links), z
         )
         likelihood = innovations.log_density(there, jnp.abs(z) + jnp.abs(innovation.mean))
         value = jnp.where(there, innovation.mean, jnp.nan)

@@ -115,7 +115,7 @@ class ClockFilter(AbstractSizedFilter):
         # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
         sensor, prior = at(base.sensor, k), state.gaussian
-        signal = signal_of(at(base.plant, k), sensor, base.transform, prior, start_of(base))
+        signal = signal_of(at(base.plant, k), sensor, base.transform, prior, start_of(base.plant, base))
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
         z = nearest(jnp.asarray(z), expected, base.observed_angles)
         # Innovation covariance S, for all components.

@@ -154,7 +154,7 @@ class FedBackFilter(AbstractSizedFilter):
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
         """Correct with the measurement of y - r."""
         base = self.base
-        y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, state.gaussian, start_of(base))
+        y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, state.gaussian, start_of(base.plant, base))
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
         after, innovation = corrected(sent, at(base.channel, k), base.rule, jnp.asarray(z))

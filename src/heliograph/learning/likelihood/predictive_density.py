@@ -197,7 +197,7 @@ def expected_signals(
         k, z_k, u_k = row
         prior = filter.predict(state, u_k, k)
         plant, sensor, channel = at((filter.plant, filter.sensor, filter.channel), k)
-        y = signal_of(plant, sensor, filter.transform, prior, start_of(filter))
+        y = signal_of(plant, sensor, filter.transform, prior, start_of(filter.plant, filter))
         near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, filter.observed_angles)
         return filter.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
