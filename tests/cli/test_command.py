@@ -125,7 +125,6 @@ def test_lists_do_not_load_jax():
     assert [line.split()[0] for line in lines] == [
         *(
             "demo",
-            "fusion",
             "late-data",
             "live",
             "motor-drive",
@@ -160,7 +159,7 @@ def test_a_refusal_in_a_process_of_its_own(folder):
         (["reproduce", "all", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
         (
             ["example", "dmeo", "--out", "o"],
-            ["example: expected one of demo, fusion, late-data", "without-centre, got 'dmeo'"],
+            ["example: expected one of demo, late-data, live", "without-centre, got 'dmeo'"],
         ),
         (["demo", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0 to 4294967295, got 111"]),
         (["demo", "--out", "o", "--seed", "-1"], ["--seed: expected a whole number from 0 to 4294967295, got -1"]),

@@ -20,6 +20,7 @@ GROUP = "heliograph.studies"
 PAGES = {  # what is a page of the documentation, with blocks that run, by the name of the example that it was
     "delays": "delays.md",
     "event-triggered": "event_triggered.md",
+    "fusion": "fusion.md",
     "learning": "learning.md",
     "links-with-memory": "memory.md",
     "network-design": "design_from_arrays.md",
