@@ -389,3 +389,9 @@ def test_inspect_proposes_what_looks_like_the_measurement_and_the_count(folder, 
     (folder / "table.csv").write_text("battery,level,seq,at\n98,1.5,1,2026-09-27T10:00:00Z\n")
     assert cli.main(["inspect", "table.csv"]) == 0
     assert "json_field('level', node='NODE', output='OUTPUT', time='at', sequence='seq')" in capsys.readouterr().out
+    # Of several dates the one that is not the same in all, as of Influx.
+    rows = [f",,0,2026-09-27T09:00:00Z,2026-09-27T11:00:00Z,2026-09-27T10:0{k}:00Z,2{k}.1" for k in range(3)]
+    (folder / "flux.csv").write_text("\n".join([",result,table,_start,_stop,_time,_value", *rows, ""]))
+    assert cli.main(["inspect", "flux.csv"]) == 0
+    said = capsys.readouterr().out
+    assert "json_field('_value', node='NODE', output='OUTPUT', time='_time')" in said and "0.0167 Hz" in said

@@ -25,7 +25,7 @@ HOUSEKEEPING = re.compile(
     r"battery|batt|bat|voltage|linkquality|rssi|lqi|snr|link|signal|f_port|fport|port|channel|frequency|bandwidth|"
     r"spreading|coding|gateway|gateways|rx_metadata|rxinfo|txinfo|settings|data_rate|datarate|dr|version|firmware|"
     r"model|id|uptime|heap|free|wifi|timestamp|consumed_airtime|airtime|adr|confirmed|retain|qos|mid|status|error|"
-    r"errors|code|locations|header|covariance|layout"
+    r"errors|code|locations|header|covariance|layout|table|result"
 )
 # Names of running counts.
 COUNTS = re.compile(
@@ -44,6 +44,9 @@ class Topic:
         fields: dotted paths of their numbers.
         time: dotted path of their time; None if they have none.
         count: dotted path of their running count; None if they have none.
+        logged: when each was logged, or arrived, in nanoseconds since 1970.
+        late: seconds from the time in each to its logging.
+        dates: by dotted path the dates in the messages, in nanoseconds since 1970, and how late these are.
     """
 
     kind: str
@@ -51,6 +54,16 @@ class Topic:
     time: str | None = None
     logged: "array[int]" = field(default_factory=lambda: array("q"))
     late: "array[float]" = field(default_factory=lambda: array("d"))
+    dates: "dict[str, tuple[array[int], array[float]]]" = field(default_factory=dict)
+
+    def choose_time(self) -> None:
+        """Take for the time of the messages the first date that is not the same in all of them, or else the first."""
+        if self.time is not None or not self.dates:
+            return
+        vary = (path for path, (moments, _) in self.dates.items() if len(set(moments)) > 1)
+        self.time = next(vary, next(iter(self.dates)))
+        moments, self.late = self.dates[self.time]
+        self.logged = self.logged or moments
 
     @property
     def count(self) -> str | None:
@@ -63,6 +76,7 @@ class Topic:
 
     def row(self) -> list[str]:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
+        self.choose_time()
         times = np.sort(np.array(self.logged, dtype=np.int64))
         apart = np.diff(times) / SECOND
         span = float(apart.sum())
@@ -120,14 +134,13 @@ def _note(topics: dict[str, Topic], name: str, content: object, kind: str, arriv
         if isinstance(value, int | float) and path not in topic.fields:
             topic.fields.append(path)
         # A date in a message may be the time of its measurement.
-        if isinstance(value, str) and looks_like_date(value) and topic.time in (None, path):
+        if isinstance(value, str) and looks_like_date(value):
             with suppress(InputError):
                 time = nanoseconds(value, "s", path)
-                topic.time = path
-                if arrival is None:
-                    topic.logged.append(time)
-                else:
-                    topic.late.append((arrival - time) / SECOND)
+                moments, late = topic.dates.setdefault(path, (array("q"), array("d")))
+                moments.append(time)
+                if arrival is not None:
+                    late.append((arrival - time) / SECOND)
 
 
 def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
@@ -165,6 +178,7 @@ def suggestion(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) 
     lines = [f"# {node}: {', '.join(outputs)}" for node, outputs in names.items()]
     lines.append("sources = {")
     for name, topic in sorted(topics.items()):
+        topic.choose_time()
         fields = topic.measured()
         if not fields:
             continue
