@@ -250,6 +250,27 @@ def with_transition(function):
 
 SHIFTED = with_transition(lambda x, u: jax.lax.conv(x[None, None], jnp.ones((1, 1, 1)), (1,), "SAME")[0, 0])
 BEYOND = with_transition(lambda x, u: jax.scipy.special.erfinv(x / 9))
+
+
+class WithCovariance(hg.filters.AbstractFilter):
+    """A user's filter whose state is a mean and a covariance, which single precision may make indefinite."""
+
+    states, inputs, received, claim = ("x",), (), 1, "nominal"
+
+    def init(self):
+        return jnp.zeros(1), jnp.eye(1)
+
+    def predict(self, state, u, k):
+        return state[0], state[1] + 0.1
+
+    def correct(self, state, z, k):
+        gain = state[1] / (state[1] + 1.0)
+        return state[0] + gain[0] * (z - state[0]), (1.0 - gain) * state[1]
+
+    def estimate(self, state):
+        return hg.Estimate(*state, "nominal")
+
+
 HIDDEN = hg.gilbert_elliott(FADING, hg.hop(0.2, 0.05), 0.2, 0.3)
 
 
@@ -264,7 +285,7 @@ HIDDEN = hg.gilbert_elliott(FADING, hg.hop(0.2, 0.05), 0.2, 0.3)
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "while.c", "double", "a name that C takes"),
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "no/a.c", "double", "an existing folder"),
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "a.c", "half", "expected double or float, got 'half'"),
-        (lambda: hg.linear_filter(LINE, RANGE, HIDDEN), "a.c", "float", "or a schedule of gains, got ModalFilter"),
+        (lambda: WithCovariance(), "a.c", "float", "or a schedule of gains, got WithCovariance"),
         (lambda: "relay_aware", "a.c", "double", "export: expected a filter"),
     ],
 )  # fmt: skip
