@@ -76,6 +76,7 @@ CALLS = [  # what is called, and arguments with which it works
     (random_affine.Series, {"maps": [HOP]}),
     (random_affine.Stack, {"maps": [HOP]}),
     (hg.superposed, {"links": [HOP, HOP], "noise": 0.1, "same": True}),
+    (random_affine.Rotation, {"deviation": 0.3}),
     (random_affine.Superposed, {"maps": [HOP], "noise": COIN, "places": [(0,)], "inputs": 1}),
     (random_affine.square, {"base": HOP}),
     (random_affine.Constant, {"value": 1.0}),

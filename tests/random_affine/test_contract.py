@@ -36,6 +36,7 @@ CHANNELS = {
     "dropout of a direct link in series": hg.random_affine.Series(
         [hg.dropout(hg.model.with_direct_link(SCALAR, SCALAR), 0.6), hg.random_affine.known([[1.0, -0.5]])]
     ),
+    "rotation": hg.random_affine.Rotation(0.7),
     "silent": hg.model.silent(2, 3, 0.5),
     "sum": hg.superposed([SCALAR, hg.dropout(hg.hop(hg.Rayleigh(1.0), 0.1), 0.8)], 0.1),
     "sum of relays": hg.superposed([TWO_HOPS, hg.hop(hg.Rayleigh(0.5), 0.0, dimension=2)], SKEWED, same=True),

@@ -8,6 +8,7 @@ from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar, shown
 from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.planning.added import adds_up, design_added
 from heliograph.planning.budget import as_budget, power_limits, unlimited
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, steady_moment
@@ -43,6 +44,10 @@ def design(
     problem is convex, and the certificate is a gap. With more it is not: descents begin from every choice of the paths
     that send, if there are no more than `starts`, else from drawn ones, and the certificate is the global bound of the
     convex envelopes of each path's information.
+
+    Where one node receives a sum of links (`superposed`) of one scalar signal, the best amplitudes are closed forms and
+    the gap is 0; of several states they are searched, and no linear filter has less error than the bound, that of
+    links apart with the whole budget each.
 
     Numbers of any kind are free where `network` is a function of them that returns a network. Channels may then share
     gains, have observed losses or modes, or uncertain probabilities: the error is an upper bound then, with "young"
@@ -98,6 +103,8 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     if isinstance(problem.free, Mapping):
         expected = "names of transmitters (numbers are free of a function that returns a network)"
         raise fail("free", expected, shown(problem.free))
+    if isinstance(problem.network, Network) and adds_up(problem.network):
+        return design_added(problem, problem.network)
     starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
     error, network = problem.criterion, problem.network

@@ -61,7 +61,7 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         for k, second in enumerate(seconds)
     ]
     channels = {name: _over_time([step[name] for step in steps]) for name in nodes}
-    designed = {name: _designed(plant, node, channels[name]) for name, node in nodes.items()}
+    designed = {name: with_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
     if len(nodes) > 1:
         # All sensors and channels as one node, for the filter of all that is received.
@@ -98,7 +98,7 @@ def _checked(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str,
     }
 
 
-def _designed(plant: AnyPlant, node: Node, channel: Channel) -> Node:
+def with_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     """Return the node with this channel, and the best linear filter behind it."""
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or same(channel, node.channel):

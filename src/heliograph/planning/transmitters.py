@@ -25,6 +25,7 @@ from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
 from heliograph.random_affine.moments.second_moments import second_moment_tensor
+from heliograph.random_affine.rotation import Rotation
 from heliograph.random_affine.superposed import Superposed
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
@@ -103,7 +104,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
             pairs = [_visit(affine, visit, at) for affine, at in choices]
             visited = [affine for affine, _ in pairs]
             position = position if several else max((at for _, at in pairs), key=lambda at: at.hops)
-        case ModeOutput():
+        case ModeOutput() | Rotation():
             return channel, position
         # What wraps a link: inside it; the line of past signals goes into a map of the line.
         case Erasure() | OneStepLate() | Delayed() | DelayLine():
@@ -281,15 +282,15 @@ def allocate(
         if name in powers:
             now = sent_powers(channel, second, step)[name]
             if now <= 0 < powers[name]:
-                channel = _amplified(channel, name, None)
+                channel = amplified(channel, name, None)
                 now = sent_powers(channel, second, step)[name]
             if now <= 0 < powers[name]:
                 raise fail(f"transmitter {name!r}", "a signal that can be amplified", "none")
-            channel = _amplified(channel, name, np.sqrt(powers[name] / now) if now > 0 else 0.0)
+            channel = amplified(channel, name, np.sqrt(powers[name] / now) if now > 0 else 0.0)
     return channel
 
 
-def _amplified(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
+def amplified(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
     """Channel in which a transmitter amplifies by this factor more; None: sends what it receives, whatever it sent."""
 
     def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:

@@ -44,6 +44,9 @@ from .noise import (
 from .moments.second_moments import (
     second_order as second_order,
 )
+from .rotation import (
+    Rotation as Rotation,
+)
 from .superposed import (
     Superposed as Superposed,
 )

@@ -1,0 +1,246 @@
+"""Powers of transmitters whose signals add up: z = sum_i a_i g_i y_i + noise, with amplitudes a, errors and bounds.
+
+With b_i = E[g_i] c_i (rows of B), D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, t_i = E[y_i^2] and N the noise of
+links and receiver, a step tells J = B' a a' B / (a' D a + N) of the state. Of one scalar signal x that is
+j = (b' a)^2 / (a' D a + N), a generalised Rayleigh quotient:
+
+- total power sum_i a_i^2 t_i = P: a ~ (D + N T / P)^-1 b, j = b' (D + N T / P)^-1 b;
+- each a_i at most cap_i, D diagonal: a_i = min(theta b_i / D_i, cap_i), theta = (a' D a + N) / b' a;
+- both: D + nu T and N - nu P in place of D and N, with nu >= 0 at which the power is P.
+
+Of several states amplitudes are searched. No information is above B' (D + N T / P)^-1 B (Cauchy and Schwarz).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.types import Float
+from heliograph.planning.budget import PowerLimits, as_budget, power_limits
+from heliograph.planning.moments import check_constant_noise, check_design_plant, measurement_moment, steady_moment
+from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
+from heliograph.planning.realised import with_best_filter
+from heliograph.planning.transmitters import amplified, sent_powers, transmitter_names
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.random_affine.superposed import Superposed
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+Vector = Float[np.ndarray, "links"]
+ALIKE = 1e-12  # relative: rows of one signal, noises that are independent
+HALVINGS = 200  # of an interval that holds a multiplier
+
+
+class Links(NamedTuple):
+    """Links of a sum: rows B, noise D, power t of a unit amplitude, noise N, and the amplitudes at present."""
+
+    rows: Float[np.ndarray, "links n"]
+    noise: Float[np.ndarray, "links links"]
+    unit: Vector
+    floor: float
+    present: Vector
+
+    def information(self, amplitudes: Vector) -> Float[np.ndarray, "n n"]:
+        """J of a step."""
+        heard = amplitudes @ self.rows
+        noise = float(amplitudes @ self.noise @ amplitudes) + self.floor
+        return np.outer(heard, heard) / noise if noise > 0 else np.zeros((len(heard),) * 2)
+
+    def best_information(self, total: float) -> Float[np.ndarray, "n n"]:
+        """B' (D + N T / P)^-1 B, which no amplitudes of this total power exceed."""
+        noise = self.noise + np.diag(self.floor * self.unit / total)
+        bound: np.ndarray = self.rows.T @ np.linalg.solve(noise, self.rows)
+        return bound
+
+
+def adds_up(network: object) -> bool:
+    """Decide whether the one node of a network receives a sum of links."""
+    if not isinstance(network, Network) or network.relays is not None or network.common is not None:
+        return False
+    nodes = list(network.nodes.values())
+    return len(nodes) == 1 and isinstance(nodes[0], Node) and isinstance(nodes[0].channel, Superposed)
+
+
+def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
+    """Powers of the least steady error within the budget: closed forms of one signal, a search of several.
+
+    Raises:
+        ValueError: parts that the formulas do not cover; `hg.design` of a function of free numbers does.
+    """
+    (name, node), error = next(iter(network.nodes.items())), problem.criterion
+    assert isinstance(node, Node)
+    assert isinstance(node.channel, Superposed)
+    if problem.budget is None or problem.target_error is not None or problem.free is not None or error.steps > 1:
+        raise fail("design of a sum of links", "all powers free, the steady error, and a budget", "another problem")
+    plant, process = check_constant_noise(check_design_plant(network.plant))
+    second = np.asarray(measurement_moment(node.sensor, steady_moment(plant)))
+    links, unit_channel = links_of(node, second)
+    names = [f"{name}.{hop}" for hop in transmitter_names(node.channel)]
+    sent = links.present**2 * links.unit
+    limits = power_limits(as_budget(problem.budget), names, np.ones(len(names), dtype=bool), sent[None])
+    criterion = error.criterion(network.states)
+
+    def covariance(information: np.ndarray) -> np.ndarray:
+        return steady_error(np.asarray(plant.matrix), np.asarray(process.covariance), information)
+
+    def value(amplitudes: Vector) -> float:
+        return criterion.exact(covariance(links.information(amplitudes))[None])
+
+    caps = np.sqrt(np.minimum(limits.peak[0], limits.mean) / links.unit)
+    closed = closed_form(links, limits.total, caps)
+    starts = 1 if closed is not None else check_count("starts", problem.starts)
+    seed = check_seed("seed", problem.seed)
+    chosen = searched(links, limits.total, caps, value, starts, seed) if closed is None else closed
+    found = value(chosen)
+    bound = found if closed is not None else criterion.exact(covariance(_limit(links, limits, caps))[None])
+    channel: AbstractRandomAffine = unit_channel
+    for hop, amplitude in zip(transmitter_names(node.channel), chosen, strict=True):
+        channel = amplified(channel, hop, float(amplitude))
+    powers = {name: np.array([power]) for name, power in zip(names, chosen**2 * links.unit, strict=True)}
+    return PowerDesign(
+        problem=problem,
+        powers=powers,
+        error=found,
+        certificate=Certificate(closed is not None, found, bound, np.nan if closed is None else 0.0, starts, "error"),
+        present=value(links.present),
+        covariance=covariance(links.information(chosen))[None],
+        sensitivity=dict.fromkeys(names, float("nan")),
+        price=float("nan"),
+        numbers={},
+        realised=Network(network.plant, {name: with_best_filter(network.plant, node, channel)}),
+    )
+
+
+def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[Links, Superposed]:
+    """The links of a node's sum, and the sum with all amplitudes 1."""
+    sensor, channel = node.sensor, node.channel
+    if not isinstance(sensor, LinearSensor) or sensor.circular:
+        raise _unfit("a sensor that varies, is not linear or has angles")
+    assert isinstance(channel, Superposed)
+    if channel.outputs > 1 or channel.past or channel.remembers or channel.corner_count() > 1:
+        raise _unfit("several outputs, delays, memory or uncertain probabilities")
+    counts = [len(transmitter_names(link)) for link in channel.maps]
+    if any(count != 1 for count in counts) or any(link.inputs > 1 for link in channel.maps):
+        raise _unfit(f"{counts} hops and {[link.inputs for link in channel.maps]} numbers")
+    unit = channel
+    for hop in transmitter_names(channel):
+        whole = amplified(unit, hop, None)
+        assert isinstance(whole, Superposed)
+        unit = whole
+    described, now = [second_order(link) for link in unit.maps], [second_order(link) for link in channel.maps]
+    mean = np.array([float(d.mean_gain[0, 0]) for d in described])
+    spread = np.array([float(d.nominal.center[0, 0, 0, 0]) for d in described])
+    floor = sum(float(d.nominal.center[0, 0, -1, -1]) for d in described) + float(channel.noise.covariance[0, 0])
+    places = [at[0] for at in channel.places]
+    power = np.array(list(sent_powers(unit, second).values()))
+    shared = np.asarray(sensor.noise.covariance)[np.ix_(places, places)]
+    noise = np.outer(mean, mean) * shared + np.diag(spread * power)
+    present = np.sqrt(np.array(list(sent_powers(channel, second).values())) / power)
+    signs = np.array([np.sign(float(d.mean_gain[0, 0])) for d in now]) * np.sign(mean)
+    rows = mean[:, None] * np.asarray(sensor.matrix)[places]
+    return Links(rows, noise, power, floor, np.where(signs == 0, 1.0, signs) * present), unit
+
+
+def _unfit(got: str) -> ValueError:
+    expected = "links of one known hop each, for one number (else give a function of free numbers)"
+    return fail("design of a sum of links", expected, got)
+
+
+def steady_error(
+    matrix: Float[np.ndarray, "n n"], process: Float[np.ndarray, "n n"], information: Float[np.ndarray, "n n"]
+) -> Float[np.ndarray, "n n"]:
+    """Steady covariance after each step of a filter that learns this information at each."""
+    values, vectors = np.linalg.eigh(information)
+    used = values > ALIKE * max(values[-1], 0.0)
+    if not used.any():
+        return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))
+    output = (vectors[:, used] * np.sqrt(values[used])).T
+    prior = scipy.linalg.solve_discrete_are(matrix.T, output.T, process, np.eye(len(output)))
+    gain = np.linalg.solve(output @ prior @ output.T + np.eye(len(output)), output @ prior)
+    return np.asarray(prior - prior @ output.T @ gain)
+
+
+def closed_form(links: Links, total: float, caps: Vector) -> Vector | None:
+    """Best amplitudes of one scalar signal under a total, or under limits of each where noises are independent."""
+    _, sizes, right = np.linalg.svd(links.rows)
+    if len(sizes) > 1 and sizes[1] > ALIKE * sizes[0]:
+        return None
+    b = links.rows @ right[0]
+    if np.isfinite(total):
+        free = np.linalg.solve(links.noise + np.diag(links.floor * links.unit / total), b)
+        free = free * np.sqrt(total / (free**2 @ links.unit))
+        if np.all(np.abs(free) <= caps):
+            return np.asarray(free)
+    diagonal = np.diagonal(links.noise)
+    if np.any(np.abs(links.noise - np.diag(diagonal)) > ALIKE * np.sqrt(np.outer(diagonal, diagonal))):
+        return None
+
+    def at(nu: float) -> Vector:
+        return np.asarray(np.sign(b) * _capped(np.abs(b), diagonal + nu * links.unit, links.floor - nu * total, caps))
+
+    best: np.ndarray = np.sign(b) * _capped(np.abs(b), diagonal, links.floor, caps)
+    if best**2 @ links.unit <= total:
+        return best
+    low, high = 0.0, links.floor / total
+    for _ in range(HALVINGS):
+        nu = (low + high) / 2
+        low, high = (nu, high) if at(nu) ** 2 @ links.unit > total else (low, nu)
+    return at(high)
+
+
+def _capped(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
+    """a_i = min(theta b_i / D_i, cap_i) at the theta at which theta b' a = a' D a + N."""
+    ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
+
+    def at(theta: float) -> Vector:
+        return np.asarray(np.where(b > 0, np.minimum(theta * ratio, caps), 0.0))
+
+    def excess(theta: float) -> float:
+        a = at(theta)
+        return theta * float(b @ a) - float(noise @ a**2) - floor
+
+    low, high = 0.0, 1.0
+    while excess(high) < 0:
+        high *= 2
+        if high > 1 / ALIKE**2:
+            raise fail("budget", "one that limits every transmitter that helps", "no limit")
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+    return at(high)
+
+
+def searched(
+    links: Links, total: float, caps: Vector, value: Callable[[Vector], float], starts: int, seed: int
+) -> Vector:
+    """Amplitudes of the least error that searches from random starts find; signs matter."""
+    generator, best, found = np.random.default_rng(seed), links.present, np.inf
+    scale = np.minimum(caps, np.sqrt(total / links.unit))
+    if not np.all(np.isfinite(scale)):
+        raise fail("budget", "one that limits every transmitter", "no limit")
+
+    def allowed(x: Vector) -> Vector:
+        a = np.clip(x, -1, 1) * scale
+        power = float(a**2 @ links.unit)
+        return np.asarray(a * np.sqrt(total / power)) if power > total else a
+
+    def loss(x: Vector) -> float:
+        return value(allowed(x))
+
+    for _ in range(starts):
+        start = generator.uniform(-1.0, 1.0, len(scale))
+        result = scipy.optimize.minimize(loss, start, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
+        if result.fun < found:
+            best, found = allowed(np.asarray(result.x)), float(result.fun)
+    return best
+
+
+def _limit(links: Links, limits: PowerLimits, caps: Vector) -> Float[np.ndarray, "n n"]:
+    """Information that no amplitudes within the limits exceed: with the total, or with all that each may send."""
+    most = float(caps**2 @ links.unit)
+    return links.best_information(min(limits.total, most))

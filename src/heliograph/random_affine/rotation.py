@@ -1,0 +1,64 @@
+"""Pairs (real, imaginary) of a complex baseband signal, turned by a random phase."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.caching import cached
+from heliograph.numerics.check import scalar
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import known
+from heliograph.random_affine.moments.monomials import Moments, exponents, symmetric_power
+
+# (a, b, 1) to (w, its conjugate, 1) with w = a + i b.
+TO_COMPLEX = np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, 1]])
+
+
+class Rotation(AbstractRandomAffine):
+    """Pair (real, imaginary) turned by a phase phi of N(0, deviation^2): w -> exp(i phi) w for w = a + i b.
+
+    What is left of a phase that transmitters compensate; from a deviation of 9 rad on it is any phase, to rounding.
+    In w and its conjugate v the map is diagonal, E[exp(i phi)^p exp(-i phi)^q] = exp(-(p - q)^2 deviation^2 / 2).
+
+    Args:
+        deviation: standard deviation of the phase in rad.
+
+    Raises:
+        ValueError: a negative deviation.
+    """
+
+    deviation: Float[jax.Array | np.ndarray, ""]
+
+    def __init__(self, deviation: "Float[ArrayLike, '']"):
+        self.deviation = scalar("deviation of a phase", deviation, 0.0)
+
+    @property
+    def outputs(self) -> int:
+        """Always two."""
+        return 2
+
+    @property
+    def inputs(self) -> int:
+        """Always two."""
+        return 2
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw the rotation by phi."""
+        phi = self.deviation * jax.random.normal(key, dtype=float)
+        c, s = jnp.cos(phi), jnp.sin(phi)
+        return jnp.stack([jnp.stack([c, -s, 0 * c]), jnp.stack([s, c, 0 * c]), jnp.array([0.0, 0.0, 1.0])])
+
+    @cached
+    def moments(self, order: int) -> Moments:
+        """Return Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), C the map to w and its conjugate."""
+        turns = np.array([p - q for p, q, _ in exponents(3, order)])
+        factors = library(self.deviation).exp(-(turns**2) * self.deviation**2 / 2)
+        there, back = (symmetric_power(matrix, order) for matrix in (TO_COMPLEX, np.linalg.inv(TO_COMPLEX)))
+        matrix = (np.asarray(back) * factors) @ there
+        return Moments(matrix.real, 2, 2, order)
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Return the map exp(-deviation^2 / 2) y."""
+        return known(self.moments(1).mean[:-1, :-1])
