@@ -11,7 +11,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import PRECISE, add, times_vector
+from heliograph.numerics.linalg import add, times_vector
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.traced import is_traced, library
@@ -31,6 +31,7 @@ from heliograph.random_affine.superposed import Superposed
 
 Vector = Float[jax.Array | np.ndarray, " m"]
 Matrix = Float[jax.Array | np.ndarray, "m branches"]
+REGULAR = 1e-7  # least eigenvalue of a noise's correlations: with less, there is no noise in some combination
 TOLERANCE = 1e-12  # of correlations and of gains, that are zero but for rounding
 
 
@@ -223,7 +224,7 @@ def _check(covariance: Array, apart: bool) -> None:
     if apart and np.any(off > TOLERANCE):
         expected = "independent components (Huber, InverseMultiquadric, WoLF and Gate take correlated ones)"
         raise fail("noise of a robust filter", expected, f"a correlation of {off.max():.3g}")
-    if (least := np.linalg.eigvalsh(correlations)[0]) < PRECISE:
+    if (least := np.linalg.eigvalsh(correlations)[0]) < REGULAR:
         expected = "some in each combination of the received numbers"
         raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
 

@@ -14,7 +14,6 @@ from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
-from heliograph.numerics.linalg import with_rounding
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Series
@@ -276,10 +275,11 @@ class Lifted:
 def mean_and_spread(
     second: Float[Array, "N N"],
 ) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
-    """Mean and covariance from the second moments of (y, 1), with the rounding of the difference."""
+    """Mean and covariance from the second moments of (y, 1), with n + 2 units of rounding of what is subtracted."""
     second = np.asarray(second)
     mean = second[:-1, -1]
-    return mean, with_rounding(second[:-1, :-1], len(mean)) - np.outer(mean, mean)
+    rounding = (len(mean) + 2) * EPS * np.diag(np.diag(second)[:-1])
+    return mean, second[:-1, :-1] + rounding - np.outer(mean, mean)
 
 
 def affine(

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +15,9 @@ from heliograph.numerics.types import Array, Float
 UNROLL_LIMIT = 8  # above this size XLA compiles a loop over columns in less time; native code is written out always
 PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, given those before it, is zero
 NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
-PRECISE = 1e-7  # of a measurement's variance: noise below it costs the short form P - K C half of the digits
 OFF_SUPPORT = 1e-6  # standard deviations, and
 KNOWN = 16  # roundings of its size: a deviation of no more says that a component is known
 OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
-
-A = TypeVar("A", jax.Array, np.ndarray)
 
 
 def transpose(a: Array) -> jax.Array:
@@ -100,15 +96,6 @@ def diagonal(d: jax.Array) -> jax.Array:
 def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) -> float:
     """A relative tolerance, or so many units of an array's rounding where its precision does not allow that."""
     return max(tolerance, units * float(np.finfo(like.dtype).eps))
-
-
-def with_rounding(p: A, terms: int) -> A:
-    """P with (terms + 2) units of rounding more of each variance: what a difference P - B'B of so many terms may miss.
-
-    So what a precise measurement leaves is never less than nothing. P (n, n, ...), NumPy's or JAX's.
-    """
-    units = (terms + 2) * float(np.finfo(p.dtype).eps)
-    return p * (1 + units * np.eye(len(p), dtype=p.dtype)).reshape(p.shape[:2] + (1,) * (p.ndim - 2))
 
 
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
