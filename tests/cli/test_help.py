@@ -56,13 +56,13 @@ def test_bash_completes_a_word(capsys):
     assert "reproduce" in done.stdout.split()
 
 
-@pytest.mark.parametrize(("out", "expected"), [("out", "out"), ("out/fusion", "out"), ("fusion", ".")])
+@pytest.mark.parametrize(("out", "expected"), [("out", "out"), ("out/uwb", "out"), ("uwb", ".")])
 def test_results_are_not_put_one_folder_deeper_than_said(monkeypatch, out, expected):
     calls = []
     study = SimpleNamespace(settings=lambda values: values, run=lambda setting, place: calls.append(str(place)))
     monkeypatch.setattr("heliograph.cli.studies.load", lambda entry: study)
-    assert cli.main(["example", "fusion", "--out", out]) == 0 and calls == [expected]
-    assert cli.main(["reproduce", "quadratic-bias", "--out", out.replace("fusion", "quadratic-bias")]) == 0
+    assert cli.main(["example", "uwb", "--out", out]) == 0 and calls == [expected]
+    assert cli.main(["reproduce", "quadratic-bias", "--out", out.replace("uwb", "quadratic-bias")]) == 0
     assert calls[1] == expected
     assert cli.main(["reproduce", "all", "--out", "out/all"]) == 0 and set(calls[2:]) == {"out/all"}
 
