@@ -56,13 +56,13 @@ class Columns(NamedTuple):
 
 
 def joined(*parts: Columns) -> Columns:
-    """Sum of covariances: their columns side by side."""
+    """Add covariances: their columns side by side."""
     matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
     return Columns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
 
 
 def side_by_side(parts: Columns, weights: Array) -> Columns:
-    """Columns of sum_i w_i P_i of covariances P_i; `parts` have a leading axis."""
+    """Add covariances P_i with weights, sum_i w_i P_i; `parts` have a leading axis."""
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
     return Columns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
@@ -74,7 +74,7 @@ def nothing(n: int) -> Columns:
 
 
 def unit_lower(entries: Array) -> Any:
-    """L (..., n, n) of its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
+    """Build L (..., n, n) from its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
     xp, count = library(entries), entries.shape[-1]
     n = (1 + int(np.sqrt(1 + 8 * count))) // 2
     place = np.full((n, n), count)
@@ -82,17 +82,17 @@ def unit_lower(entries: Array) -> Any:
     np.fill_diagonal(place, count + 1)
     ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
     whole = xp.concatenate([entries, ends], axis=-1)
-    return whole[..., place] if xp is np else _taken(whole, place)
+    return whole[..., place] if xp is np else _take(whole, place)
 
 
 def below_diagonal(lower: jax.Array) -> jax.Array:
-    """Entries of L below its diagonal, row by row: the inverse of `unit_lower`."""
+    """Read off the entries of L below its diagonal, row by row: the inverse of `unit_lower`."""
     n = lower.shape[-1]
-    return _taken(lax.reshape(lower, (n * n,)), np.flatnonzero(np.tri(n, k=-1)))
+    return _take(lax.reshape(lower, (n * n,)), np.flatnonzero(np.tri(n, k=-1)))
 
 
-def _taken(entries: jax.Array, places: np.ndarray) -> jax.Array:
-    """Entries of the last axis at known places."""
+def _take(entries: jax.Array, places: np.ndarray) -> jax.Array:
+    """Take entries of the last axis at places that are known."""
     axis = entries.ndim - 1
     numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
     sizes = (*entries.shape[:-1], 1)
@@ -100,7 +100,7 @@ def _taken(entries: jax.Array, places: np.ndarray) -> jax.Array:
 
 
 def is_positive(x: jax.Array) -> jax.Array:
-    """Whether a number is above zero and 1 / x is a number too, which it is not of the smallest: these count as 0."""
+    """Test whether x is above zero and 1 / x is a number too, which it is not of the smallest: these count as 0."""
     return x > float(np.finfo(np.dtype(x.dtype)).tiny)
 
 
@@ -122,7 +122,7 @@ def square_root(x: jax.Array) -> jax.Array:
 
 
 def triangular(columns: Columns) -> Columns:
-    """L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
+    """Return L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
 
     d_j = |row j|^2 in the weights, L_ij = (row i, row j) / d_j, and row i loses L_ij row j. c n (n + 1) products for c
     columns, n reciprocals. A row that depends on those above it has d = 0 and adds nothing to those below.
@@ -144,7 +144,7 @@ def triangular(columns: Columns) -> Columns:
 
 
 def eliminated(covariance: jax.Array, least: float = 0.0) -> Columns:
-    """L and d with L diag(d) L' = P, by elimination: n^3 / 6 products, n reciprocals.
+    """Return L and d with L diag(d) L' = P, by elimination: n^3 / 6 products, n reciprocals.
 
     A pivot is known to eps of its own variance, of which rounding may leave less than nothing: it is at least `least`
     times it.
@@ -190,7 +190,7 @@ def root_of(covariance: np.ndarray) -> np.ndarray:
 
 
 def known_factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Entries of L below its diagonal and d of a known covariance, by the orthogonal rows of its root."""
+    """Factor a known covariance: entries of L below its diagonal, and d, by the orthogonal rows of its root."""
     rows = root_of(covariance)
     n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
     for j in range(n):
@@ -245,23 +245,23 @@ def unit_of(numbers: Array) -> float:
 
 
 def outer(a: jax.Array, b: jax.Array) -> jax.Array:
-    """a b' as a matrix product."""
+    """Return a b' as a matrix product."""
     return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
 
 
 def _at_least(pivot: jax.Array, floor: jax.Array) -> jax.Array:
-    """The larger of both; not by a maximum, which halves the derivative where both are zero."""
+    """Return the larger of both; not by a maximum, which halves the derivative where both are zero."""
     return jnp.where(pivot >= floor, pivot, floor)
 
 
 def _below(j: int, column: jax.Array) -> jax.Array:
-    """Column j of L without its diagonal: the entries below it, zeros above."""
+    """Return column j of L without its diagonal: the entries below it, zeros above."""
     n = len(column)
     return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
 
 
 def _factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> Columns:
-    """L and d of their columns below the diagonal and their entries."""
+    """Put L and d together from the columns below the diagonal and the entries of d."""
     n = len(variances)
     if not n:
         return Columns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
@@ -270,7 +270,7 @@ def _factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype
 
 
 def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
-    """`triangular` as a loop over the rows."""
+    """Compute `triangular` as a loop over the rows."""
     n = len(rows)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -286,7 +286,7 @@ def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
 
 
 def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
-    """`eliminated` as a loop over the columns."""
+    """Compute `eliminated` as a loop over the columns."""
     n, whole = len(covariance), jnp.diagonal(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

@@ -67,13 +67,13 @@ class Gaussian(NamedTuple):
 
 
 def of_columns(mean: jax.Array, columns: Columns) -> Gaussian:
-    """Gaussian whose covariance is a sum of squares: by orthogonal rows, to eps^2 of each variance."""
+    """Make a Gaussian whose covariance is a sum of squares: by orthogonal rows, to eps^2 of each variance."""
     factors = triangular(columns)
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
 def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
-    """Gaussian of the same by the sum's matrix: 2/3 of the products, each variance to n eps of itself."""
+    """Make the same Gaussian by the sum's matrix: 2/3 of the products, each variance to n eps of itself."""
     total = parts[0].covariance
     for part in parts[1:]:
         total = total + part.covariance
@@ -81,22 +81,22 @@ def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
 
 
 def of_matrix(mean: jax.Array, covariance: jax.Array) -> Gaussian:
-    """Gaussian of a covariance matrix that is a sum of squares, by elimination."""
+    """Make a Gaussian of a covariance matrix that is a sum of squares, by elimination."""
     factors = eliminated(covariance, len(covariance) * unit_of(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
 def given(mean: Array, covariance: Array) -> Gaussian:
-    """Gaussian of a covariance matrix, the border to all that has one; each variance to n eps of itself."""
+    """Make a Gaussian of a covariance matrix, the border to all that has one; each variance to n eps of itself."""
     if isinstance(covariance, np.ndarray):
-        known: Any = (mean if is_traced(mean) else np.asarray(mean), *known_factors(covariance))
-        return Gaussian(*known)
+        factors: Any = (mean if is_traced(mean) else np.asarray(mean), *known_factors(covariance))
+        return Gaussian(*factors)
     columns = eliminated(jnp.asarray(covariance), len(covariance) * unit_of(covariance))
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 
 def move(x: Gaussian, matrix: Array, shift: Array, noise: Columns) -> Gaussian:
-    """F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
+    """Move x to F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
     return of_columns(jnp.asarray(matrix @ x.mean + shift), joined(Columns(matrix @ x.root, x.variances), noise))
 
 
@@ -126,12 +126,12 @@ def with_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns) -
 
 
 def leading(x: Gaussian, n: int) -> Gaussian:
-    """Law of the first n components alone: the first rows of L."""
+    """Return the law of the first n components alone: the first rows of L."""
     return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
 
 
 def transform(x: Gaussian, image: Image, noise: Columns) -> Gaussian:
-    """f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w."""
+    """Return the law of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w."""
     return of_sum(image.mean, Columns(image.slopes, x.variances), image.curvature, noise)
 
 
@@ -147,7 +147,7 @@ class Innovations(NamedTuple):
 
     @property
     def determined(self) -> jax.Array:
-        """Which components those before them determine, to rounding (m,)."""
+        """Return which components those before them determine, to rounding (m,)."""
         return self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
 
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
@@ -156,12 +156,12 @@ class Innovations(NamedTuple):
         A component that those before it determine, s_j = 0 to rounding, adds nothing where it agrees with them and
         -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation.
         """
-        known = self.determined
-        safe = jnp.where(known, 1.0, self.variance)
+        determined = self.determined
+        safe = jnp.where(determined, 1.0, self.variance)
         density = -(self.value**2 * (1 / safe) + jnp.log(safe) + LOG_TURN) / 2
         reach = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
         agrees = jnp.where(jnp.abs(self.value) <= reach, 0.0, -jnp.inf)
-        return jnp.sum(jnp.where(present, jnp.where(known, agrees, density), 0.0))
+        return jnp.sum(jnp.where(present, jnp.where(determined, agrees, density), 0.0))
 
 
 def observe(
@@ -185,18 +185,20 @@ def observe(
     root, d = jnp.concatenate([x.root, rows[:, :n]]), x.variances
     news, values, totals = jnp.concatenate([x.mean, -rows[:, n]]), [], []
     for i in range(m):
-        root, d, gain, total = _measured(root, d, root[n + i], variance[i])
+        root, d, gain, total = _measure_scalar(root, d, root[n + i], variance[i])
         values.append(-news[n + i])
         totals.append(total)
         news = news + gain * values[i]
     after = Gaussian(news[:n], below_diagonal(root[:n]), d)
-    return after, Innovations(_vector(values), _vector(totals), whole)
+    return after, Innovations(_stack_numbers(values), _stack_numbers(totals), whole)
 
 
-def _measured(
+def _measure_scalar(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Rows V, variances d, gain and s after the scalar f' xi + v, Var v = r: s = f' diag(d) f + r, K = V diag(d) f / s.
+    """Update the rows V of a root and its variances d by one scalar measurement f' xi + v; return V, d, gain K and s.
+
+    With Var v = r, s = f' diag(d) f + r is the variance of the innovation, and K = V diag(d) f / s.
 
     With s_j = r + sum_{k >= j} f_k^2 d_k and w_j = sum_{k >= j} d_k f_k V_k, columns V_j of V:
     d_j+ = d_j s_{j+1} / s_j and V_j+ = V_j - (f_j / s_{j+1}) w_{j+1}. Ratios of sums of positive terms.
@@ -206,24 +208,25 @@ def _measured(
     """
     product = d * f
     s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(f * product, (0,))], 0)), (0,))
-    after, kept, w = _turned(root, d, product, f, s)
+    after, kept, w = _revise_columns(root, d, product, f, s)
     return after, kept, w * inverse(s[0]), s[0]
 
 
-def _turned(
+def _revise_columns(
     root: jax.Array, d: jax.Array, product: jax.Array, f: jax.Array, s: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
+    """Return V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
     n, lower = len(d), np.tril(np.ones(root.shape, bool))
     w = lax.cumsum(lax.select(lower, root * product, jnp.zeros_like(root)), axis=1, reverse=True)
     over = inverse(s)  # where s is 0, so is what it divides
-    here, next_ = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
+    # s_j and s_{j+1}, and one over each.
+    s_here, s_next = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
     over_here, over_next = lax.slice_in_dim(over, 0, n), lax.slice_in_dim(over, 1, n + 1)
     # w_{j+1} in the place of w_j, of the rows below: what is above the diagonal of L stays zero.
     later = lax.pad(lax.slice_in_dim(w, 1, n, axis=1), jnp.zeros((), w.dtype), [(0, 0, 0), (0, 1, 0)])
     strictly = np.concatenate([lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
     after = root - lax.select(strictly, later * (f * over_next), jnp.zeros_like(root))
-    kept = lax.select(is_positive(here), d * (next_ * over_here), d)
+    kept = lax.select(is_positive(s_here), d * (s_next * over_here), d)
     return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False)
 
 
@@ -245,14 +248,14 @@ def revise(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> G
     power = row * product
     before = jnp.append(0.0, lax.cumsum(power))
     s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
-    root, variances, w = _turned(x.root, x.variances, product, (1 - ratio) * row, s)
+    root, variances, w = _revise_columns(x.root, x.variances, product, (1 - ratio) * row, s)
     return Gaussian(x.mean + w * (inverse(s[0]) * shift), below_diagonal(root), variances)
 
 
 def moments_of_mixture(
     means: Float[jax.Array, "parts n"], covariances: Float[jax.Array, "parts n n"], weights: Float[jax.Array, " parts"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
+    """Return the mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
 
     Means are taken about the first: of some so large that all are equal nothing is left, and no rounding to be squared.
     """
@@ -263,7 +266,7 @@ def moments_of_mixture(
 
 
 def merge(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
-    """Gaussian with the moments of a mixture; `parts` have a leading axis."""
+    """Merge a mixture into one Gaussian of its moments; `parts` have a leading axis."""
     return of_matrix(*moments_of_mixture(parts.mean, parts.covariance, weights))
 
 
@@ -305,32 +308,32 @@ def backwards(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) 
     next_, d = jnp.concatenate([slopes, noise.matrix], axis=1), jnp.concatenate([x.variances, noise.weights])
     rounding = (UNITS * n**3 * unit_of(slopes)) ** 2 * (next_**2 @ d)
 
-    def measured(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def measure_part(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         f = root[n + i]
-        heard = f[:n] @ (d[:n] * f[:n]) > rounding[i]
-        return _measured(root, d, jnp.concatenate([jnp.where(heard, f[:n], 0.0), f[n:]]), zero)[:3]
+        is_informative = f[:n] @ (d[:n] * f[:n]) > rounding[i]
+        return _measure_scalar(root, d, jnp.concatenate([jnp.where(is_informative, f[:n], 0.0), f[n:]]), zero)[:3]
 
-    root, d, gains = _one_by_one(measured, n, jnp.concatenate([top, next_]), d)
+    root, d, gains = _measure_parts(measure_part, n, jnp.concatenate([top, next_]), d)
     left = Gaussian(x.mean, below_diagonal(root[:n, :n]), d[:n])
     return Backwards(left, gains[:n], ahead, below_diagonal(gains[n:]))
 
 
-def _one_by_one(
-    measured: Callable[..., tuple[jax.Array, jax.Array, jax.Array]], n: int, root: jax.Array, d: jax.Array
+def _measure_parts(
+    measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]], n: int, root: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Rows, variances d and gains (rows, n) after n measurements, of many as a loop."""
+    """Measure n parts one by one, many of them in a loop: rows, variances d and gains (rows, n) after them."""
     gains = list[jax.Array]()
     if n > WRITTEN:
 
         def body(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            root, d, gain = measured(i, *carry[:2])
+            root, d, gain = measure_part(i, *carry[:2])
             return root, d, carry[2].at[:, i].add(gain)
 
         start = root, d, jnp.zeros((len(root), n), root.dtype)
         looped: tuple[jax.Array, jax.Array, jax.Array] = lax.fori_loop(0, n, body, start)
         return looped
     for i in range(n):
-        root, d, gain = measured(i, root, d)
+        root, d, gain = measure_part(i, root, d)
         gains.append(lax.expand_dims(gain, (1,)))
     return root, d, lax.concatenate(gains, 1)
 
@@ -340,9 +343,9 @@ def smoothed(back: Backwards, later: Gaussian) -> Gaussian:
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
-    known = Columns(back.gain @ back.apart(later.root), later.variances)
-    return of_columns(back.mean_given(later.mean), joined(known, back.left.columns))
+    carried = Columns(back.gain @ back.apart(later.root), later.variances)
+    return of_columns(back.mean_given(later.mean), joined(carried, back.left.columns))
 
 
-def _vector(entries: list[jax.Array]) -> jax.Array:
+def _stack_numbers(entries: list[jax.Array]) -> jax.Array:
     return jnp.stack(entries) if entries else jnp.zeros(0)

@@ -182,7 +182,7 @@ class AbstractFilter(Module):
         return self
 
     def as_large_as(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":
-        """Return the same filter with arrays of the lengths that the other ones have, so that one program steps all."""
+        """Return the same filter with arrays as long as the longest of the others, so that one program steps all."""
         return self
 
     def angles_used(self) -> FilterAngles | None:
@@ -279,9 +279,9 @@ def step_with_judgement(
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     estimate = filter.after_step(after, k)
-    known = filter.estimate(state), filter.estimate(prior), estimate
+    estimates = filter.estimate(state), filter.estimate(prior), estimate
     spoilt = inputs_spoil(filter, filter.inputs, u, k)
-    judgement = judge(filter.claim, (state, prior, after), known, innovation, z, filter.of_atoms, spoilt)
+    judgement = judge(filter.claim, (state, prior, after), estimates, innovation, z, filter.of_atoms, spoilt)
     return after, estimate, judgement, innovation
 
 

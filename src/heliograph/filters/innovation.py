@@ -201,8 +201,8 @@ def summarise_innovations(innovations: Weighed) -> tuple[InnovationSummary, ...]
 
 
 def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
-    there = np.isfinite(value)
-    e, w, d2 = value[there], weight[there], value[there] ** 2 / variance[there]
+    arrived = np.isfinite(value)
+    e, w, d2 = value[arrived], weight[arrived], value[arrived] ** 2 / variance[arrived]
     down, count = int(np.sum(w < HALF)), len(e)
     if not count:
         return InnovationSummary(len(value), 0, 0, wilson(0, 0), 0.0, *[float("nan")] * 5)

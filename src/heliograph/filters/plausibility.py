@@ -143,16 +143,16 @@ def judge(
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
     every, certain = _squares(value, covariance, present, size)
-    distance, count = _total(every), _total(present.astype(value.dtype))
+    distance, count = _add_up(every), _add_up(present.astype(value.dtype))
 
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     squares, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
-    far = _some((free > most) | (larger & jnp.isinf(value))) | (_total(free) > most)
+    far = _any_true((free > most) | (larger & jnp.isinf(value))) | (_add_up(free) > most)
     # Excluded: all determined, and one of them differs.
-    excluded = _some(jnp.isinf(every) & certain) & ~_some(~certain & present)
+    excluded = _any_true(jnp.isinf(every) & certain) & ~_any_true(~certain & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
 
@@ -162,17 +162,17 @@ def judge(
     predicted = (_finite(before, claim) & ~_is_prediction(prior, claim)) | _overflows(states[0], states[1])
     predicted |= spoilt
     reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
-    came = (count > 0) | _some(~jnp.isnan(z))  # also where what was expected is no number
+    came = (count > 0) | _any_true(~jnp.isnan(z))  # also where what was expected is no number
     reason = jnp.where(unsound & came & ~far, Reason.UNSOUND, reason)
     reason = jnp.where(predicted, Reason.PREDICTION, reason)
     # Inputs that move the mean to where its deviation is below its rounding.
-    digits = _some(_rounded_away(prior) & ~_rounded_away(before)).astype(value.dtype)
-    known = jnp.nan if claim == "none" else digits
+    digits = _any_true(_rounded_away(prior) & ~_rounded_away(before)).astype(value.dtype)
+    input_verdict = jnp.nan if claim == "none" else digits
     distance = jnp.where((count > 0) & (sound | (reason > 0)), distance, jnp.nan)
-    return Judgement(distance, count, reason.astype(value.dtype), jnp.asarray(known))
+    return Judgement(distance, count, reason.astype(value.dtype), jnp.asarray(input_verdict))
 
 
-def _some(which: jax.Array) -> jax.Array:
+def _any_true(which: jax.Array) -> jax.Array:
     """Test whether any is true; for few without a loop, which would cost more than the operations themselves."""
     flat = which.reshape(-1)
     if not 0 < len(flat) <= FEW:
@@ -180,25 +180,25 @@ def _some(which: jax.Array) -> jax.Array:
     return reduce(jnp.logical_or, [jax.lax.index_in_dim(flat, i, keepdims=False) for i in range(len(flat))])
 
 
-def _total(values: jax.Array) -> jax.Array:
-    """Sum of values; for few without a loop."""
+def _add_up(values: jax.Array) -> jax.Array:
+    """Add up values; for few without a loop."""
     if not 0 < len(values) <= FEW:
         return jnp.sum(values)
     return add([jax.lax.index_in_dim(values, i, keepdims=False) for i in range(len(values))])
 
 
 def _squares(value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Squared distances of the components in use, one after another, and which of these the others determine."""
+    """Return the squared distances of the components in use, in turn, and which of these the others determine."""
     if not len(value):
         return jnp.zeros(0), jnp.zeros(0, dtype=bool)
-    known = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
-    squares, determined = squared_distances(known, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
+    padded = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
+    squares, determined = squared_distances(padded, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
     return jnp.where(used, squares, 0.0), used & determined
 
 
 def _finite(estimates: Estimate, claim: Claim) -> jax.Array:
-    finite = ~_some(~jnp.isfinite(jnp.asarray(estimates.mean)))
-    return finite if claim == "none" else finite & ~_some(~jnp.isfinite(jnp.asarray(estimates.covariance)))
+    finite = ~_any_true(~jnp.isfinite(jnp.asarray(estimates.mean)))
+    return finite if claim == "none" else finite & ~_any_true(~jnp.isfinite(jnp.asarray(estimates.covariance)))
 
 
 def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
@@ -207,7 +207,7 @@ def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
         return _finite(estimates, claim)
     left, whole = diagonal_of(jnp.asarray(estimates.covariance)), diagonal_of(jnp.asarray(before.covariance))
     rounded = rounding(NEGATIVE_TOLERANCE, left) * jnp.where(jnp.isfinite(whole), jnp.abs(whole), 0.0)
-    return _finite(estimates, claim) & ~_some(left < -rounded)
+    return _finite(estimates, claim) & ~_any_true(left < -rounded)
 
 
 def _is_prediction(prior: Estimate, claim: Claim) -> jax.Array:
@@ -216,13 +216,13 @@ def _is_prediction(prior: Estimate, claim: Claim) -> jax.Array:
         return _finite(prior, claim)
     variances = diagonal_of(jnp.asarray(prior.covariance))
     largest = jnp.max(jnp.abs(variances), initial=0.0)
-    return _finite(prior, claim) & ~_some(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
+    return _finite(prior, claim) & ~_any_true(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
     """Test whether some number of a state became infinite."""
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
-    items = [_some(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
+    items = [_any_true(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
     return reduce(jnp.logical_or, items, jnp.asarray(False))
 
 

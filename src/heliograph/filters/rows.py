@@ -112,11 +112,11 @@ def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
 
 
 def _results(filter: Steps, z: Array, u: Array) -> PyTree:
-    def single(state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+    def outputs_of(state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
         estimate = filter.after_step(state, k)
         return estimate.mean, estimate.covariance, innovation
 
-    return over_rows(filter, z, u, single)
+    return over_rows(filter, z, u, outputs_of)
 
 
 _by_xla = quickly_compiled(_results)

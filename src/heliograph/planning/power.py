@@ -120,7 +120,7 @@ def power(
     # What the hops make of it.
     power, error = {}, {}
     for name, (_, channel) in sources.items():
-        batches = [[_at_step(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in y[name]]
+        batches = [[_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in y[name]]
         for hop in batches[0][0]:
             values = np.array([[now[hop] for now in batch] for batch in batches])
             power[f"{name}.{hop}"] = values.mean(axis=0)
@@ -129,9 +129,9 @@ def power(
     return SentPower(power, error, rate)
 
 
-def _at_step(channel: Channel, k: int, second: np.ndarray, horizon: int | None) -> dict[str, float]:
-    """Powers sent at a step, or where there is no horizon in the long run."""
-    return steady_powers(at(channel, k), second) if horizon is None else sent_powers(at(channel, k), second, k)
+def _powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
+    """Return the powers sent at step k for `moment` = E (y, 1)(y, 1)', or in the long run if there is no horizon."""
+    return steady_powers(at(channel, k), moment) if horizon is None else sent_powers(at(channel, k), moment, k)
 
 
 def _sources(network: Network) -> Sources:

@@ -76,18 +76,18 @@ def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
         case Erasure():
             # Either what the base delivers, or nothing.
             arrival, lost = plain(channel.arrival), np.zeros(channel.outputs, dtype=bool)
-            results = [o._replace(probability=arrival * o.probability) for o in outcomes(channel.base)]
-            results.append(Outcome(1 - arrival, known(np.zeros((channel.outputs, channel.inputs))), lost))
+            listed = [o._replace(probability=arrival * o.probability) for o in outcomes(channel.base)]
+            listed.append(Outcome(1 - arrival, known(np.zeros((channel.outputs, channel.inputs))), lost))
         # Losses of independent parts: probabilities multiply.
         case Series() | Stack():
-            join = _after if isinstance(channel, Series) else _others
-            results = reduce(lambda done, more: _joint(done, more, join), map(outcomes, channel.maps))
+            join = _join_series if isinstance(channel, Series) else _join_parallel
+            listed = reduce(lambda done, more: _join_outcomes(done, more, join), map(outcomes, channel.maps))
         case _:
             raise fail("channel with erasures", "erasures in series and stacks", type(channel).__name__)
-    return [o for o in results if is_traced(o.probability) or o.probability > 0]
+    return [o for o in listed if is_traced(o.probability) or o.probability > 0]
 
 
-def _joint(
+def _join_outcomes(
     a: list[Outcome], b: list[Outcome], join: Callable[[Outcome, Outcome], tuple[AbstractRandomAffine, np.ndarray]]
 ) -> list[Outcome]:
     if len(a) * len(b) > OUTCOME_LIMIT:
@@ -95,7 +95,7 @@ def _joint(
     return [Outcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
 
 
-def _after(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+def _join_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     """Join outcomes in series: an output is lost where y loses it or has a gain on what x lost."""
     received = known(np.diag(x.arrived.astype(float)))
     power = second_moments(y.map)[1][..., :-1, :-1]  # E[G_ia G_jb]
@@ -103,8 +103,8 @@ def _after(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
 
 
-def _others(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
-    """Join outcomes of parallel maps, stacked."""
+def _join_parallel(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+    """Join outcomes in parallel: the outputs of both, one after another."""
     return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
 
 

@@ -173,18 +173,19 @@ def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.nd
     """
     # Sets of losses, and the sums of rows with known gain in each.
     kinds = list(dict.fromkeys(tuple(o.arrived.tolist()) for outcome in links.outcomes for o in outcome))
-    weights = [
+    # Cases: mode i, outcome o, and the number s of the outcome's set of losses.
+    cases = [
         (i, o, kinds.index(tuple(o.arrived.tolist()))) for i, outcome in enumerate(links.outcomes) for o in outcome
     ]
-    parts = [_certain([o for _, o, s in weights if s == kind], links, space) for kind in range(len(kinds))]
+    parts = [_certain([o for _, o, s in cases if s == kind], links, space) for kind in range(len(kinds))]
     # Chain of (mode, outcome), with its long-run law.
-    values = np.array([s for _, _, s in weights])
-    mode = np.array([i for i, _, _ in weights])
-    probability = np.array([o.probability for _, o, _ in weights])
+    kind_of_case = np.array([s for _, _, s in cases])
+    mode = np.array([i for i, _, _ in cases])
+    probability = np.array([o.probability for _, o, _ in cases])
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
-    noises = tuple(parts[s].noise(o, links) for _, o, s in weights)
-    system = KnownLossSystem(a, q, chain, law, values, tuple(outcome.rows for outcome in parts), noises)
+    noises = tuple(parts[s].noise(o, links) for _, o, s in cases)
+    system = KnownLossSystem(a, q, chain, law, kind_of_case, tuple(outcome.rows for outcome in parts), noises)
     return KnownLosses(system, kinds, parts)
 
 
@@ -210,7 +211,10 @@ class Certain(NamedTuple):
 
 
 def _certain(alike: Sequence[Outcome], links: Links, space: Float[np.ndarray, "n d"]) -> Certain:
-    """Null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same, Y the subspace."""
+    """Find the sums of known gain: the null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same.
+
+    Y is a basis of the subspace `space`.
+    """
     moments = [second_moments(o.map) for o in alike]
     mean = np.mean([m for m, _ in moments], axis=0)
     arrived = np.flatnonzero(alike[0].arrived)

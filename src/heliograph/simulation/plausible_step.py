@@ -25,8 +25,8 @@ RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 def implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
     """Test whether some filter judges its measurement implausible."""
-    items = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
-    return jnp.any(jnp.stack(items)) if items else jnp.asarray(False)
+    flags = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
+    return jnp.any(jnp.stack(flags)) if flags else jnp.asarray(False)
 
 
 def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
@@ -97,11 +97,11 @@ class Judges:
     def _rows(
         self, outputs: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
-        items = [[field[..., f, i] for field in outputs["judged"][k]] for k, f, i in places]
-        items += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
-        if not items:
+        judgements = [[field[..., f, i] for field in outputs["judged"][k]] for k, f, i in places]
+        judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
+        if not judgements:
             return np.zeros((0, len(Judgement._fields)))
-        return np.moveaxis(np.array(items), (0, 1), (-2, -1))
+        return np.moveaxis(np.array(judgements), (0, 1), (-2, -1))
 
     @property
     def without_own(self) -> list[str]:
@@ -129,7 +129,7 @@ def doubts(
     refused: Mapping[str, Mapping[int, str]],
     u: Float[np.ndarray, "steps inputs"],
 ) -> list[str]:
-    """Messages about a recording: rows that are implausible, or to one filter alone, and inputs."""
+    """Return messages about a recording: rows that are implausible to all filters or to one alone, and inputs."""
     # Rows that are implausible for all filters of a node.
     faults = _Faults(network, outputs, u)
     lines = []
@@ -138,13 +138,13 @@ def doubts(
         fault = next((said for name in network.nodes[node].filters if (said := faults.of(node, name, row))), "")
         lines.append(f"node {node!r}: {_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
     # Rows that a single filter skips.
-    items = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
+    at_nodes = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
             for (node, name), (kind, f, i) in network.places.items()}  # fmt: skip
-    every = {(FUSED, name): list(judgement) for name, judgement in outputs["judged_centrally"].items()}
+    at_centres = {(FUSED, name): list(judgement) for name, judgement in outputs["judged_centrally"].items()}
     all_rows = {k: "" for rows in refused.values() for k in rows}
-    for (node, name), (distance, _, reason, _) in (items | every).items():
-        known = all_rows if node == FUSED else refused.get(node, {})
-        rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in known]
+    for (node, name), (distance, _, reason, _) in (at_nodes | at_centres).items():
+        reported = all_rows if node == FUSED else refused.get(node, {})
+        rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in reported]
         if rows:
             why = in_words(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
             lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
@@ -181,15 +181,15 @@ class _Faults:
 
 
 def _flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
-    """Rows that some filter flags."""
+    """Return the rows that some filter flags."""
     if not votes.size:
         return []
-    results: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(field)] > 0).any(axis=-1)).tolist()
-    return results
+    flagged: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(field)] > 0).any(axis=-1)).tolist()
+    return flagged
 
 
 def _rows(rows: Sequence[int]) -> str:
-    """Rows from 1, the first few."""
+    """Write rows as text, counted from 1: the first few."""
     listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"
 

@@ -61,21 +61,21 @@ class ChannelGroup(Module):
 
 def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     """Stack channels by structure; each is looked at once, however many names have it."""
-    items, memories = list(channels.values()), list(memory_places(channels).values())
+    listed, memories = list(channels.values()), list(memory_places(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
-    kinds = {id(channel): without_names(channel) for channel in {id(c): c for c in items}.values()}
+    kinds = {id(channel): without_names(channel) for channel in {id(c): c for c in listed}.values()}
     alike: dict[object, dict[int, int]] = {}
     for which, kind in kinds.items():
         same = alike.setdefault(structure(kind), {})
         same[which] = len(same)
-    results = []
+    groups = []
     for same in alike.values():
-        places = np.array([e for e, channel in enumerate(items) if id(channel) in same])
-        rows = np.array([same[id(items[e])] for e in places])
+        places = np.array([e for e, channel in enumerate(listed) if id(channel) in same])
+        rows = np.array([same[id(listed[e])] for e in places])
         kind = stack([kinds[which] for which in same])
         channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, kind)
-        results.append(ChannelGroup(channel, checksums[places], np.stack([memories[e] for e in places]), places))
-    return tuple(results)
+        groups.append(ChannelGroup(channel, checksums[places], np.stack([memories[e] for e in places]), places))
+    return tuple(groups)
 
 
 class Late(NamedTuple):

@@ -47,7 +47,7 @@ class Smoother(Module):
     groups: tuple[int, ...] = eqx.field(static=True)
 
     def both(self, outputs: PyTree) -> PyTree:
-        """Results of a run (time, ...) for a reducer, "filtered" and "smoothed", and sums of the NIS."""
+        """Return filtered and smoothed results of a run (time, ...), as a reducer takes them, and sums of the NIS."""
         steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
         filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
         # Smoothed estimates of nodes and central filters, then their fusions.

@@ -36,7 +36,7 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     Shapes: centre and variance (m,), variance positive; radius ().
     """
     if len(centre) == 1:
-        return _joined(_slice(centre[0], variance[0], radius, inside))
+        return _join_pieces(_cut_component(centre[0], variance[0], radius, inside))
     # Where e_1 lies inside of the radius: the moments of the others at each node.
     first, deviation = centre[0], jnp.sqrt(variance[0])
     near = jnp.clip(first, -radius, radius)
@@ -50,17 +50,17 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     covariance = jnp.zeros((len(e), *variance.shape * 2)).at[:, 1:, 1:].set(others.covariance)
     pieces = BallMoments(weight + others.log_mass, mean, covariance)
     if inside:
-        return _joined(pieces)
+        return _join_pieces(pieces)
     # Where it does not: above and below, and the others anywhere.
-    tails = _slice(first, variance[0], radius, False)
+    tails = _cut_component(first, variance[0], radius, False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
     free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
     wide = BallMoments(tails.log_mass, mean, free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
-    return _joined(BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True))))
+    return _join_pieces(BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True))))
 
 
 def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: bool) -> Parts:
-    """Each Gaussian cut to |D x| <= radius, or to where it is more, and the Gaussian of the same moments.
+    """Cut each Gaussian to |D x| <= radius, or to where it is more, and take the Gaussian of the same moments.
 
     With Cov(D x) = V diag(s) V', e = V' D x has independent components. Of those that are known to vary, x is given
     exactly, and then E e and Cov e enter with K = Cov(x, e) diag(s)^-1: mean m + K (E e - V' D m), and columns K more.
@@ -68,7 +68,7 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
     Shapes: directions (m, N).
     """
 
-    def single(x: Gaussian) -> tuple[jax.Array, Gaussian]:
+    def cut_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
         rows, centre = directions @ x.root, directions @ x.mean
         variance, turn = eigh(Columns(rows, x.variances).covariance)
         # What has no variance lies where it is.
@@ -76,19 +76,19 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
         rows, centre = turn.T @ rows, turn.T @ centre
         size = jnp.maximum(variance, least)
         moments = ball_moments(centre, size, radius, inside)
-        known = (variance > least) & jnp.isfinite(moments.log_mass)
-        gain = jnp.where(known, (x.root * x.variances) @ rows.T / size, 0.0)
-        given, _ = observe(x, rows, jnp.zeros(len(rows)), nothing(len(rows)), known)
-        mean = x.mean + gain @ jnp.where(known, moments.mean - centre, 0.0)
+        varies = (variance > least) & jnp.isfinite(moments.log_mass)
+        gain = jnp.where(varies, (x.root * x.variances) @ rows.T / size, 0.0)
+        given, _ = observe(x, rows, jnp.zeros(len(rows)), nothing(len(rows)), varies)
+        mean = x.mean + gain @ jnp.where(varies, moments.mean - centre, 0.0)
         spread = eliminated(moments.covariance).through(gain)
         return moments.log_mass, of_columns(mean, joined(given.columns, spread))
 
-    log_mass, after = jax.lax.map(single, parts.gaussian)
+    log_mass, after = jax.lax.map(cut_one, parts.gaussian)
     return Parts(parts.log_weight + log_mass, after, parts.label)
 
 
-def _slice(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
-    """One component within the radius, (1, ...), or below and above it, (2, ...)."""
+def _cut_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+    """Cut one component to within the radius, (1, ...), or below and above it, (2, ...)."""
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
     if inside:
@@ -102,8 +102,8 @@ def _slice(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bo
     return BallMoments(jnp.where(possible, moments.log_mass, -jnp.inf), mean[:, None], spread[:, None, None])
 
 
-def _joined(pieces: BallMoments) -> BallMoments:
-    """Moments of the mixture of pieces."""
+def _join_pieces(pieces: BallMoments) -> BallMoments:
+    """Join the pieces: moments of their mixture."""
     top = jnp.max(pieces.log_mass)
     top = jnp.where(jnp.isfinite(top), top, 0.0)
     weight = jnp.exp(pieces.log_mass - top)

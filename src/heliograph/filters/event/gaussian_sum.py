@@ -124,24 +124,24 @@ class EventFilter(AbstractSizedFilter):
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        single = Parts(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
+        prior_sum = Parts(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
         begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.of(self._alone(single), begun, jnp.asarray(False))
+        return EventBelief.of(self._pad_sum(prior_sum), begun, jnp.asarray(False))
 
-    def _alone(self, single: Parts) -> Parts:
-        """One Gaussian in a sum of which all others have no weight."""
+    def _pad_sum(self, one: Parts) -> Parts:
+        """Pad a sum of one Gaussian with others that have no weight."""
         count = self._known_slots + (self.lost if self.follows else 0)
-        every: Parts = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), single)
-        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, single.log_weight[0], -jnp.inf))
+        every: Parts = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
+        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
 
     @property
     def _known_slots(self) -> int:
-        """Gaussians with a known reference: parts of the interval, and what lies outside where that may be silent."""
+        """Number of Gaussians with a known reference: parts of the interval, and of the outside if it may be silent."""
         return self.known + (self._outside if self.loses and not self.follows else 0)
 
     @property
     def _outside(self) -> int:
-        """Parts of what is outside of a sender's region."""
+        """Number of parts of what is outside of a sender's region."""
         return 2 * len(range(self.outputs)[self.senders[0]]) + self.ball
 
     @property
@@ -151,7 +151,7 @@ class EventFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
-        """x moves and r stays, or is the prediction; modes move, and it is one step longer since the last sent."""
+        """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
         plant, u, start = at(self.plant, k), jnp.asarray(u), start_of(self.plant)
         both = jax.vmap(lambda x: moved(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
@@ -171,7 +171,7 @@ class EventFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:
-        """Use what came, and that nothing came."""
+        """Correct with the values that came, and with the silence of the senders from which none came."""
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
@@ -182,37 +182,43 @@ class EventFilter(AbstractSizedFilter):
             mine = values[those] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
             wide = augmented(plant, sensor, self.transform, parts, start)
-            there = jnp.any(~jnp.isnan(mine))
-            after, expected, spread = self._used(wide, channel, mine, lost, s, begun[s])
+            arrived = jnp.any(~jnp.isnan(mine))
+            after, expected, spread = self._condition_on_sender(wide, channel, mine, lost, s, begun[s])
             whole = log_total(after.log_weight)
             total, parts = total + whole, after.times(-whole)
-            begun = begun.at[s].set(begun[s] | (there if self.trigger.reference == "acknowledged" else True))
+            begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
             value.append(mine - expected)
             covariance.append(spread)
-        innovation = Innovation(*_with_losses(jnp.concatenate(value), covariance, losses), total)
+        innovation = Innovation(*_append_losses(jnp.concatenate(value), covariance, losses), total)
         return EventBelief.of(parts, begun, state.moved), innovation
 
-    def _used(
+    def _condition_on_sender(
         self, wide: Parts, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[Parts, jax.Array, jax.Array]:
-        """The sum after what a sender's value says, or its silence; what was to be expected of a value."""
+        """Condition on a sender's value or on its silence; return the mean and covariance expected of a value too."""
 
         def silent(wide: Parts) -> tuple[Parts, jax.Array, jax.Array]:
-            return self._silent(wide, channel, lost, s, begun), jnp.zeros_like(z), jnp.zeros((len(z), len(z)))
+            return (
+                self._condition_on_silence(wide, channel, lost, s, begun),
+                jnp.zeros_like(z),
+                jnp.zeros((len(z), len(z))),
+            )
 
         def came(wide: Parts) -> tuple[Parts, jax.Array, jax.Array]:
-            return self._came(wide, channel, z, lost, s, begun)
+            return self._condition_on_value(wide, channel, z, lost, s, begun)
 
         used: tuple[Parts, jax.Array, jax.Array] = jax.lax.cond(jnp.any(~jnp.isnan(z)), came, silent, wide)
         return used
 
-    def _silent(self, wide: Parts, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array) -> Parts:
-        """Nothing came: not sent, or sent and lost."""
+    def _condition_on_silence(
+        self, wide: Parts, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array
+    ) -> Parts:
+        """Condition the sum on silence: nothing was sent, or it was sent and lost."""
         n, m, sender = len(self.states), self.outputs, self.senders[s]
         as_it_was, label = np.r_[0 : n + m], wide.label[:, s]
         waiting, due = self._by_age(label, begun)
         loss = self._loss(channel, s)[:, None, None]
-        dropped, forced = (_sent(which * loss, True) for which in (waiting, due))
+        dropped, forced = (_relabel_sent(which * loss, True) for which in (waiting, due))
         if self.trigger.losses == "known":
             waiting = jnp.where(lost > 0, 0.0, waiting)
             dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
@@ -220,28 +226,28 @@ class EventFilter(AbstractSizedFilter):
         # Known reference: every Gaussian cut to each part of the line, and joined part by part.
         if not self.follows:
             inside = wide.labelled(s, waiting + forced if self.loses else waiting)
-            slots, _ = self._inside(inside, inside.some(0, 0), sender)
+            slots, _ = self._cut_to_region(inside, inside.some(0, 0), sender)
             if self.loses:
-                outside = self._outside_of(wide.labelled(s, dropped + forced), sender, 1.0)
+                outside = self._cut_to_outside(wide.labelled(s, dropped + forced), sender, 1.0)
                 slots = together([slots, join(outside, self._outside)])
             return self._or_nothing(slots.keep(as_it_was), wide)
 
         # Reference that may be a value that was lost: not sent, with the reference as it was ...
         unsent = wide.labelled(s, waiting)
-        slots, others = self._inside(unsent.some(0, self.known), unsent.some(self.known), sender)
+        slots, others = self._cut_to_region(unsent.some(0, self.known), unsent.some(self.known), sender)
         # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
-        outside = join(self._outside_of(wide.labelled(s, dropped), sender, 1.0), self._outside)
+        outside = join(self._cut_to_outside(wide.labelled(s, dropped), sender, 1.0), self._outside)
         fresh = together([outside, join(wide.labelled(s, forced))]).keep(self._renewed(sender))
         few = reduced(together([others.keep(as_it_was), fresh]), self.lost, slice(n + sender.start, n + sender.stop))
         return self._or_nothing(together([slots.keep(as_it_was), few]), wide)
 
-    def _came(
+    def _condition_on_value(
         self, wide: Parts, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[Parts, jax.Array, jax.Array]:
-        """A value came: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
+        """Condition on a value: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
         # Probability that this pattern of values arrives, by mode.
-        sender, there = self.senders[s], ~jnp.isnan(z)
-        pattern = there if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
+        sender, arrived = self.senders[s], ~jnp.isnan(z)
+        pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
         kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
         chance = jnp.asarray(channel.chance)[:, kind]
         arrives = chance if len(self.senders) == 1 else 1 - self._loss(channel, s)
@@ -257,28 +263,28 @@ class EventFilter(AbstractSizedFilter):
             moments = channel.mean, channel.gain_spread, channel.noise
             links.append(Link(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
             before.append(wide.labelled(s, only))
-            used.append(updated(before[-1], z, there, links[-1], sender, self.outputs, self.delivers))
+            used.append(updated(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers))
         # Restricted to where the sender had to send.
         count, size = len(links), len(label)
-        selected = self._selected(together([*used, *before]), s, begun)
+        selected = self._select_sent(together([*used, *before]), s, begun)
         pieces = [selected.some(start, start + size) for start in range(0, len(selected.log_weight), size)]
-        of_mode = [together(pieces[j :: 2 * count]) for j in range(2 * count)]
+        by_mode = [together(pieces[j :: 2 * count]) for j in range(2 * count)]
         # What was to be expected of a value that comes.
         signals = []
-        for sent, link in zip(map(join, of_mode[count:]), links, strict=True):
+        for sent, link in zip(map(join, by_mode[count:]), links, strict=True):
             received = arriving(sent.gaussian, link, sender, self.outputs)
             signals.append(Parts(sent.log_weight, received, jnp.zeros((1, 1))))
         # One sum again, with a new reference.
-        whole = join(together(of_mode[:count]).keep(self._renewed(sender)))
-        whole = whole.labelled(s, _sent(whole.label[:, s], False))
+        whole = join(together(by_mode[:count]).keep(self._renewed(sender)))
+        whole = whole.labelled(s, _relabel_sent(whole.label[:, s], False))
         signal = join(together(signals)).gaussian
-        return self._alone(whole), signal.mean[0], signal.covariance[0]
+        return self._pad_sum(whole), signal.mean[0], signal.covariance[0]
 
-    def _selected(self, used: Parts, s: int, begun: jax.Array) -> Parts:
-        """Gaussians where their sender had to send, all one time after another: outside, or anywhere if it was due."""
+    def _select_sent(self, used: Parts, s: int, begun: jax.Array) -> Parts:
+        """Select where the sender had to send, all Gaussians time after time: outside, or anywhere if it was due."""
         waiting, due = self._by_age(used.label[:, s], begun)
         event = used.labelled(s, waiting)
-        outside = self._outside_of(event, self.senders[s], 1 - RIM)
+        outside = self._cut_to_outside(event, self.senders[s], 1 - RIM)
         mass = jnp.max(outside.log_weight.reshape(self._outside, -1), axis=0)
         lowest = event.log_weight + np.log(FLOOR)
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
@@ -292,7 +298,7 @@ class EventFilter(AbstractSizedFilter):
         return label - due, due
 
     def _loss(self, channel: SideInformation, s: int) -> jax.Array:
-        """The probability that what a sender transmits is lost, in each mode."""
+        """Return the probability that what a sender transmits is lost, in each mode."""
         mine = self.senders[s] if len(self.senders) > 1 else slice(None)
         lost = ~jnp.any(jnp.asarray(channel.present)[:, mine], axis=1)
         return jnp.asarray(channel.chance) @ lost.astype(float)
@@ -312,8 +318,8 @@ class EventFilter(AbstractSizedFilter):
         unit = jnp.eye(n + 2 * m)
         return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
 
-    def _inside(self, parts: Parts, others: Parts, sender: slice) -> tuple[Parts, Parts]:
-        """Cut to the region: Gaussians to each part of its first component's interval, joined; others to all of it."""
+    def _cut_to_region(self, parts: Parts, others: Parts, sender: slice) -> tuple[Parts, Parts]:
+        """Cut to the region: `parts` to each part of its first component's interval, joined; `others` to all of it."""
         (direction, delta), *rest = self._errors(sender)
         size, edges = len(parts.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
         low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
@@ -330,7 +336,7 @@ class EventFilter(AbstractSizedFilter):
         count = size * self.known
         return join(every.some(0, count), self.known), every.some(count)
 
-    def _outside_of(self, parts: Parts, sender: slice, scale: float) -> Parts:
+    def _cut_to_outside(self, parts: Parts, sender: slice, scale: float) -> Parts:
         """Cut to what is outside, all one time after the other, `_outside` times.
 
         The first component that is, above or below, those before it inside; of a ball these are what is outside of the
@@ -349,7 +355,7 @@ class EventFilter(AbstractSizedFilter):
         return cut_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
 
     def _or_nothing(self, parts: Parts, before: Parts) -> Parts:
-        """The sum, or where the rule forbids what came that before it, with a floor as its likelihood."""
+        """Return the sum, or where the rule forbids what came the sum before, with a floor as its likelihood."""
         stays = before.keep(np.arange(parts.gaussian.mean.shape[1]))
         stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
         forbidden = ~jnp.isfinite(log_total(parts.log_weight))
@@ -373,8 +379,8 @@ class EventFilter(AbstractSizedFilter):
         return first
 
 
-def _sent(label: jax.Array, lost: bool) -> jax.Array:
-    """A sender's label (K, M, A, C) after a transmission: no step since then, and one more lost or none."""
+def _relabel_sent(label: jax.Array, lost: bool) -> jax.Array:
+    """Relabel a sender (K, M, A, C) after a transmission: no step since then, and one more lost or none."""
     label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
     if label.shape[-1] == 1:
         return label
@@ -384,10 +390,10 @@ def _sent(label: jax.Array, lost: bool) -> jax.Array:
     return more.at[..., -1].add(label[..., -1])
 
 
-def _with_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The whole innovation: what is known of losses is side information, which nothing is expected of."""
-    known = jnp.where(jnp.isnan(losses), jnp.nan, 0.0)
-    value = jnp.concatenate([value, known])
-    there = ~jnp.isnan(value)
+def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Append the losses to the innovation: they are side information, of which nothing is expected."""
+    loss_values = jnp.where(jnp.isnan(losses), jnp.nan, 0.0)
+    value = jnp.concatenate([value, loss_values])
+    arrived = ~jnp.isnan(value)
     whole = jax.scipy.linalg.block_diag(*(jnp.nan_to_num(block) for block in blocks), jnp.zeros((len(losses),) * 2))
-    return value, jnp.where(there[:, None] & there, whole, jnp.nan)
+    return value, jnp.where(arrived[:, None] & arrived, whole, jnp.nan)

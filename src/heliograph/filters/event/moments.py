@@ -33,21 +33,21 @@ class Link(NamedTuple):
 def augmented(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: Parts, start: jax.Array
 ) -> Parts:
-    """Each Gaussian of (x, r) with y = h(x) + v as well; `start` (n,) is E[x_i^2] before any data."""
+    """Augment each Gaussian of (x, r) by y = h(x) + v; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
 
-    def single(both: Gaussian) -> Gaussian:
+    def augment_one(both: Gaussian) -> Gaussian:
         signal = signal_of(plant, sensor, transform, leading(both, n), start)
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
         return with_rows(both, signal.mean, slopes, triangular(joined(signal.noise, rounding_of(signal.size))))
 
-    return parts._replace(gaussian=jax.vmap(single)(parts.gaussian))
+    return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
 
 
 def moved(
     plant: AbstractPlant, transform: AbstractTransform, both: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
-    """(x, r) a step later; `start` (n,) is E[x_i^2] before any data."""
+    """Move (x, r) by one step of the plant; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
     rest = len(both.mean) - n
     image = image_of(plant, transform, leading(both, n), u)
@@ -68,39 +68,39 @@ def pinned(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
 def updated(
     parts: Parts,
     z: jax.Array,
-    there: jax.Array,
+    arrived: jax.Array,
     link: Link,
     sender: slice,
     m: int,
     delivers: bool,
 ) -> Parts:
-    """Each Gaussian of (x, r, y) given z = G y + n, weighed by its density."""
+    """Condition each Gaussian of (x, r, y) on z = G y + n, and weigh it by its density."""
     size = parts.gaussian.mean.shape[1]
 
-    def single(x: Gaussian) -> tuple[Gaussian, jax.Array]:
-        expected, slopes, noise = _through(x, link.of_sender(sender, m), m)
-        after, innovations = observe(x, slopes, z - expected, noise, there)
+    def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
+        expected, slopes, noise = _through_link(x, link.of_sender(sender, m), m)
+        after, innovations = observe(x, slopes, z - expected, noise, arrived)
         if delivers:  # y is z, to the last digit
-            after = pinned(after, np.arange(size - m, size)[sender], jnp.where(there, z, 0.0))
-        return after, innovations.log_density(there, jnp.abs(jnp.where(there, z, 0.0)))
+            after = pinned(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
+        return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
 
-    after, density = jax.vmap(single)(parts.gaussian)
+    after, density = jax.vmap(update_one)(parts.gaussian)
     return Parts(parts.log_weight + density, after, parts.label)
 
 
 def arriving(x: Gaussian, link: Link, sender: slice, m: int) -> Gaussian:
-    """z = G y + n of each Gaussian of (x, r, y)."""
+    """Return the law of z = G y + n of each Gaussian of (x, r, y)."""
 
-    def single(x: Gaussian) -> Gaussian:
-        expected, slopes, noise = _through(x, link.of_sender(sender, m), m)
+    def receive_one(x: Gaussian) -> Gaussian:
+        expected, slopes, noise = _through_link(x, link.of_sender(sender, m), m)
         return of_columns(expected, joined(Columns(slopes, x.variances), noise))
 
-    received: Gaussian = jax.vmap(single)(x)
+    received: Gaussian = jax.vmap(receive_one)(x)
     return received
 
 
-def _through(x: Gaussian, link: Link, m: int) -> tuple[jax.Array, jax.Array, Columns]:
-    """E z, slopes and noise of z = G y + n, y the last m components."""
+def _through_link(x: Gaussian, link: Link, m: int) -> tuple[jax.Array, jax.Array, Columns]:
+    """Return E z, slopes and noise of z = G y + n, y the last m components."""
     centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
     second = Columns(rows, x.variances).covariance + outer(centre, centre)
     noise = joined(link.noise, gain_noise(link.gain_spread, second, centre))

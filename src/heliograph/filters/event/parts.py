@@ -47,14 +47,14 @@ class Parts(NamedTuple):
         return few
 
     def keep(self, places: np.ndarray) -> "Parts":
-        """Some components of the Gaussians, in another order."""
+        """Keep some components of the Gaussians, in the order of `places`."""
         if np.array_equal(places, np.arange(len(places))):
             return self._replace(gaussian=leading(self.gaussian, len(places)))
 
-        def single(x: Gaussian) -> Gaussian:
+        def keep_one(x: Gaussian) -> Gaussian:
             return of_columns(x.mean[places], Columns(x.root[places], x.variances))
 
-        return self._replace(gaussian=jax.vmap(single)(self.gaussian))
+        return self._replace(gaussian=jax.vmap(keep_one)(self.gaussian))
 
 
 def safe_log(x: jax.Array) -> jax.Array:
@@ -70,14 +70,14 @@ def log_total(log_weight: jax.Array) -> jax.Array:
 
 
 def together(parts: Sequence[Parts]) -> Parts:
-    """Several sums as one."""
+    """Put several sums together as one."""
     every: Parts = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return every
 
 
 @jax.jit
 def cut(parts: Parts, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> Parts:
-    """Each Gaussian cut to lower <= d'x <= upper, (K,) or (), and the Gaussian of the same moments."""
+    """Cut each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
     row, variance = _component(parts, direction)
     ends = [jnp.broadcast_to(end, variance.shape) for end in (lower, upper)]
     return _cut(parts, parts.gaussian.mean @ direction, row, variance, ends)
@@ -85,7 +85,7 @@ def cut(parts: Parts, direction: jax.Array, lower: jax.Array, upper: jax.Array) 
 
 @jax.jit
 def cut_away(parts: Parts, direction: jax.Array, edge: jax.Array) -> Parts:
-    """Each Gaussian cut to d'x >= edge, and after all these each cut to d'x <= -edge, (2 K,)."""
+    """Cut each Gaussian to d'x >= edge, and after all these each to d'x <= -edge, (2 K,)."""
     row, variance = _component(parts, direction)
     centre, edges = parts.gaussian.mean @ direction, jnp.full(2 * len(variance), edge)
     centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
@@ -99,7 +99,7 @@ def _component(parts: Parts, direction: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def _cut(parts: Parts, centre: jax.Array, row: jax.Array, variance: jax.Array, ends: Sequence[jax.Array]) -> Parts:
-    """Gaussians cut to where d'x = centre + row xi is above the first end, and below the second if there is one.
+    """Cut the Gaussians to where d'x = centre + row xi is above the first end, and below the second if there is one.
 
     With S the variance of d'x and mu, v the moments of a standard normal number that is cut: d'x moves by sqrt(S) mu
     and has the variance v S; x given d'x stays.
@@ -120,7 +120,7 @@ def _cut(parts: Parts, centre: jax.Array, row: jax.Array, variance: jax.Array, e
 
 
 def join(parts: Parts, groups: int = 1) -> Parts:
-    """Gaussians with the moments of the sum, (1, ...), or of each of so many groups of as many Gaussians."""
+    """Join the sum into one Gaussian of its moments, (1, ...), or each of so many groups of as many Gaussians."""
     few: Parts = _join(parts, groups)
     return few
 
@@ -150,7 +150,7 @@ def reduced(parts: Parts, count: int, places: slice) -> Parts:
 
 @partial(jax.jit, static_argnames="ends")
 def _one_fewer(parts: Parts, ends: tuple[int, int]) -> Parts:
-    """The pair of least cost joined; it takes the place of its first, the last Gaussian that of its second."""
+    """Join the pair of least cost; it takes the place of its first, the last Gaussian that of its second."""
     size, places = len(parts.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))
     first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))

@@ -84,7 +84,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
-        """x and the modes move; both ends compute the next reference."""
+        """Move x and the modes; both ends compute the next reference."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         moved = predicted(plant, self.transform, state.gaussian, u, start_of(self.plant))
         rows = jnp.asarray(at(self.channel, k).transition)
@@ -100,7 +100,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: StochasticBelief, z: ArrayLike, k: Step = 0) -> tuple[StochasticBelief, Innovation]:
-        """A value that came, or that nothing did."""
+        """Correct with the value that came, or with the silence if none did."""
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, down = z[:count], z[count:]
@@ -112,42 +112,42 @@ class StochasticEventFilter(AbstractSizedFilter):
         sent = repeated(signal, modes)
         posteriors, weight, innovation = receive(sent, channel, jnp.arange(modes), state.law, values)
         came = join(Parts(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
-
-        log_silent, quiet = self._silence(prior, signal, state.reference, k)
-        nothing = self._nothing(prior, _alone(log_silent, quiet, state.law), state.law, channel, down)
-
-        there = jnp.any(~jnp.isnan(values))
+        # Nothing: silence, or a link that is down.
+        log_silent, quiet = self._condition_on_silence(prior, signal, state.reference, k)
+        nothing = self._condition_on_nothing(prior, _sum_of_one(log_silent, quiet, state.law), state.law, channel, down)
+        # Which of the two it is, with its likelihood.
+        arrived = jnp.any(~jnp.isnan(values))
         log_nothing = jnp.maximum(nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         log_came = innovation.log_likelihood
         if isinstance(self.trigger, StochasticTrigger):
             # Given that it was sent, where no component of it is missing.
-            link, whole = self._link(channel, state.law), ~jnp.any(jnp.isnan(value))
+            link, is_complete = self._link(channel, state.law), ~jnp.any(jnp.isnan(value))
             shift, change = self._given_sent(link, signal, state.reference, log_silent)
-            complete = jnp.where(whole, value, 0.0), jnp.where(whole, covariance, jnp.eye(len(value)))
+            complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
             log_sent = self._log_sent(link[0], signal, state.reference, *complete)
-            log_came = log_came + jnp.where(whole, log_sent, 0.0)
+            log_came = log_came + jnp.where(is_complete, log_sent, 0.0)
             value, covariance = (
-                jnp.where(whole, value - shift, value),
-                jnp.where(whole, covariance + change, covariance),
+                jnp.where(is_complete, value - shift, value),
+                jnp.where(is_complete, covariance + change, covariance),
             )
-        total = jnp.where(there, log_came, log_nothing)
-        after = jax.tree.map(lambda a, b: jnp.where(there, a, b), came, nothing)
+        total = jnp.where(arrived, log_came, log_nothing)
+        after = jax.tree.map(lambda a, b: jnp.where(arrived, a, b), came, nothing)
         if len(down):
-            known, covariance = append_flag(covariance, down[0])
-            value = jnp.append(value, known)
+            flag_innovation, covariance = append_flag(covariance, down[0])
+            value = jnp.append(value, flag_innovation)
         x: Gaussian = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
         following = StochasticBelief(*x, after.label[0, 0], state.reference, state.moved)
         return following, Innovation(value, covariance, total)
 
-    def _nothing(
+    def _condition_on_nothing(
         self, prior: Gaussian, silent: Parts, law: jax.Array, channel: SideInformation, down: jax.Array
     ) -> Parts:
-        """Belief where nothing came: the sender was silent, or the link was down, and the prior stays."""
+        """Condition on nothing that came: the sender was silent, or the link was down, and the prior stays."""
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
         parts = [silent.labelled(0, law[None] * (1 - lost))]
         if self.loses:
-            parts.append(_alone(jnp.zeros(()), prior, law).labelled(0, law[None] * lost))
+            parts.append(_sum_of_one(jnp.zeros(()), prior, law).labelled(0, law[None] * lost))
         if len(down):
             up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
             parts = [parts[0].times(up), *(cause.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:])]
@@ -205,8 +205,10 @@ class StochasticEventFilter(AbstractSizedFilter):
         log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
         return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
 
-    def _silence(self, prior: Gaussian, signal: Signal, reference: jax.Array, k: Step) -> tuple[jax.Array, Gaussian]:
-        """log P(silent) where the link is up, and the state given it."""
+    def _condition_on_silence(
+        self, prior: Gaussian, signal: Signal, reference: jax.Array, k: Step
+    ) -> tuple[jax.Array, Gaussian]:
+        """Condition the prior on silence while the link is up; return log P(silent) too."""
         if isinstance(self.trigger, Periodic):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
             return jnp.where(due, -jnp.inf, 0.0), prior
@@ -226,6 +228,6 @@ class StochasticEventFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self, step, first(self.plant))
 
 
-def _alone(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> Parts:
+def _sum_of_one(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> Parts:
     alone: Parts = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], Parts(log_weight, belief, law[None]))
     return alone

@@ -55,13 +55,13 @@ def as_scalars(values: np.ndarray) -> Scalars | None:
 
 
 def keep_unless(changes: jax.Array, after: T, before: T) -> T:
-    """`after` where something changes, else `before`."""
+    """Return `after` where something changes, else `before`."""
     chosen: T = jax.tree.map(lambda a, b: jnp.where(changes, a, b), after, before)
     return chosen
 
 
 def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars: Array) -> Gaussian:
-    """Update of `Polytope` for any description of the channel; scalars (2,), NaN to minimise the trace over them.
+    """Update by `Polytope` for any description of the channel; scalars (2,), NaN to minimise the trace over them.
 
     (1 + b1) P - C' Omega^-1 C with Omega = base + (1/b1 + 1/b2) shift + (1 + b2) M (H P H' + R) M' is what a Kalman
     update makes of the prior (1 + b1) P and, of z, of the noise (1 + b1)^2 [base + (1/b1 + 1/b2) shift +
@@ -84,7 +84,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars:
 
 
 def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scalar: Array) -> Gaussian:
-    """Update of `ZeroMean`; scalar (1,), NaN to optimise it.
+    """Update by `ZeroMean`; scalar (1,), NaN to optimise it.
 
     Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta is at least M H P H' M', so that the rest is a noise;
     beta times what the received components explain of P, C Pyy^+ C', is added.
@@ -112,19 +112,19 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
 
 
 def _received(signal: Signal, channel: SecondOrder, present: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """M H of what arrived, M H P H' M' and M R M'."""
+    """Return M H of what arrived, M H P H' M' and M R M'."""
     gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
     slopes = gain @ signal.slopes
     return slopes, Columns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance
 
 
 def absent(present: jax.Array) -> jax.Array:
-    """Unit variance for components that did not arrive, so that the reduced system keeps its full size."""
+    """Return unit variance for components that did not arrive, so that the reduced system keeps its full size."""
     return jnp.diag(jnp.where(present, 0.0, 1.0))
 
 
 def received(channel: SecondOrder, present: jax.Array) -> jax.Array:
-    """Mask (p,) of the components of the signal that act on what arrived; the others count as never measured."""
+    """Return the mask (p,) of the signal's components that act on what arrived; the others count as never measured."""
     m, p = channel.mean_gain.shape[:2]
     reached = (channel.power.center != 0) | (channel.power.radius != 0)
     parts = [[reached[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]

@@ -76,22 +76,24 @@ def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: j
 def young_sweep(
     t: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array, power: jax.Array, whole: jax.Array
 ) -> tuple[jax.Array, Slopes]:
-    """beta_1 = sqrt(tr W S / tr P), beta_2 = sqrt(tr W S / tr W M)."""
+    """Compute the next scalars by the last gain: beta_1 = sqrt(tr W S / tr P), beta_2 = sqrt(tr W S / tr W M)."""
     beta = jnp.exp(t)
     weight, (s, m) = _weight(young_omega(beta, base, shift, mean_part), power, (shift, mean_part))
     ws, wm = times(weight, shift), times(weight, mean_part)
-    moved, known = trace(ws), trace(wm)
+    shift_trace, mean_trace = trace(ws), trace(wm)
     by_first = [2 / beta[0] * inner(transpose(s), x) for x in (ws, wm)]  # d tr W X / d log beta_1
     by_second = [2 / beta[1] * inner(transpose(s), x) - 2 * beta[1] * inner(transpose(m), x) for x in (ws, wm)]
-    first, first_slopes = _root_ratio(moved, [by_first[0], by_second[0]], whole, [None, None])
-    second, second_slopes = _root_ratio(moved, [by_first[0], by_second[0]], known, [by_first[1], by_second[1]])
+    first, first_slopes = _root_ratio(shift_trace, [by_first[0], by_second[0]], whole, [None, None])
+    second, second_slopes = _root_ratio(
+        shift_trace, [by_first[0], by_second[0]], mean_trace, [by_first[1], by_second[1]]
+    )
     return jnp.stack([first, second]), [first_slopes, second_slopes]
 
 
 def zero_mean_sweep(
     t: jax.Array, base: jax.Array, shift: jax.Array, power: jax.Array, whole: jax.Array
 ) -> tuple[jax.Array, Slopes]:
-    """beta = sqrt(tr W S / tr explained) with Omega = base + S / beta."""
+    """Compute the next scalar by the last gain: beta = sqrt(tr W S / tr explained) with Omega = base + S / beta."""
     beta = jnp.exp(t[0])
     weight, (s,) = _weight(base + shift / beta, power, (shift,))
     ws = times(weight, shift)

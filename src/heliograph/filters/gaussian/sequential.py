@@ -62,23 +62,24 @@ class SequentialFilter(AbstractSizedFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with each node's measurement in turn."""
         z = jnp.asarray(z)
-        if all(
-            alike(filter, self.filters[0]) for filter in self.filters
-        ):  # one correction compiled, run over the nodes
+        # Filters of one structure: one correction compiled, run over the nodes.
+        if all(alike(filter, self.filters[0]) for filter in self.filters):
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
             def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
-                single: GaussianFilter = eqx.combine(node[0], rest)
-                return single.correct(belief, node[1], k)
+                node_filter: GaussianFilter = eqx.combine(node[0], rest)
+                return node_filter.correct(belief, node[1], k)
 
             state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
-            return state, _joined([jax.tree.map(lambda leaf: leaf[i], innovation) for i in range(len(self.filters))])  # noqa: B023
+            return state, _join_innovations(
+                [jax.tree.map(lambda leaf: leaf[i], innovation) for i in range(len(self.filters))]  # noqa: B023
+            )
         # Filters of different structure: one correction each.
         ends, parts = np.cumsum([filter.received for filter in self.filters]), []
         for filter, received in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
-            state, single = filter.correct(state, received, k)
-            parts.append(single)
-        return state, _joined(parts)
+            state, innovation = filter.correct(state, received, k)
+            parts.append(innovation)
+        return state, _join_innovations(parts)
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
@@ -91,7 +92,7 @@ class SequentialFilter(AbstractSizedFilter):
         return replace(smoother_step_by_transform(self.filters[0], step, self.filters[0]), claim=self.claim)
 
 
-def _joined(parts: Sequence[Innovation]) -> Innovation:
+def _join_innovations(parts: Sequence[Innovation]) -> Innovation:
     covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in parts))
     total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in parts]))
     return Innovation(jnp.concatenate([innovation.value for innovation in parts]), covariance, total)

@@ -67,7 +67,7 @@ def signal_of(
     start: jax.Array,
     noise: Columns | None = None,
 ) -> Signal:
-    """Moments of the sensor's signal y = h(x) + v under the prior of x.
+    """Return the moments of the sensor's signal y = h(x) + v under the prior of x.
 
     Args:
         plant: whose states may be angles.
@@ -101,7 +101,7 @@ def size_of(sensor: LinearSensor, start: jax.Array) -> jax.Array:
 
 
 def received_noise(signal: Signal, channel: SecondOrder) -> Columns:
-    """Noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
+    """Return the noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
 
     A combination of outputs free of v and n is known to eps of it: these are made triangular, of known numbers once.
     What the random gain adds, E[(G - M) y y' (G - M)'], is formed and eliminated: of a combination free of it, that
@@ -111,24 +111,24 @@ def received_noise(signal: Signal, channel: SecondOrder) -> Columns:
 
 
 def noise_through(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
-    """`received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
+    """Return `received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ jnp.sqrt(signal.size)) ** 2)
-    known = triangular(joined(signal.noise.through(gain), link, rounding))
-    return joined(known, gain_noise(gain_spread, signal.second, signal.mean))
+    plain = triangular(joined(signal.noise.through(gain), link, rounding))
+    return joined(plain, gain_noise(gain_spread, signal.second, signal.mean))
 
 
 def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> Columns:
-    """Factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
+    """Factor E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
     return eliminated_spread(contract(gain_spread, homogeneous(second, mean, 1.0)))
 
 
 def eliminated_spread(spread: jax.Array) -> Columns:
-    """Factors of a spread that is formed: of a combination free of it, elimination leaves a hundred eps."""
+    """Factor a spread that is formed: of a combination free of it, elimination leaves a hundred eps."""
     return eliminated(spread, LOST * unit_of(spread))
 
 
 def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
-    """Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
+    """Return Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
     return joined(channel.noise, gain_noise(channel.gain_spread, second, mean))
 
 
@@ -152,12 +152,12 @@ def corrected_by(
 
 
 def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
-    """Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m)."""
+    """Return Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m)."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
     return joined(Columns(slopes, signal.prior.variances), received_noise(signal, channel)).covariance
 
 
 def homogeneous(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
-    """E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
+    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
     top = jnp.concatenate([second, mean[:, None]], axis=1)
     return jnp.concatenate([top, jnp.append(mean, last)[None]])

@@ -101,8 +101,8 @@ class PlannedFilter(AbstractSizedFilter):
         return replace(self, past=OverTime(steps))
 
     def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
-        known = mean if self.projection is None else _affine(self.projection, mean, jnp.zeros(len(self.projection)))
-        return Estimate(known, jnp.asarray(self.covariances)[stage], self.claim)
+        x = mean if self.projection is None else _affine(self.projection, mean, jnp.zeros(len(self.projection)))
+        return Estimate(x, jnp.asarray(self.covariances)[stage], self.claim)
 
 
 @runs_last
@@ -131,18 +131,18 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
     quiet = jnp.zeros(filter.received)
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[Plan, jax.Array]]:
-        single, prior, after = followed(filter, state, quiet, row[1], row[0])
-        return after, (single, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
+        step, prior, after = followed(filter, state, quiet, row[1], row[0])
+        return after, (step, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
 
     start = filter.init()
     start = jax.tree.map(jnp.asarray, start)
     _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
     # Covariances in the order of `PlannedMean.stage`.
-    items = covariances.reshape(-1, *covariances.shape[2:])
-    known = jnp.concatenate([_seen(start.covariance, projection)[None], items])
+    in_order = covariances.reshape(-1, *covariances.shape[2:])
+    by_stage = jnp.concatenate([_seen(start.covariance, projection)[None], in_order])
     return PlannedFilter(
         steps=OverTime(steps),
-        covariances=known,
+        covariances=by_stage,
         start=start.mean,
         projection=projection,
         **sized(filter.claim, filter, filter.received),
@@ -153,7 +153,7 @@ _plan_by_xla = quickly_compiled(_plan)
 
 
 def followed(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:
-    """Matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
+    """Plan a step from this state, whatever its mean: its matrices, and the states after prediction and correction."""
     # F and f: the prior mean is affine in the mean.
     none = jnp.zeros_like(state.mean)
 
@@ -163,8 +163,8 @@ def followed(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, 
 
     transition, prior = jax.jacfwd(predict, has_aux=True)(none)
     # K and C: derivatives of posterior mean and innovation.
-    (_, gain), (output, _), after, innovation = _corrected(filter, prior, none, z, k)
-    single = Plan(
+    (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, none, z, k)
+    step = Plan(
         transition=transition,
         drift=jnp.asarray(prior.mean),
         gain=gain,
@@ -172,36 +172,36 @@ def followed(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, 
         offset=-jnp.asarray(innovation.value),
         innovation=jnp.asarray(innovation.covariance),
     )
-    return single, prior, after
+    return step, prior, after
 
 
-def _corrected(
+def _correction_slopes(
     filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
-    """Derivatives of the corrected mean and of the innovation, each by prior mean and by z, and both themselves."""
+    """Differentiate the corrected mean and the innovation by prior mean and z; return slopes and both themselves."""
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
         after, innovation = filter.correct(prior._replace(mean=mean), z, k)
         return (jnp.asarray(after.mean), jnp.asarray(innovation.value)), (after, innovation)
 
-    (of_mean, of_innovation), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
-    return of_mean, of_innovation, after, received
+    (mean_slopes, innovation_slopes), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
+    return mean_slopes, innovation_slopes, after, received
 
 
 def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
-    """Matrices of one step of a filter of which only the mean depends on data; of z only the gaps matter.
+    """Return the matrices of one step of a filter of which only the mean depends on data; of z only the gaps matter.
 
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
     if isinstance(filter, PlannedFilter):
         outcome: Plan = at(filter.steps, k)
         return outcome
-    single, _, _ = followed(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    step, _, _ = followed(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
-    return single._replace(
-        gain=jnp.where(present, single.gain, 0.0),
-        output=jnp.where(present[:, None], single.output, 0.0),
-        offset=jnp.where(present, single.offset, 0.0),
+    return step._replace(
+        gain=jnp.where(present, step.gain, 0.0),
+        output=jnp.where(present[:, None], step.output, 0.0),
+        offset=jnp.where(present, step.offset, 0.0),
     )
 
 
@@ -223,7 +223,7 @@ def linearised_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.
     The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
     """
     prior = filter.predict(state, u, k)
-    (_, gain), (output, _), _, innovation = _corrected(filter, prior, jnp.asarray(prior.mean), z, k)
+    (_, gain), (output, _), _, innovation = _correction_slopes(filter, prior, jnp.asarray(prior.mean), z, k)
     present = ~jnp.isnan(z)
     output = jnp.where(present[:, None], -output, 0.0)
     total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
@@ -244,7 +244,7 @@ def _shape(leaf: Any) -> object:
 
 @lru_cache(maxsize=1024)
 def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[object, ...]) -> bool:
-    """Answer of `is_linear_filter` by structure and shapes, so that filters of one structure are traced once."""
+    """Answer `is_linear_filter` by structure and shapes, so that filters of one structure are traced once."""
     with jax.enable_x64(True):
         filter = jax.tree.unflatten(tree, leaves)
         planned = eqx.filter_eval_shape(lambda single: single.planned(jnp.zeros((1, len(single.inputs)))), filter)

@@ -63,11 +63,11 @@ Atoms = list[list[Component]]  # of each of the maps inside
 
 
 def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
-    """All combinations of the atoms of a map's gains and noises."""
+    """List all combinations of the atoms of a map's gains and noises."""
     return fold(channel, {
         GainAndNoise: _atoms_of_hop,
-        Series: _combined(_after),
-        Stack: _combined(_others),
+        Series: _combined(_compose_maps),
+        Stack: _combined(_stack_maps),
         Superposed: lambda channel, _: atoms_of(channel.as_stack),
         # One of several maps, drawn: p(i) times the atoms of map i.
         Mixture: lambda mixture, parts: [c._replace(weight=p * c.weight) for p, atoms in
@@ -76,7 +76,7 @@ def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
 
 
 def _atoms_of_hop(hop: GainAndNoise, _: object) -> list[Component]:
-    """Every gain with every noise of z = g H y + n."""
+    """Combine every gain with every noise of z = g H y + n."""
     gains, noises = _gain_atoms(hop.law), _noise_atoms(hop.noise)
     return [Component(p * q, g * np.asarray(hop.matrix), c, r) for p, g in gains for q, c, r in noises]
 
@@ -90,13 +90,13 @@ def _combined(join: Callable[[Component, Component], Component]) -> Callable[[ob
     return lambda _, parts: reduce(pairs, parts)
 
 
-def _after(x: Component, y: Component) -> Component:
+def _compose_maps(x: Component, y: Component) -> Component:
     """Compose maps, y after x: G_y (G_x s + c_x + n_x) + c_y + n_y."""
     noise = y.gain @ x.noise @ y.gain.T + y.noise
     return Component(x.weight * y.weight, y.gain @ x.gain, y.gain @ x.offset + y.offset, noise)
 
 
-def _others(x: Component, y: Component) -> Component:
+def _stack_maps(x: Component, y: Component) -> Component:
     """Stack both maps, one above the other."""
     gain, offset = np.concatenate([x.gain, y.gain]), np.concatenate([x.offset, y.offset])
     return Component(x.weight * y.weight, gain, offset, np.asarray(scipy.linalg.block_diag(x.noise, y.noise)))
@@ -120,7 +120,7 @@ def _joint(a: NoiseAtom, b: NoiseAtom) -> NoiseAtom:
 
 
 def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
-    """All combinations of the atoms of a noise's components."""
+    """List all combinations of the atoms of a noise's components."""
     match noise:
         # One atom, its mean, with the covariance about it.
         case GaussianNoise():

@@ -118,7 +118,7 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
-        """x = sum_j zeta^j."""
+        """Return x = sum_j zeta^j, and the covariance of its error."""
         projection, x = self._projection(), state.gaussian
         return Estimate(projection @ x.mean, Columns(projection @ x.root, x.variances).covariance, self.claim)
 
@@ -161,8 +161,8 @@ class ModalFilter(AbstractModalFilter):
         (move, noise, centre), rows = moved_about(at(self.plant, k), u, state.centre), self._rows(state, k)
         law = state.law @ rows
         # F zeta about the moving centre.
-        known = state.mean - known_part(state.law, state.centre)
-        mean = moved_by_mode(known[:, None], move, rows)[:, 0] + known_part(law, centre)
+        centred = state.mean - known_part(state.law, state.centre)
+        mean = moved_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
         root, fresh = self._moves(state, u, k)
         after = of_columns(mean, joined(Columns(root, state.variances), fresh))
         moments = jnp.einsum("ij,iab->jab", rows, _carried(state, move)) + law[:, None, None] * noise
@@ -175,8 +175,8 @@ class ModalFilter(AbstractModalFilter):
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j the spread of
         the gains in mode j.
         """
-        known = state.mean - known_part(state.law, state.centre)
-        after, innovation = observe_modes(state.gaussian, known, self._output(state, k), z)
+        centred = state.mean - known_part(state.law, state.centre)
+        after, innovation = observe_modes(state.gaussian, centred, self._output(state, k), z)
         return ModalBelief(*after, *state[3:]), innovation
 
     def _rows(self, state: ModalBelief, k: Step) -> jax.Array:
@@ -197,9 +197,9 @@ class ModalFilter(AbstractModalFilter):
         matrix, common = without_common(jnp.asarray(channel.mean) @ measure, law)
         sent = jax.vmap(lambda a: measure @ a @ measure.T)(state.moments) + law[:, None, None] * noise
         random = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent)
-        known = known_noise(channel, sensor.noise.columns, law)
+        plain = known_noise(channel, sensor.noise.columns, law)
         rounding = rounding_of_received(jnp.asarray(channel.mean), sent)
-        return Output(beside(matrix), common, joined(known, rounding, eliminated_spread(random)))
+        return Output(beside(matrix), common, joined(plain, rounding, eliminated_spread(random)))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step given its prediction."""
@@ -209,7 +209,7 @@ class ModalFilter(AbstractModalFilter):
 
 
 def _carried(state: ModalBelief, move: jax.Array) -> jax.Array:
-    """A~ E_i A~' (M, n + 1, n + 1)."""
+    """Carry the moments of each mode through the plant: A~ E_i A~' (M, n + 1, n + 1)."""
     carried: jax.Array = jax.vmap(lambda a: move @ a @ move.T)(state.moments)
     return carried
 
@@ -222,7 +222,7 @@ def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns
 
 
 def moved_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax.Array:
-    """F times columns (N, c), F[j, i] = Pi[i, j] A~: each part is moved, then all are mixed by the chain."""
+    """Multiply columns (N, c) by F, F[j, i] = Pi[i, j] A~: move each part by the plant, then mix all by the chain."""
     parts = columns.reshape(len(rows), len(move), -1)
     moved = jax.vmap(lambda part: move @ part)(parts).reshape(len(rows), -1)
     return jnp.reshape(rows.T @ moved, columns.shape)
@@ -256,12 +256,12 @@ def known_noise(channel: ObservationModel, sent: Columns, law: jax.Array) -> Col
 
 
 def rounding_of_received(gains: jax.Array, sent: jax.Array) -> Columns:
-    """Rounding (m, m) of z, of gains (M, m, p + 1), from E[y~ y~' 1{mode}] (M, p + 1, p + 1)."""
+    """Return the rounding (m, m) of z, of gains (M, m, p + 1), from E[y~ y~' 1{mode}] (M, p + 1, p + 1)."""
     return rounding_of(jnp.einsum("jma,jab,jmb->m", gains, sent, gains))
 
 
 def kron(a: jax.Array, b: jax.Array) -> jax.Array:
-    """A x B, by a matrix product, which keeps known zeros."""
+    """Return A x B, by a matrix product, which keeps known zeros."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     products = outer(a.reshape(-1), b.reshape(-1)).reshape(*a.shape, *b.shape)
     return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
@@ -272,9 +272,9 @@ def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
-def observe_modes(x: Gaussian, known: jax.Array, output: Output, z: ArrayLike) -> tuple[Gaussian, Innovation]:
-    """Condition zeta on the components of z that arrived; `known` is its mean less P(mode) c."""
-    expected = output.common + output.matrix @ known
+def observe_modes(x: Gaussian, centred: jax.Array, output: Output, z: ArrayLike) -> tuple[Gaussian, Innovation]:
+    """Condition zeta on the components of z that arrived; `centred` is its mean less P(mode) c."""
+    expected = output.common + output.matrix @ centred
     return corrected_by(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
 
 
@@ -335,12 +335,12 @@ def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def beside(output: jax.Array) -> jax.Array:
-    """Output matrices (M, m, n + 1) as one matrix (m, N) that acts on zeta."""
+    """Put output matrices (M, m, n + 1) side by side as one matrix (m, N) that acts on zeta."""
     return jnp.concatenate(list(output), axis=1)
 
 
 def padded(a: jax.Array) -> jax.Array:
-    """[[A, 0], [0, 0]]."""
+    """Pad A by a row and a column of zeros: [[A, 0], [0, 0]]."""
     return jnp.pad(a, ((0, 1), (0, 1)))
 
 
@@ -370,8 +370,8 @@ def observation_models(channel: Channel) -> tuple[Float[Array, " M"], Observatio
         modes = joint_modes(channel)
         return modes.initial, observation_model(modes, modes)
     steps = [joint_modes(c) for c in unstack(channel)]
-    items = [observation_model(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    return steps[0].initial, over_time(items)
+    models = [observation_model(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    return steps[0].initial, over_time(models)
 
 
 def observation_model(now: JointModes, before: JointModes) -> ObservationModel:

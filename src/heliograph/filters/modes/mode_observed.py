@@ -88,7 +88,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         # Received vector: z, then the states of the memories.
         m = channel.outputs
         z, published = observed[:m], observed[m:]
-        known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
+        is_known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         certain = jnp.nan_to_num(published)
         start, rule = start_of(self.plant), Polytope()
         if self.late:
@@ -96,15 +96,15 @@ class ModeObservedFilter(AbstractSizedFilter):
             then = _given(at(self.channel, last), certain)
             redone, _ = corrected_linear(state.before, at(self.sensor, last), then, rule, state.z, start)
             redone = predicted(redone, state.move)
-            prior = jax.tree.map(lambda a, b: jnp.where(known & state.begun, a, b), redone, state.belief)
+            prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
             then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
             described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
         else:
             prior, described = state.belief, _given(channel, certain)
         # Update with z, which is not used where a state is missing.
-        usable = jnp.where(known, z, jnp.nan)
+        usable = jnp.where(is_known, z, jnp.nan)
         after, innovation = corrected_linear(prior, sensor, described, rule, z, start)
-        after = jax.tree.map(lambda a, b: jnp.where(known, a, b), after, prior)
+        after = jax.tree.map(lambda a, b: jnp.where(is_known, a, b), after, prior)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         # The flags belong to the innovation; they add nothing to the likelihood.
         for mode in published:
@@ -126,12 +126,12 @@ def _given(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
 
 def _following(last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
     """Law of the channel given the memories' states at the step before; without them, of the first step."""
-    items = []
+    choices = []
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
-        items.append(memory.following(None if last is None else memory.read(number), degree_in(channel, identity)))
-    chosen = list(product(*(range(len(weights)) for _, weights in items)))
-    maps = [given(channel, [items[i][0][j] for i, j in enumerate(places)]) for places in chosen]
-    weights = [prod(items[i][1][j] for i, j in enumerate(places)) for places in chosen]
+        choices.append(memory.following(None if last is None else memory.read(number), degree_in(channel, identity)))
+    chosen = list(product(*(range(len(weights)) for _, weights in choices)))
+    maps = [given(channel, [choices[i][0][j] for i, j in enumerate(places)]) for places in chosen]
+    weights = [prod(choices[i][1][j] for i, j in enumerate(places)) for places in chosen]
     return _nominal(Mixture(maps, jnp.stack([jnp.asarray(w) for w in weights])))
 
 

@@ -140,8 +140,8 @@ class AbstractMerging(Module):
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (component, mode) of the measurement update: all that can have a weight."""
-        items = np.arange(modes)
-        return items, items
+        places = np.arange(modes)
+        return places, places
 
     def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
         """Components after the update of all pairs, and the probability of each present mode."""
@@ -184,7 +184,7 @@ class MergeByMode(AbstractMerging):
 
 
 def shares(weight: jax.Array) -> jax.Array:
-    """Weights (components, mixtures) of which each column sums to 1: equal ones where a mixture has none."""
+    """Return weights (components, mixtures) of which each column sums to 1: equal ones where a mixture has none."""
     law = jnp.sum(weight, axis=0)
     some = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
     return jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
@@ -278,12 +278,12 @@ class MultipleModelFilter(AbstractSizedFilter):
 
 
 def _whole(state: ModalBeliefs) -> Gaussian:
-    """Mean and covariance of the whole mixture."""
+    """Return the mean and covariance of the whole mixture."""
     return merge(state.parts, jnp.sum(state.weight, axis=1))
 
 
 def repeated(x: T, count: int) -> T:
-    """The same so many times, along a new first axis."""
+    """Repeat the same so many times, along a new first axis."""
     every: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
     return every
 

@@ -138,8 +138,8 @@ class SideInformationFilter(AbstractSizedFilter):
         prior, unit = given(start.initial_mean, start.initial_covariance), np.eye(len(self.states) + 1)[:, -1:]
         # q in each mode of x - c and of what is known there, x~ = (0, 1) and e = (1{mode} - p) x (0, 1).
         x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
-        known = jnp.zeros_like(x).at[:, -1:].set(unit)
-        errors = [kron(of_mode[:, None], x) - kron(law[:, None], known) for of_mode in jnp.eye(len(law))]
+        constant = jnp.zeros_like(x).at[:, -1:].set(unit)
+        errors = [kron(of_mode[:, None], x) - kron(law[:, None], constant) for of_mode in jnp.eye(len(law))]
         moments = Columns(
             jnp.stack([jnp.concatenate([e, x]) for e in errors]), outer(law, jnp.append(prior.variances, 1.0))
         )
@@ -148,7 +148,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
-        """s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
+        """Predict s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
         plant, channel = at(self.plant, k), at(self.channel, k)
         move, _, centre = moved_about(plant, u, state.centre)
         modes, (errors, x, weights) = len(self.initial), _parts(state)
@@ -178,26 +178,28 @@ class SideInformationFilter(AbstractSizedFilter):
         self, state: SideInformationBelief, z: ArrayLike, k: Step = 0
     ) -> tuple[SideInformationBelief, Innovation]:
         """Weight the modes by the flag and by the pattern of arrivals, then project zeta on (1, s, z)."""
-        sensor, known, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))
         # P(flag, pattern | mode).
-        flag_there, there = ~jnp.isnan(flag), ~jnp.isnan(z)
-        number = jnp.clip(jnp.where(flag_there, flag, 0.0).astype(int), 0, known.flags.shape[1] - 1)
-        spelled = jnp.where(flag_there, jnp.asarray(known.flags)[:, number], 1.0)
-        kind = pattern_of(known, there)
-        weight = jnp.asarray(known.chance)[:, kind] * spelled
+        flag_arrived, arrived = ~jnp.isnan(flag), ~jnp.isnan(z)
+        number = jnp.clip(jnp.where(flag_arrived, flag, 0.0).astype(int), 0, channel.flags.shape[1] - 1)
+        flag_chance = jnp.where(flag_arrived, jnp.asarray(channel.flags)[:, number], 1.0)
+        pattern = pattern_of(channel, arrived)
+        weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
         # Moments given the side information, then the projection.
         _, x, weights = _parts(state)
         weight = weight / (weight @ _law(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
-        told = jnp.asarray(weight - 1)[:, None] * state.variances
-        links = jax.tree.map(lambda part: jnp.asarray(part)[:, kind], (known.mean, known.gain_spread, known.noise))
-        after, innovations, innovation = _projected(
-            prior, told, _received(prior, sensor, size_of(sensor, start_of(self.plant)), *links), z
+        excess = jnp.asarray(weight - 1)[:, None] * state.variances
+        links = jax.tree.map(
+            lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
         )
-        likelihood = innovations.log_density(there, jnp.abs(z) + jnp.abs(innovation.mean))
-        value = jnp.where(there, innovation.mean, jnp.nan)
-        covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.nan)
+        after, innovations, innovation = _project(
+            prior, excess, _received(prior, sensor, size_of(sensor, start_of(self.plant)), *links), z
+        )
+        likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
+        value = jnp.where(arrived, innovation.mean, jnp.nan)
+        covariance = jnp.where(arrived[:, None] & arrived, innovation.covariance, jnp.nan)
         if self.flagged:
             nis, covariance = append_flag(covariance, flag)
             value = jnp.append(value, nis)
@@ -205,7 +207,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: SideInformationBelief) -> Estimate:
-        """x - c = sum_j zeta^j."""
+        """Return x = c + sum_j zeta^j, and the covariance of its error."""
         projection = sum_of_modes(len(self.states), len(self.initial))
         mean, covariance = state.centre + projection @ state.mean, state.errors.through(projection).covariance
         return Estimate(mean, covariance, self.claim)
@@ -230,13 +232,13 @@ class Expected(NamedTuple):
 
 
 def _parts(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Columns of e (M, N, q) and of x~ (M, n + 1, q) in each mode, and their weights (M, q)."""
+    """Return the columns of e (M, N, q) and of x~ (M, n + 1, q) in each mode, and their weights (M, q)."""
     root, count = jnp.asarray(state.moments.matrix), len(state.mean)
     return root[:, :count], root[:, count:], jnp.asarray(state.variances)
 
 
 def _of_factors(mean: jax.Array, moments: Columns, centre: jax.Array, moved: jax.Array) -> SideInformationBelief:
-    """State of the triangular factors of each mode's moments (M, q, q)."""
+    """Build the state from the triangular factors of each mode's moments (M, q, q)."""
     lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))
     return SideInformationBelief(mean, lower, jnp.asarray(moments.weights), centre, moved)
 
@@ -254,15 +256,18 @@ def _received(
     gain_spread: jax.Array,
     link: Columns,
 ) -> Received:
-    """Cov(z | zeta) in mode j is T_j(E[y y' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), and the rounding of z."""
+    """Return what is received of zeta: the output matrix, the mean output, and the noise in each mode.
+
+    Cov(z | zeta) in mode j is T_j(E[y y' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), and the rounding of z.
+    """
     (measure, noise), (_, x, weights) = measured_about(sensor, state.centre), _parts(state)
     law = _law(x, weights)
 
     def noise_of(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
         sent = x.through(measure).covariance + p * noise
-        known = joined(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
+        plain = joined(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ jnp.sqrt(size)) ** 2).times(p)
-        return triangular(joined(known, rounding, eliminated_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
+        return triangular(joined(plain, rounding, eliminated_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
 
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = without_common(gains @ measure, law)
@@ -270,44 +275,44 @@ def _received(
     return Received(output, common, jax.vmap(noise_of)(gains, gain_spread, link, Columns(x, weights), law))
 
 
-def _projected(
-    state: SideInformationBelief, told: jax.Array, received: Received, z: jax.Array
+def _project(
+    state: SideInformationBelief, excess: jax.Array, received: Received, z: jax.Array
 ) -> tuple[SideInformationBelief, Innovations, Expected]:
     """Project zeta on (1, s, z): what these say of e goes from e to s, column by column.
 
-    Before the side information (1, s) said nothing of e: what they say now is by what the weights `told` (M, q) more.
+    Before the side information (1, s) said nothing of e: what they say now is by what the weights grew, `excess`.
     """
     errors, x, weights = _parts(state)
-    m, count, modes, there = len(z), len(state.mean), len(weights), ~jnp.isnan(z)
+    m, count, modes, arrived = len(z), len(state.mean), len(weights), ~jnp.isnan(z)
     # Columns of the state and of the noise of z, in each mode.
     errors, x = (jnp.pad(part, ((0, 0), (0, 0), (0, m))) for part in (errors, x))
-    fresh = jnp.pad(jnp.asarray(received.noise.matrix), ((0, 0), (0, 0), (weights.shape[1], 0)))
+    noise = jnp.pad(jnp.asarray(received.noise.matrix), ((0, 0), (0, 0), (weights.shape[1], 0)))
     weights = jnp.concatenate([weights, received.noise.weights], axis=1).reshape(-1)
-    told = jnp.pad(told, ((0, 0), (0, m))).reshape(-1)
-    # Rows 1 and s = zeta - e, and z less what s says and e, of all modes side by side; and their values.
+    excess = jnp.pad(excess, ((0, 0), (0, m))).reshape(-1)
+    # Basis 1 and s = zeta - e; rows z, less what s says, and e: of all modes side by side, and their values.
     zeta = jax.vmap(lambda j, x: kron(j[:, None], x))(jnp.eye(modes), x)
-    seen = jnp.where(there[:, None], jax.vmap(lambda e: received.output @ e)(errors) + fresh, 0.0)
-    known, rest = _beside(x[:, -1:], zeta - errors), _beside(seen, errors)
-    value = jnp.where(there, z - received.common - received.output @ state.mean, 0.0)
+    innovation_rows = jnp.where(arrived[:, None], jax.vmap(lambda e: received.output @ e)(errors) + noise, 0.0)
+    basis, rows = _join_modes(x[:, -1:], zeta - errors), _join_modes(innovation_rows, errors)
+    values = jnp.where(arrived, z - received.common - received.output @ state.mean, 0.0)
     # Directions of s that rounding decides, eps of x~ and more where it was divided by little, say nothing.
-    size = jnp.tile(jnp.square(_beside(x)) @ weights, modes) + jnp.square(known[1:]) @ weights
-    least = jnp.append(0.0, np.sqrt(unit_of(weights)) * size)
-    known, numbers, variances = uncorrelated(known, jnp.append(1.0, state.mean), weights, 1 + count)
-    over = reciprocal(jnp.where(variances > least, variances, 0.0))
-    share = (rest @ (told * known).T) * over
-    rest, value = rest - share @ known, jnp.append(value, -state.mean) - share @ numbers
-    expected = Expected(value[:m], Columns(rest[:m], weights).covariance)
-    # The same with z.
-    rest, value, variances = uncorrelated(rest, value, weights, m)
-    innovations = Innovations(value[:m], variances, jnp.diagonal(expected.covariance))
+    size = jnp.tile(jnp.square(_join_modes(x)) @ weights, modes) + jnp.square(basis[1:]) @ weights
+    smallest = jnp.append(0.0, np.sqrt(unit_of(weights)) * size)
+    basis, basis_values, variances = uncorrelated(basis, jnp.append(1.0, state.mean), weights, 1 + count)
+    inverses = reciprocal(jnp.where(variances > smallest, variances, 0.0))
+    gains = (rows @ (excess * basis).T) * inverses
+    rows, values = rows - gains @ basis, jnp.append(values, -state.mean) - gains @ basis_values
+    expected = Expected(values[:m], Columns(rows[:m], weights).covariance)
+    # Then what z says of e.
+    rows, values, variances = uncorrelated(rows, values, weights, m)
+    innovations = Innovations(values[:m], variances, jnp.diagonal(expected.covariance))
     # Factors of each mode.
-    after = jnp.moveaxis(rest[m:].reshape(count, modes, -1), 1, 0)
-    moments = jax.vmap(triangular)(Columns(jnp.concatenate([after, x], axis=1), weights.reshape(modes, -1)))
-    return _of_factors(-value[m:], moments, state.centre, state.moved), innovations, expected
+    left = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
+    moments = jax.vmap(triangular)(Columns(jnp.concatenate([left, x], axis=1), weights.reshape(modes, -1)))
+    return _of_factors(-values[m:], moments, state.centre, state.moved), innovations, expected
 
 
-def _beside(*parts: jax.Array) -> jax.Array:
-    """Rows of all parts, each (M, rows, columns), with the columns of all modes side by side."""
+def _join_modes(*parts: jax.Array) -> jax.Array:
+    """Stack the rows of all parts, each (M, rows, columns), with the columns of all modes side by side."""
     rows = jnp.moveaxis(jnp.concatenate(parts, axis=1), 0, 1)
     return rows.reshape(len(rows), -1)
 
@@ -328,10 +333,10 @@ def uncorrelated(
     return rows, numbers, jnp.stack(variances)
 
 
-def pattern_of(channel: SideInformation, there: Bool[Array, " m"]) -> jax.Array:
-    """Index of the smallest possible pattern in which every component that is there arrives."""
+def pattern_of(channel: SideInformation, arrived: Bool[Array, " m"]) -> jax.Array:
+    """Return the index of the smallest possible pattern in which all components that arrived arrive."""
     present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
-    fits = jnp.all(present | ~there, axis=1) & possible
+    fits = jnp.all(present | ~arrived, axis=1) & possible
     return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
 
 
@@ -366,14 +371,14 @@ def side_information_filter(
     """
     check_linear("side-information filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
-    initial, steps, known = _described(channel)
+    initial, steps, is_known = _describe(channel)
     # P(flag | mode); one flag that is always the same where there are none.
     if flags is not None:
         chances = array("flags", flags, (len(initial), None))
         for i, row in enumerate(chances):
             probabilities(f"flags in mode {i}", row)
         steps = [replace(step, flags=chances) for step in steps]
-    claim = given_bounds("exact" if known else "nominal", plant, sensor, channel)
+    claim = given_bounds("exact" if is_known else "nominal", plant, sensor, channel)
     filter = SideInformationFilter(
         plant=plant,
         sensor=sensor,
@@ -389,20 +394,20 @@ def side_information_filter(
 
 
 @cached
-def _described(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
-    """Law of a channel's first mode, its moments at each step, and whether all of its probabilities are known."""
+def _describe(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
+    """Describe a channel: law of the first mode, moments at each step, and whether all probabilities are known."""
     steps = [joint_modes(c) for c in unstack(channel)]
-    known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
-    return steps[0].initial, by_pattern(steps, np.ones((len(steps[0].initial), 1))), known
+    is_known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
+    return steps[0].initial, by_pattern(steps, np.ones((len(steps[0].initial), 1))), is_known
 
 
 def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
     """Moments of the channel at each step by mode and pattern of arrivals, with the patterns of all steps."""
-    items = [[outcomes(m) for m in step.maps] for step in steps]
-    results = {tuple(o.arrived) for modes in items for parts in modes for o in parts}
-    kinds = sorted(results, key=lambda kind: (sum(kind), kind))
+    by_step = [[outcomes(m) for m in step.maps] for step in steps]
+    distinct = {tuple(o.arrived) for modes in by_step for parts in modes for o in parts}
+    patterns = sorted(distinct, key=lambda kind: (sum(kind), kind))
     before = [steps[0], *steps[:-1]]
-    return [_side_information(modes, kinds, last, flags) for modes, last in zip(items, before, strict=True)]
+    return [_side_information(modes, patterns, last, flags) for modes, last in zip(by_step, before, strict=True)]
 
 
 def _side_information(

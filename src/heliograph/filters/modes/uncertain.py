@@ -89,11 +89,11 @@ class UncertainModalFilter(AbstractModalFilter):
         (rows, radius), x = self._chain(state, k), state.gaussian
         move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
         root, young, fresh = self._moves(state, u, k)
-        known, law = x.mean - known_part(state.law, state.centre), state.law @ rows
-        mean = moved_by_mode(known[:, None], move, rows)[:, 0] + known_part(law, centre)
+        centred, law = x.mean - known_part(state.law, state.centre), state.law @ rows
+        mean = moved_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
         after = of_columns(mean, joined(Columns(root, (1 + young) * x.variances), fresh))
         # E[x~ x~'] and nominal law one step later.
-        second, (low, high) = move @ state.second @ move.T + noise, _bounds(rows, radius, state.low, state.high)
+        second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
         return UncertainBelief(*after, second, centre, law, low, high, jnp.asarray(True))
 
     def _chain(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
@@ -107,15 +107,17 @@ class UncertainModalFilter(AbstractModalFilter):
         move, (rows, radius) = moved_about(at(self.plant, k), u, state.centre)[0], self._chain(state, k)
         # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
         carried = move @ state.second @ move.T
-        chosen, wandering = (_worst(items, *_middle(state.low, state.high)) for items in _each_row(rows, radius))
+        chosen, wandering = (
+            _bound_mean(matrices, *_middle_law(state.low, state.high)) for matrices in _bound_moves(rows, radius)
+        )
         # Young's inequality, b = root(tr D / tr F Sigma F').
         root = moved_by_mode(state.gaussian.root, move, rows)
         young = jnp.sqrt(_ratio(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ state.variances)))
         wide = chosen + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * wandering
         # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
-        low, high = _bounds(rows, radius, state.low, state.high)
+        low, high = _bound_next_law(rows, radius, state.low, state.high)
         among = apart_by_mode(jnp.einsum("jl,ab->jalb", wide[:-1, :-1], carried))
-        own = self.moved_noise(u, k, eliminated_spread(_worst_diagonal(low, high)))
+        own = self.moved_noise(u, k, eliminated_spread(_bound_diagonal(low, high)))
         return root, young, joined(among, own)
 
     @corrects
@@ -125,12 +127,12 @@ class UncertainModalFilter(AbstractModalFilter):
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
         random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
-        added = _worst(random + gains @ noise @ gains.swapaxes(1, 2), *_middle(state.low, state.high))
+        added = _bound_mean(random + gains @ noise @ gains.swapaxes(1, 2), *_middle_law(state.low, state.high))
         matrix, common = without_common(gains @ measure, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * second)
-        known = state.mean - known_part(state.law, state.centre)
+        centred = state.mean - known_part(state.law, state.centre)
         output = Output(beside(matrix), common, joined(rounding, eliminated_spread(added)))
-        after, innovation = observe_modes(state.gaussian, known, output, z)
+        after, innovation = observe_modes(state.gaussian, centred, output, z)
         return UncertainBelief(*after, *state[3:]), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -145,8 +147,8 @@ def _ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
     return jnp.where(denominator > 0, numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0)
 
 
-def _each_row(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Bounds on Cov(1{next} | i) and on Delta_i Delta_i', for each mode i and every Delta_i.
+def _bound_moves(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Bound Cov(1{next} | i) and Delta_i Delta_i', for each mode i and every Delta_i.
 
     Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta'; and Delta Delta' <= P diag(r_j sum r) P, with P
     the projection that removes the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
@@ -159,28 +161,28 @@ def _each_row(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]
     return chosen, jnp.einsum("aj,ij,jb->iab", centred, sizes, centred)
 
 
-def _middle(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A law between the ends (its sum is 1), and the largest deviation of a possible law from it."""
+def _middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return a law between the ends (its sum is 1), and the largest deviation of a possible law from it."""
     middle = (low + high) / 2
     middle = middle + (1 - jnp.sum(middle)) / len(low)
     return middle, jnp.maximum(high - middle, middle - low)
 
 
-def _worst(items: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
-    """Bound on sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
-    values, vectors = jax.vmap(eigh)(items - jnp.mean(items, axis=0))
+def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
+    """Bound sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
+    values, vectors = jax.vmap(eigh)(matrices - jnp.mean(matrices, axis=0))
     sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
-    return jnp.einsum("i,iab->ab", middle, items) + jnp.einsum("i,iab->ab", reach, sizes)
+    return jnp.einsum("i,iab->ab", middle, matrices) + jnp.einsum("i,iab->ab", reach, sizes)
 
 
-def _worst_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
-    """Bound on diag(p) for all laws p, tight in the direction of x, which is that of equal entries.
+def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
+    """Bound diag(p) for all laws p, tight in the direction of x, which is that of equal entries.
 
     delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u':
     diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
     P diag(delta) P is 0 for two modes.
     """
-    modes, (middle, reach) = len(low), _middle(low, high)
+    modes, (middle, reach) = len(low), _middle_law(low, high)
     centred, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
     share = total / modes / 2
     safe = jnp.where(share > 0, share, 1.0)
@@ -189,14 +191,16 @@ def _worst_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
     return jnp.diag(middle) + share / modes * jnp.ones((modes, modes)) + across + within
 
 
-def _bounds(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Bounds on every mode's next probability, over the laws between `low` and `high`."""
+def _bound_next_law(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Bound every mode's next probability over the laws between `low` and `high`."""
     least, most = jnp.clip(rows - radius, 0.0, 1.0), jnp.clip(rows + radius, 0.0, 1.0)
-    return -jax.vmap(_largest, (1, None, None))(-least, low, high), jax.vmap(_largest, (1, None, None))(most, low, high)
+    return -jax.vmap(_largest_payoff, (1, None, None))(-least, low, high), jax.vmap(_largest_payoff, (1, None, None))(
+        most, low, high
+    )
 
 
-def _largest(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first."""
+def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first."""
     number = jnp.arange(len(payoff))
     earlier = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))
     room = high - low

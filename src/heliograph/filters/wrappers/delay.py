@@ -140,7 +140,7 @@ class HeldFilter(AbstractPartFilter):
         """Move the plant, send the sensor's signal, and receive it at one relay after another."""
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
-            state = _received_by(state, link, *line)
+            state = _receive_at(state, link, *line)
         return state
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -148,18 +148,18 @@ class HeldFilter(AbstractPartFilter):
         return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _received_by(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
-    """Moments after r = G l + n stands at `position`, l the line of `length` from `start` on."""
+def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
+    """Receive r = G l + n and put it at `position`; l is the line of `length` from `start` on."""
     # x+ = matrix x + shift: the received signal replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.mean), len(offset)
-    here, there = slice(start, start + length), slice(position, position + m)
-    matrix = jnp.eye(total).at[there, :].set(0.0).at[there, here].set(gain)
-    shift = jnp.zeros(total).at[there].set(offset)
+    line, place = slice(start, start + length), slice(position, position + m)
+    matrix = jnp.eye(total).at[place, :].set(0.0).at[place, line].set(gain)
+    shift = jnp.zeros(total).at[place].set(offset)
     # Cov(r | l) at the unconditional moments of l.
-    mean, covariance = state.state_mean[here], state.state_covariance[here, here]
+    mean, covariance = state.state_mean[line], state.state_covariance[line, line]
     spread = link_noise(link, covariance + jnp.outer(mean, mean), mean)
-    noise = Columns(jnp.zeros((total, spread.matrix.shape[1])).at[there].set(spread.matrix), spread.weights)
+    noise = Columns(jnp.zeros((total, spread.matrix.shape[1])).at[place].set(spread.matrix), spread.weights)
     return predicted(state, Move(matrix, shift, noise.covariance, noise))
 
 
@@ -177,13 +177,13 @@ def with_relays(
         lines.append((start, stage.inputs, total))
         start = total
         total += later.inputs
-        moved = at_each_step(partial(_holding, relay=i, size=stage.outputs, steps=later.past), moved)
+        moved = at_each_step(partial(_append_relay_line, relay=i, size=stage.outputs, steps=later.past), moved)
     # The receiver sees the line of the last relay.
     last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
     return moved, last, on_delay_line(channel.stages[-1]), tuple(lines)
 
 
-def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
+def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
     """Enlarge the plant by the line of a relay, which shifts by one at each step."""
     held = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
@@ -243,10 +243,10 @@ class LateFilter(AbstractSizedFilter):
         """Predict over step k - delay, with the input of that step."""
         line = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])
         then = jnp.asarray(k) - self.delay
-        moved = self._moved(state.base, line[0], then)
+        moved = self._predict_if_begun(state.base, line[0], then)
         return LateState(moved, line[1:], jnp.asarray(k, dtype=state.step.dtype))
 
-    def _moved(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+    def _predict_if_begun(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
         """Predict over step k, or return the state as it is where k < 0."""
         after = self.base.predict(base, u, jnp.maximum(k, 0))
         return jax.tree.map(lambda new, old: jnp.where(k >= 0, new, old), after, base)
@@ -267,7 +267,7 @@ class LateFilter(AbstractSizedFilter):
         """Prediction over the last `delay` steps."""
 
         def move(j: jax.Array, base: PyTree) -> PyTree:
-            return self._moved(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
+            return self._predict_if_begun(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
 
         if not self.delay:
             return self.base.estimate(state.base)

@@ -39,7 +39,7 @@ class PlantParts(NamedTuple):
 
     def to_bytes(self) -> bytes:
         """Serialise: lengths of the parts, then the parts."""
-        return _joined(self.head, *(array.ravel() for array in self[1:]))
+        return _pack_parts(self.head, *(array.ravel() for array in self[1:]))
 
     @staticmethod
     def of(data: bytes, width: int) -> "PlantParts":
@@ -49,7 +49,7 @@ class PlantParts(NamedTuple):
         shapes = ((rows, 2), (events, 3), (rows, width), (events,), (numbers,))
         for kind, shape in zip(TYPES, shapes, strict=True):
             if len(arrays) == 2 and KEPT in head:
-                array, at = _unpacked(data, at, math.prod(shape), head.pop(KEPT))
+                array, at = _unpack_table(data, at, math.prod(shape), head.pop(KEPT))
             else:
                 array = np.frombuffer(data, kind, math.prod(shape), at)
                 at += array.nbytes
@@ -65,7 +65,7 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
     origin = None if plant.origin is None else plant.origin.isoformat()
     links = {node: list(vars(link).values()) for node, link in plant.links.items()}
     names = [(i, *name) for i, row in enumerate(rows) for name in row.events]
-    return _joined(
+    return _pack_parts(
         {
             "now": plant.now,
             "forced": plant.forced,
@@ -82,21 +82,23 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
     )
 
 
-def _joined(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
-    """Serialise the head and the flat parts of a plant behind their lengths."""
+def _pack_parts(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
+    """Serialise the head and the flat parts (keys, events, table, times, values) behind the lengths of all."""
+    # Numbers of rows, events and values, from keys (rows, 2), events (events, 3) and values.
     counts = len(flat[0]) // 2, len(flat[1]) // 3, len(flat[4])
-    numbers = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]
-    table = numbers[2]
-    there = table.view("<i8") != 0  # the sign of a zero counts
-    kept = int(np.count_nonzero(there))
-    bodies = [array.tobytes() for array in numbers]
+    arrays = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]
+    # Of a table that is mostly zeros a bit for each number, and those that are not zero.
+    table = arrays[2]
+    nonzero = table.view("<i8") != 0  # the sign of a zero counts
+    kept = int(np.count_nonzero(nonzero))
+    packed = [array.tobytes() for array in arrays]
     if 2 * kept < len(table):
-        head, bodies[2] = head | {KEPT: kept}, np.packbits(there).tobytes() + table[there].tobytes()
+        head, packed[2] = head | {KEPT: kept}, np.packbits(nonzero).tobytes() + table[nonzero].tobytes()
     text = json.dumps(head).encode()
-    return b"".join([HEAD.pack(len(text), *counts), text, *bodies])
+    return b"".join([HEAD.pack(len(text), *counts), text, *packed])
 
 
-def _unpacked(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
+def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
     """Read so many numbers, of which some are kept; return them and the place behind them."""
     bits = np.frombuffer(data, np.uint8, -(-size // 8), at)
     values = np.frombuffer(data, "<f8", kept, at + len(bits))

@@ -95,7 +95,7 @@ def transmitters_of(network: Network) -> tuple[str, ...]:
 
 
 def check_time(network: Network, error: Error) -> None:
-    """Raise ValueError where what varies in a network does not fit the steps of an error, or none of it is steady."""
+    """Raise ValueError unless all that varies over time in a network fits an error's horizon, or else its period."""
     check_design_plant(network.plant)
     covered = steps_covered((network.plant, sources_of(network)))
     if error.horizon is not None:

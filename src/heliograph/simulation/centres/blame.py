@@ -47,18 +47,20 @@ def refused_centrally(
     Returns:
         the rows of each node that is to blame, with the reason.
     """
-    tried = [(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
-    rows = np.array([k for k, _ in tried], dtype=int)
+    # Each row once for each of these nodes that has a value in it, without that value.
+    removals = [(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
+    rows = np.array([k for k, _ in removals], dtype=int)
     without = [z[name][rows] for name in z]
-    for i, (_, name) in enumerate(tried):
+    for i, (_, name) in enumerate(removals):
         without[list(z).index(name)][i] = np.nan
+    # Whether the filters find the row plausible then.
     votes = _judgements(filters, before, np.concatenate(without, axis=1), u, rows)
-    plausible = {those: why_values(vote) is None for those, vote in zip(tried, votes, strict=True)}
+    plausible = {removal: why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
     refused = dict[str, dict[int, str]]()
     for k, reason in why.items():
-        if candidates := [those for those in tried if those[0] == k]:
+        if candidates := [removal for removal in removals if removal[0] == k]:
             _, name = blamed(
-                candidates, lambda those: float(np.nanmax(np.abs(z[those[1]][those[0]]))), plausible.__getitem__
+                candidates, lambda removal: float(np.nanmax(np.abs(z[removal[1]][removal[0]]))), plausible.__getitem__
             )
             refused.setdefault(name, {})[k] = reason
     return refused

@@ -77,7 +77,10 @@ class Edges(Module):
         return states, jnp.stack(rounds, axis=1)
 
     def lossless(self) -> Bool[np.ndarray, "node rounds degree"] | Int[np.ndarray, "node rounds degree"]:
-        """Flags of a step at which everything arrives at once."""
+        """Return the flags of a step at which everything arrives at once.
+
+        Of messages that may be late they are ages, 0 of a neighbour and -1 of none; else whether there is a neighbour.
+        """
         module = library(self.present)
         flags = module.where(self.present, 0, -1) if self.past else self.present
         repeated: np.ndarray = module.repeat(flags[:, None], self.rounds, axis=1)

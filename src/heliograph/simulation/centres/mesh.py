@@ -247,9 +247,9 @@ class Mesh(Module):
     ) -> PyTree:
         """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
         information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
-        both = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
-        results = []
-        for bucket, known in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
+        over_rows = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
+        by_bucket = []
+        for bucket, bucket_ahead in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
             rows, width = bucket.rows, bucket.width
             theirs = (self.senders if senders is None else senders)[rows, :width]
             block = None if blocks is None else blocks[rows, :width, :, :width]
@@ -257,11 +257,11 @@ class Mesh(Module):
             if self.alpha is not None:  # what was sent last errs by more than the estimate
                 wider = jnp.where(np.arange(width) > 0, (1 + jnp.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
                 seen = seen._replace(traces=seen.traces * wider, information=seen.information / wider[:, None, None])
-            results.append(both(bucket.rule, seen, *(leaf[rows] for leaf in rest), known))
-        if len(results) == 1:
-            return results[0]
+            by_bucket.append(over_rows(bucket.rule, seen, *(leaf[rows] for leaf in rest), bucket_ahead))
+        if len(by_bucket) == 1:
+            return by_bucket[0]
         # Rows of one length again, in the order of the nodes.
-        padded = [r._replace(parts=_padded(r.parts, self.senders.shape[1])) for r in results]
+        padded = [r._replace(parts=_padded(r.parts, self.senders.shape[1])) for r in by_bucket]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
     def _collected(self, values: jax.Array, arrived: Arrived) -> jax.Array:
@@ -328,7 +328,7 @@ def _weights(rule: AbstractFusion, belief: Believed, *_: PyTree) -> Weights:
 
 
 def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
-    """Fill rows with zeros up to the longest."""
+    """Pad rows with zeros up to the longest."""
     return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), *[(0, 0)] * (parts.ndim - 2)))
 
 
@@ -341,13 +341,14 @@ def mesh_of(network: Network, name: str) -> Mesh:
     # Models of the measurements, group after group.
     index = {node: i for i, node in enumerate(nodes)}
     groups: list[ObservationModel | None] = []
-    order: dict[str, int] = {}
+    group_places: dict[str, int] = {}
     for names in network.groups:
         sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
         groups.append(observation_model([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
-        order |= {node: len(order) + i for i, node in enumerate(names)}
+        group_places |= {node: len(group_places) + i for i, node in enumerate(names)}
+    # Kinds of its filters, and the places of their nodes in the mesh.
     kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
-    mine = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]
+    kind_places = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]
     return Mesh(
         plant=network.plant,
         buckets=tuple(Rows(fusion.rule.placed(b), b.senders[:, 0], b.senders.shape[1]) for b in graph.buckets()),
@@ -355,12 +356,12 @@ def mesh_of(network: Network, name: str) -> Mesh:
         edges=edges_of(fusion, graph),
         observation_model=Apart(
             tuple(groups),
-            np.array([order[node] for node in nodes]),
+            np.array([group_places[node] for node in nodes]),
             max(1, *(node.received for node in network.nodes.values())),
             tuple(map(len, network.groups)),
         ),
         senders=graph.senders,
-        places=tuple(mine),
+        places=tuple(kind_places),
         nodes=graph.nodes,
         alpha=None if fusion.alpha is None else np.asarray(fusion.alpha),  # a number of its program
         quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,

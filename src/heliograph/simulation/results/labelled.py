@@ -140,29 +140,29 @@ MEANING = {
 
 
 def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
-    """Units by the state's name, and of `time`; empty ones are left out.
+    """Check units by the state's name, and of `time`; empty ones are left out.
 
     Raises:
         ValueError: a name that is no state, a unit that is no text.
     """
-    known = table("units", units, "texts")
-    for name, unit in known.items():
+    by_name = table("units", units, "texts")
+    for name, unit in by_name.items():
         if name not in (*states, TIME):
             raise fail("units", f"names of states {list(states)}, or {TIME!r}", repr(name))
         instance(f"unit of {name!r}", unit, str, "a text")
-    return {name: unit for name, unit in known.items() if unit}
+    return {name: unit for name, unit in by_name.items() if unit}
 
 
 def placed(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) -> tuple[list[str], list[Placed[T]]]:
-    """Names of all filters, and each filter's value with its place among nodes and filters."""
-    filters = list(dict.fromkeys(name for of in by_node.values() for name in of))
+    """Return the names of all filters, and each filter's value with its place (node, filter) in an array."""
+    filters = list(dict.fromkeys(name for by_filter in by_node.values() for name in by_filter))
     places: list[Placed[T]] = [((nodes.index(node), filters.index(name)), value)
-              for node, of in by_node.items() for name, value in of.items()]  # fmt: skip
+              for node, by_filter in by_node.items() for name, value in by_filter.items()]  # fmt: skip
     return filters, places
 
 
 def filled(lead: Shape, places: Shape, tail: Shape, parts: Sequence[Placed[np.ndarray]]) -> np.ndarray:
-    """Arrays (*lead, *up to tail) at their places along axes between; NaN elsewhere."""
+    """Fill an array (*lead, *places, *tail) with parts (*lead, *up to tail) at their places; NaN elsewhere."""
     arrays = np.full((*lead, *places, *tail), np.nan)
     ahead: tuple[slice, ...] = (slice(None),) * len(lead)
     for position, values in parts:
@@ -172,7 +172,7 @@ def filled(lead: Shape, places: Shape, tail: Shape, parts: Sequence[Placed[np.nd
 
 
 def claims_of(sizes: Shape, outcome: Iterable[Placed[Any]]) -> np.ndarray:
-    """Claim of each filter, at its place; empty elsewhere."""
+    """Return the claim of each filter, at its place; empty elsewhere."""
     claims = np.full(sizes, "", dtype="U7")
     for position, estimate in outcome:
         claim: Claim = estimate.claim
