@@ -162,6 +162,16 @@ def test_a_csv_file_is_mapped_by_the_same_object(world, tmp_path):
     assert "row 3: expected a field 'linear.x', got no 'x' in an empty message" in table.reasons[0]
 
 
+def test_arrivals_in_seconds_date_the_lines_of_a_log(world, tmp_path):
+    """`mosquitto_sub -F "%U %t %p"` prints seconds since 1970 with a fraction."""
+    network, _, *_ = world
+    log = tmp_path / "mqtt.log"
+    log.write_text("1700000000.25 /gps 1.5\n1700000000.75 /gps 2.5\nnoon /gps 3\n1700000002.25 /gps 3.5\n")
+    rows = hg.files.read_messages(log, network, {"/gps": hg.files.json_field("", "gps")}).recording()
+    np.testing.assert_array_equal(rows.time, [0.0, 0.5, 2.0])
+    np.testing.assert_array_equal(rows.measurements["gps"][:, 0], [1.5, 2.5, 3.5])
+
+
 def test_inputs_hold_and_repeated_events_count_once(world):
     """Input 2 from second 1 on: the row at 1 has what held before it, the next has 2; time since the row before."""
     network, *_ = world

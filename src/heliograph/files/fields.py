@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from decimal import Decimal
 from functools import lru_cache
 from math import isfinite
 from operator import attrgetter
@@ -166,10 +167,17 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> 
         raise fail(name, "a time: a date with its zone, a stamp, or a number", shown(value))
     if unit == "step":
         return count(value, name)
-    stamp = int(value) * UNITS[unit] if float(value).is_integer() else round(float(value) * UNITS[unit])
+    # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
+    whole_units = float(value).is_integer()
+    stamp = int(value) * UNITS[unit] if whole_units else round(Decimal(repr(float(value))) * UNITS[unit])
     if not -(2**63) < stamp < 2**63:
         raise fail(name, f"a time in {unit} since 1970", shown(value))
     return stamp
+
+
+def arrived(value: Any, name: str) -> int:
+    """Convert what a log says of an arrival, a date or seconds, also as a text, to nanoseconds since 1970."""
+    return nanoseconds(value, "s", name, quoted=True)
 
 
 def count(value: Any, name: str, quoted: bool = False) -> int:

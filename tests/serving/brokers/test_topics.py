@@ -117,7 +117,26 @@ def test_lines_with_a_topic_are_those_of_mosquitto_sub(translator):
     (message,) = translator.line(b'{"topic": "shed/temperature", "payload": "21.5", "retain": 0}')
     (other,) = translator.line(b'{"topic": "zigbee2mqtt/garden", "payload": {"temperature": 3}}')
     assert message.values == [21.5] and other.values == [3.0]
+    (dated,) = translator.line(b"1700000000.25 shed/temperature 21.5")  # mosquitto_sub -F "%U %t %p"
+    assert isinstance(dated, Message) and dated.time == datetime(2023, 11, 14, 22, 13, 20, 250_000, UTC)
     assert translator.line(b'{"node": "garden"}') == [b'{"node": "garden"}'] and translator.line(b"x") == [b"x"]
+
+
+def test_lines_without_a_topic_are_of_the_only_one(file):
+    """`serve < lines.jsonl` reads what `run --measurements lines.jsonl` reads; with several topics none is guessed."""
+    from heliograph.files.network_file import load_module
+
+    network, _ = load_module(str(file))
+    source = hg.files.json_field("t", node="garden", time="time", sequence=hg.files.Count("count", 8))
+    alone = Translator({"lines.jsonl": source}, network)
+    (message,) = alone.line(b'{"t": 20.5, "time": 1700000000, "count": 255}')
+    assert isinstance(message, Message) and (message.sequence, message.values) == (255, [20.5])
+    (bad,) = alone.line(b'{"t": "warm", "time": 1700000001}')
+    assert isinstance(bad, str) and bad.startswith("lines.jsonl, field 't': expected a number")
+    own = b'{"node": "garden", "sequence": 0, "time": 1, "values": [1]}'
+    assert alone.line(own) == [own]
+    several = Translator({"lines.jsonl": source, "other.jsonl": source}, network)
+    assert several.line(b'{"t": 20.5, "time": 1700000000}') == [b'{"t": 20.5, "time": 1700000000}']
 
 
 def test_sources_and_parts_exclude_each_other():
@@ -185,7 +204,7 @@ def test_the_stored_word_of_a_device_holds_for_a_service_that_begins_later(serve
                 client.publish("den2mqtt/a", payload, 1)
             await until(lambda: translator.sources.offline["den2mqtt/a"] == 2)
             client.publish("den2mqtt/a/availability", b'{"state": "online"}', 1, retain=True)
-            await until(lambda: not translator.sources._words._offline)
+            await until(lambda: not translator.sources.words._offline)
             client.publish("den2mqtt/a", b'{"temperature": 18.0}', 1)
             batch = await asyncio.wait_for(read, 20)
             assert [message.values for message in batch.payloads] == [[18.0]]

@@ -5,7 +5,7 @@ from collections.abc import Collection
 from datetime import UTC, datetime, timedelta
 
 from heliograph.files.event_columns import YEAR
-from heliograph.files.fields import decoded, nanoseconds
+from heliograph.files.fields import arrived, decoded
 from heliograph.files.message_files import log_line, of_log
 from heliograph.files.sources import Reading, Sources
 from heliograph.numerics.check import InputError, fail, shown
@@ -39,6 +39,8 @@ class Translator:
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
         self.sources = Sources(table, network, others)
+        topics = self.sources.topics
+        self._alone = topics[0] if len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/")) else None
         self._counts, self._stored = Counter[tuple[str, str]](), 0
         # Values of the newest times of each plant and node without a count.
         self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
@@ -58,7 +60,8 @@ class Translator:
         """Return a line of a pipe as it is, or the messages in it if it has a topic and a payload.
 
         So MQTT clients print, `mosquitto_sub -F %j`, `-F "%I %t %p"` or `-v` for example. What a line says of its
-        arrival is used; one that says nothing arrives when it was measured, and at the present at the latest.
+        arrival is used; one that says nothing arrives when it was measured, and at the present at the latest. A line
+        that names neither a topic nor a node is of the only topic of the sources, such as a line of a file.
         """
         try:
             content = decoded(payload[:LONGEST], "line")
@@ -68,11 +71,14 @@ class Translator:
         if logged is None and content is None:
             parts = log_line(payload.decode(errors="replace"))
             logged = parts and (*parts, False)
+        if logged is None and self._alone is not None and not (isinstance(content, dict) and "node" in content):
+            came = content.get("arrival") if isinstance(content, dict) else None
+            logged = self._alone, payload.decode(errors="replace"), came, False
         if logged is None:
             return [payload]
         topic, inner, came, stored = logged
         try:
-            arrival = None if came is None else moment(nanoseconds(came, "s", f"{topic}, arrival"))
+            arrival = None if came is None else moment(arrived(came, f"{topic}, arrival"))
         except InputError as error:
             return [str(error)]
         return list(self._read(topic, inner.encode(), arrival, stored, again=False))
