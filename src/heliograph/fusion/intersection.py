@@ -43,7 +43,7 @@ def intersect(
     Differences of the means are used, since the matrices that multiply them have lost the digits that nearly dependent
     components cost: the means themselves may be millions of deviations from zero.
     """
-    covariance = inverse(_weighted(weights, information))
+    covariance = inverse(_weighted_sum(weights, information))
     off = add([w * times_vector(j, x - means[0]) for w, j, x in zip(weights, information, means, strict=True)])
     return means[0] + times_vector(covariance, off), covariance
 
@@ -92,9 +92,9 @@ class _Point(NamedTuple):
 def _trace_derivatives(
     information: Float[jax.Array, "count n n *#runs"], w: Float[jax.Array, "count *#runs"]
 ) -> tuple[Float[jax.Array, "*#runs"], Float[jax.Array, "count *#runs"], Float[jax.Array, "count count *#runs"]]:
-    """tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
+    """Return tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
     count, n, rest = information.shape[0], information.shape[1], information.shape[3:]
-    p = inverse(_weighted(w, information))
+    p = inverse(_weighted_sum(w, information))
     half = _product(information.reshape(count * n, n, *rest), p).reshape(count, n, n, *rest)  # J_k P
     full = _product(p, jnp.swapaxes(half, 0, 1).reshape(n, count * n, *rest)).reshape(n, count, n, *rest)
     gradient = jnp.stack([-trace(full[:, k]) for k in range(count)])
@@ -106,16 +106,16 @@ def _trace_derivatives(
 _product = runs_last(times)
 
 
-def _weighted(
+def _weighted_sum(
     w: Float[jax.Array, "count *#runs"], information: Float[jax.Array, "count n n *#runs"]
 ) -> Float[jax.Array, "n n *#runs"]:
-    """sum_k w_k J_k."""
+    """Return sum_k w_k J_k."""
     return add([w[k] * information[k] for k in range(len(information))])
 
 
 @runs_last
 def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
-    """One step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
+    """Take one Newton step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
 
     The target follows from where the step with target 0 would end (Mehrotra's predictor and corrector).
     """
@@ -134,19 +134,21 @@ def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     # Predictor: the step with target 0.
     present = jnp.mean(w * slack, axis=0)
     move, slack_move = direction(jnp.zeros_like(w))
-    ahead = jnp.mean((w + _longest(w, move) * move) * (slack + _longest(slack, slack_move) * slack_move), axis=0)
+    ahead = jnp.mean(
+        (w + _longest_step(w, move) * move) * (slack + _longest_step(slack, slack_move) * slack_move), axis=0
+    )
     # Corrector: centred, less the predictor's second-order term.
     target = present * jnp.clip(ahead / present, 0.0, 1.0) ** 3 - move * slack_move
     move, slack_move = direction(target)
-    length = jnp.minimum(_longest(w, move), _longest(slack, slack_move))
+    length = jnp.minimum(_longest_step(w, move), _longest_step(slack, slack_move))
     w = w + length * move
     return w / jnp.sum(w, axis=0), slack + length * slack_move
 
 
-def _longest(
+def _longest_step(
     value: Float[jax.Array, "count *#runs"], move: Float[jax.Array, "count *#runs"]
 ) -> Float[jax.Array, "*#runs"]:
-    """Largest step, at most 1, that keeps value + step move positive."""
+    """Return the largest step, at most 1, that keeps value + step move positive."""
     reach = jnp.where(move < 0, -value / jnp.where(move < 0, move, -1.0), jnp.inf)
     return jnp.minimum(1.0, STEP_BACK * jnp.min(reach, axis=0))
 
@@ -187,13 +189,13 @@ def intersect_inversely(
 
 @runs_last_of(jnp.shape)
 def inverse(a: Float[jax.Array, "n n *#runs"]) -> Float[jax.Array, "n n *#runs"]:
-    """A^-1 of a positive definite A."""
+    """Return A^-1 of a positive definite A."""
     n = a.shape[0]
     return symmetric(solve(a, jnp.eye(n).reshape(n, n, *[1] * (a.ndim - 2))))
 
 
 def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
-    """P_k^-1 of several covariances of one state; components that an estimate knows exactly count as known to KNOWN.
+    """Invert several covariances P_k of one state; components that an estimate knows exactly count as known to KNOWN.
 
     A component with less than KNOWN of its variance left, given those before it, gets KNOWN of it added; a component of
     variance zero gets KNOWN of the largest variance that any of the estimates has for it (1 where all are zero): the
@@ -218,15 +220,15 @@ def with_known(
     means: Float[jax.Array, "count n"],
     inputs: Float[jax.Array, "count n n"],
 ) -> tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]:
-    """Fused mean and covariance, where a component that an input knows exactly is that input's, of variance zero.
+    """Replace each component of a fused estimate that an input knows exactly by that input's, of variance zero.
 
     In `inverses` a small number stands for no variance, of which the mean would keep 1e-8 of what the others say.
     """
     exact = jnp.diagonal(inputs, axis1=1, axis2=2) == 0
-    for own, known in zip(reversed(list(means)), reversed(list(exact)), strict=True):
-        mean = jnp.where(known, own, mean)
-    known = jnp.any(exact, axis=0)
-    return mean, jnp.where(known[:, None] | known, 0.0, covariance)
+    for own, is_exact in zip(reversed(list(means)), reversed(list(exact)), strict=True):
+        mean = jnp.where(is_exact, own, mean)
+    is_exact = jnp.any(exact, axis=0)
+    return mean, jnp.where(is_exact[:, None] | is_exact, 0.0, covariance)
 
 
 Shared = tuple[Float[jax.Array, " degree"], Float[jax.Array, "n n"]]  # shares pi, and (sum_j pi_j P_j^-1)^-1
@@ -250,7 +252,7 @@ def trace_shares(believed: Believed, power: float, improvements: int) -> Shared:
     least = jnp.min(jnp.where(believed.present, believed.traces, jnp.inf))
     powers = jnp.where(believed.present, (least / believed.traces) ** power, 0.0)
     equal = equal_shares(believed)
-    best = _better(intersected(believed, powers / powers.sum()), equal)
+    best = _smaller_trace(intersected(believed, powers / powers.sum()), equal)
     # A share of zero stays zero, so start inside.
     shares = (best[0] + equal[0]) / 2
     for _ in range(improvements):
@@ -258,7 +260,7 @@ def trace_shares(believed: Believed, power: float, improvements: int) -> Shared:
         push = jnp.einsum("ab,jbc,ca->j", covariance, believed.information, covariance) / jnp.trace(covariance)
         shares = shares * jnp.sqrt(jnp.maximum(push, 0.0))
         shares = shares / shares.sum()
-        best = _better(best, intersected(believed, shares))
+        best = _smaller_trace(best, intersected(believed, shares))
     return best
 
 
@@ -268,12 +270,12 @@ def intersected(believed: Believed, shares: Float[jax.Array, " degree"]) -> Shar
 
 
 def intersection_weights(believed: Believed, shared: Shared) -> Weights:
-    """Weights C_j = Pc pi_j P_j^-1 and Pc."""
+    """Return the weights C_j = Pc pi_j P_j^-1 and Pc."""
     shares, covariance = shared
     return Weights(covariance, shares[:, None, None] * believed.information, covariance)
 
 
-def _better(a: Shared, b: Shared) -> Shared:
+def _smaller_trace(a: Shared, b: Shared) -> Shared:
     """Return those shares whose intersection has the smaller trace."""
     smaller = jnp.trace(a[1]) <= jnp.trace(b[1])
     return jnp.where(smaller, a[0], b[0]), jnp.where(smaller, a[1], b[1])

@@ -24,7 +24,7 @@ RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to 
 Weights = Callable[..., Float[jax.Array, "n node n"]]
 
 
-def _of_joint(weights: Weights) -> Weights:
+def _check_joint(weights: Weights) -> Weights:
     """Decorate weights so that they refuse an array that is no joint covariance."""
 
     @wraps(weights)
@@ -37,10 +37,10 @@ def _of_joint(weights: Weights) -> Weights:
     return call
 
 
-@_of_joint
+@_check_joint
 @compiled
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Matrix weights: W_i with sum_i W_i = I that minimise W P W', for `joint` P (node, n, node, n).
+    """Compute matrix weights: W_i with sum_i W_i = I that minimise W P W', for `joint` P (node, n, node, n).
 
     W = (E' U^+ E)^-1 E' U^+, E = [I; ...; I], U = P + E D E'. P^+ alone is wrong where a combination of the estimates
     has no error. With U = P + E D E', D > 0, the range of E is in that of U, and U gives the weights of P since W E is
@@ -60,8 +60,8 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     # U = P + E E' in these units.
     total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     ones = jnp.tile(jnp.eye(n), (nodes, 1))
-    unscaled = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
-    weights = regular_solve(unscaled @ ones, unscaled).reshape(n, nodes, n)
+    projected = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
+    weights = regular_solve(projected @ ones, projected).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
 
@@ -69,7 +69,7 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 def factored_weights(
     shared: Float[Array, "node n sources"], independent: Float[Array, "node n n"]
 ) -> Float[jax.Array, "n node n"]:
-    """Matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
+    """Compute matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
 
     P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E.
     """
@@ -91,45 +91,45 @@ def factored_weights(
     return jnp.asarray(unbiased.reshape(n, nodes, n))
 
 
-@_of_joint
+@_check_joint
 @compiled
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n).
+    """Compute diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n).
 
     Args:
         joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
     """
-    return _by_component(matrix_weights, jnp.asarray(joint))
+    return _weigh_components(matrix_weights, jnp.asarray(joint))
 
 
-@_of_joint
+@_check_joint
 @compiled
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Scalar weights: one number per estimate, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n).
+    """Compute scalar weights: one number per node, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n).
 
     Args:
         joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
     """
-    return _by_trace(matrix_weights, jnp.asarray(joint))
+    return _weigh_by_trace(matrix_weights, jnp.asarray(joint))
 
 
-def _by_component(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Diagonal weights: those of each component of the state by itself."""
+def _weigh_components(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    """Return diagonal weights: those of each component of the state by itself."""
     nodes, n = joint.shape[:2]
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
     weights = jax.vmap(lambda block: weigh(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
     return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
 
 
-def _by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """One number for each estimate: the weights of errors whose covariances are the traces."""
+def _weigh_by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    """Return one number for each estimate: the weights of errors whose covariances are the traces."""
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", joint)
     return jnp.einsum("i,ab->aib", weigh(traces.reshape(nodes, 1, nodes, 1))[0, :, 0], jnp.eye(n))
 
 
 def weighted(weights: Float[Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:
-    """W P W'."""
+    """Return the covariance W P W' of the weighted sum of the errors."""
     return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))
 
 
@@ -253,7 +253,7 @@ def arrived_weights_by_component(
     degree, n = joint.shape[:2]
     if degree <= SHORT:
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
-    return _by_component(partial(arrived_weights, present=present), joint)
+    return _weigh_components(partial(arrived_weights, present=present), joint)
 
 
 @runs_last
@@ -289,4 +289,4 @@ def arrived_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """One number for each of those that are present, of least trace."""
-    return _by_trace(partial(arrived_weights, present=present), joint)
+    return _weigh_by_trace(partial(arrived_weights, present=present), joint)

@@ -97,7 +97,7 @@ def run(
     if time is not None and TIME_STEP not in network.inputs and (said := unequal_steps(clock)):
         warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=2)
     for name, node in network.nodes.items():
-        z[name] = _within(name, node, z[name])
+        z[name] = _drop_beyond_limits(name, node, z[name])
         _warn_of_forbidden(name, node, z[name])
     for line in beyond_a_turn(network, z):
         warnings.warn(line, stacklevel=2)
@@ -108,7 +108,7 @@ def run(
         arrivals = _reports_of(
             filters, {} if reports is None else table("reports", reports, "reports by fusion"), steps
         )
-        outputs = _plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
+        outputs = _filter_plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
     record = record_of(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
@@ -118,8 +118,10 @@ def run(
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 
-def _within(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
-    """Measurements without those beyond their node's limits, which are warned of."""
+def _drop_beyond_limits(
+    name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]
+) -> Float[np.ndarray, "steps m"]:
+    """Drop measurements beyond their node's limits, and warn of them."""
     if node.limits is None or not (outside := node.limits.outside(z)).any():
         return z
     row, count = int(np.argmax(outside.any(axis=1))), int(outside.sum())
@@ -139,18 +141,18 @@ def _warn_of_forbidden(name: str, node: Node | ReceivingNode, z: Float[np.ndarra
 
 def _reports_of(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
     """Return what arrived of reports and between neighbours, by fusion."""
-    arrivals: dict[str, PyTree] = {
+    centre_arrivals: dict[str, PyTree] = {
         name: centre.uplinks.recorded(name, centre.nodes, reports.get(name), steps)
         for name, centre in filters.reporting.items()
     }
-    of_meshes = {
+    mesh_arrivals = {
         name: mesh.edges.recorded(name, mesh.nodes, reports.get(name), steps) for name, mesh in filters.meshes.items()
     }
-    return arrivals | of_meshes
+    return centre_arrivals | mesh_arrivals
 
 
-def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree:
-    """Results of the filters without implausible data, which are warned of.
+def _filter_plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree:
+    """Filter a recording without implausible data, and warn of them.
 
     If there are any, the recording is first filtered step by step without them to find all rows; then, without those
     that all filters of a node refuse, once again as a recording that never had them. Of what central filters refuse
@@ -161,31 +163,31 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
         return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
 
     # Usually nothing is implausible.
-    outputs = _filtered(*rest, grouped(), False)
+    outputs = _filter_rows(*rest, grouped(), False)
     if not any_implausible(outputs):
         said = doubts(network, outputs, {}, rest[2])
     else:
         # Find all rows that are, then filter again without them.
-        outputs = first_time = _filtered(*rest, grouped(), True)
+        outputs = first_time = _filter_rows(*rest, grouped(), True)
         refused = dict[str, dict[int, str]]()
-        while new := _refused(network, outputs, z, grouped(), rest, refused):
+        while new := _find_refused(network, outputs, z, grouped(), rest, refused):
             for name, rows in new.items():
                 refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
                 z[name] = z[name].copy()
                 z[name][list(rows)] = np.nan
-            again = _filtered(*rest, grouped(), False)
-            outputs = _filtered(*rest, grouped(), True) if any_implausible(again) else again
+            again = _filter_rows(*rest, grouped(), False)
+            outputs = _filter_rows(*rest, grouped(), True) if any_implausible(again) else again
         said = doubts(network, first_time, refused, rest[2])
     for line in said:
         warnings.warn(line, stacklevel=3)
     return {name: values for name, values in outputs.items() if not name.startswith("judged")}
 
 
-def _refused(
+def _find_refused(
     network: Network, outputs: PyTree, z: dict[str, np.ndarray], grouped: tuple[np.ndarray, ...], rest: Rest,
     before: dict[str, dict[int, str]],
 ) -> dict[str, dict[int, str]]:  # fmt: skip
-    """Rows that all filters of a node refuse, and those that central ones do by the node to blame; new ones alone."""
+    """Find the rows that all filters of a node refuse, and central ones' by the node to blame; new ones alone."""
     (filters, _, u, arrivals), (refused, shared) = rest, refused_rows(network, outputs)
     if shared:
         states = computed(_central_states, _central_states_by_xla, (filters, u, arrivals, grouped))
@@ -199,7 +201,7 @@ def _refused(
 def _central_states(
     filters: AllFilters, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...]
 ) -> PyTree:
-    """States of the central filters before each row."""
+    """Return the states of the central filters before each row."""
 
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k, drawn = row
@@ -209,14 +211,14 @@ def _central_states(
     return before
 
 
-def _filtered(*arguments: PyTree) -> PyTree:
-    """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
+def _filter_rows(*arguments: PyTree) -> PyTree:
+    """Run `_run_filters`, with results as NumPy arrays, by native code where it supports the filters."""
     # Joint covariances are stored at places that the graph, an argument here, decides: XLA's.
     by_xla = any(mesh.is_long or mesh.needs_joint for mesh in arguments[0].meshes.values())
-    return _in_parts(*arguments) if by_xla else computed(_run_filters, _by_xla, arguments)
+    return _scan_in_parts(*arguments) if by_xla else computed(_run_filters, _by_xla, arguments)
 
 
-def _in_parts(
+def _scan_in_parts(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     without: bool,
 ) -> PyTree:  # fmt: skip
@@ -239,11 +241,11 @@ def _run_filters(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     without: bool,
 ) -> PyTree:  # fmt: skip
-    """Scan over all rows; `without` implausible data."""
-    return _results(later, z, _scanned(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), without)[1])
+    """Filter all rows; `without` implausible data."""
+    return _results(later, z, _scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), without)[1])
 
 
-def _scanned(
+def _scan(
     filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], without: bool
 ) -> tuple[PyTree, dict[str, PyTree]]:
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
@@ -263,5 +265,5 @@ def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[st
     return (results if later is None else later.both(results)) | judged
 
 
-_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scanned)
+_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan)
 _central_states_by_xla = quickly_compiled(_central_states)

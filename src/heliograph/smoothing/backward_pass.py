@@ -63,7 +63,7 @@ def planned_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
 
 
 def quiet_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
-    """Smoother steps for measurements of zero: right but for means, if no gain depends on data."""
+    """Return smoother steps for measurements of zero: right but for means, if no gain depends on data."""
     quiet = jnp.zeros((len(inputs), filter.received))
     steps: SmootherStep = stepped(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
     return steps
@@ -73,29 +73,29 @@ def swept(steps: SmootherStep) -> Estimate:
     """Estimate each step's state given all data: one backward pass."""
 
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
-        """Pass from the state after a step to the one before it, after the step before."""
+        """Smooth the state between two steps, given the smoothed one after both."""
         previous, step = pair
         law = step.back(later)
         return law, previous.estimate_from(law)
 
     # From the last step, whose smoothed state is the filtered one.
     last = row(steps, -1)
-    _, earlier = jax.lax.scan(body, last.after, _pairs(steps), reverse=True)
-    return _appended(earlier, last.estimate_from(last.after))
+    _, earlier = jax.lax.scan(body, last.after, _neighbours(steps), reverse=True)
+    return _append(earlier, last.estimate_from(last.after))
 
 
 def swept_means(steps: SmootherStep) -> jax.Array:
-    """Means of each step's state given all data."""
+    """Estimate the mean of each step's state given all data: one backward pass."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
         previous, step = pair
         mean = step.before.mean_given(later)
-        return mean, _mean(previous, mean)
+        return mean, _plant_mean(previous, mean)
 
     last = row(steps, -1)
     end = jnp.asarray(last.mean)
-    _, earlier = jax.lax.scan(body, end, _pairs(steps), reverse=True)
-    return _appended(earlier, _mean(last, end))
+    _, earlier = jax.lax.scan(body, end, _neighbours(steps), reverse=True)
+    return _append(earlier, _plant_mean(last, end))
 
 
 def swept_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
@@ -124,9 +124,9 @@ def carried_ahead(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
-    def body(point: Point, here: SmootherStep) -> tuple[Point, Estimate]:
-        after = here.ahead(point)
-        return after, start.estimate_from(here.reached(after))
+    def body(point: Point, later_step: SmootherStep) -> tuple[Point, Estimate]:
+        after = later_step.ahead(point)
+        return after, start.estimate_from(later_step.reached(after))
 
     _, later = jax.lax.scan(body, start.start(), rows_of(steps, slice(step + 1, None)))
     whole: Estimate = jax.tree.map(
@@ -135,17 +135,17 @@ def carried_ahead(steps: SmootherStep, step: int) -> Estimate:
     return whole
 
 
-def _mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
-    """Mean of the plant's state, from that of the filter's."""
+def _plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
+    """Return the mean of the plant's state for this mean of the filter's."""
     return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
 
 
-def _pairs(steps: SmootherStep) -> tuple[SmootherStep, SmootherStep]:
-    """Steps and those after them."""
+def _neighbours(steps: SmootherStep) -> tuple[SmootherStep, SmootherStep]:
+    """Pair each step with the one after it."""
     return rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
 
 
-def _appended(rows: T, last: T) -> T:
+def _append(rows: T, last: T) -> T:
     whole: T = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, last)
     return whole
 

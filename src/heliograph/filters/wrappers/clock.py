@@ -126,13 +126,13 @@ class ClockFilter(AbstractSizedFilter):
         observed = self._observed(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
         # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
         gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
-        gain = gain * self._estimated(observed)[:, None]
-        after = _considered(signal, channel, gain, jnp.where(present, z - expected, 0.0))
+        gain = gain * self._estimated_mask(observed)[:, None]
+        after = _correct_by_gain(signal, channel, gain, jnp.where(present, z - expected, 0.0))
         belief = ClockBelief(*after, state.inputs, silence, observed)
         return belief, gaussian_innovation(z, expected, total)
 
-    def _estimated(self, observed: jax.Array) -> jax.Array:
-        """1 for the states that are estimated, 0 for offset and drift of clocks that are not."""
+    def _estimated_mask(self, observed: jax.Array) -> jax.Array:
+        """Return 1 for the states that are estimated, 0 for offset and drift of clocks that are not."""
         values = jnp.ones(len(self.states))
         for i, offset in enumerate(self.offsets):
             values = values.at[offset : offset + 2].set(jnp.where(observed[i], 1.0, 0.0))
@@ -142,7 +142,7 @@ class ClockFilter(AbstractSizedFilter):
         """Test whether each clock is observable: dy/dt is significant, and its derivatives are linearly independent."""
         slope = jax.jacfwd(observe)
         rate, curve = slope(state.mean), jax.jacfwd(slope)(state.mean)
-        seen = self._alone(state, observe, k)
+        seen = self._independent_shares(state, observe, k)
         observable = []
         for i, offset in enumerate(self.offsets):
             variance = jnp.einsum("ri,ij,rj->r", curve[:, offset], state.covariance, curve[:, offset])
@@ -150,8 +150,8 @@ class ClockFilter(AbstractSizedFilter):
             observable.append(moves & (seen[i] > SHARE))
         return jnp.stack(observable)
 
-    def _alone(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
-        """Share of the outputs' derivatives by each offset that is independent of those by the other states."""
+    def _independent_shares(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
+        """Return the share of the outputs' derivatives by each offset that is independent of the others'."""
         plant, n = at(self.base.plant, k), len(self.states)
 
         def follow(carry: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
@@ -161,7 +161,7 @@ class ClockFilter(AbstractSizedFilter):
             return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
 
         _, squares = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
-        return jnp.stack([_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
+        return jnp.stack([_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
     @estimates
     def estimate(self, state: ClockBelief) -> Estimate:
@@ -169,21 +169,21 @@ class ClockFilter(AbstractSizedFilter):
         return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
 
 
-def _share(square: jax.Array, column: int) -> jax.Array:
-    """1 - r' R^+ r, the unexplained share of one column of O given the others, R their correlations, O'O = `square`."""
-    size = jnp.sqrt(jnp.diagonal(square))
-    scale = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
+def _unexplained_share(square: jax.Array, column: int) -> jax.Array:
+    """Return 1 - r' R^+ r, what other columns of O, of correlations R, leave unexplained of one; O'O = `square`."""
+    lengths = jnp.sqrt(jnp.diagonal(square))
+    scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)
     correlations = scale[:, None] * square * scale
     others = [i for i in range(square.shape[0]) if i != column]
     among, r = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), column]
     values, vectors = eigh(among)
-    used = values > RANK * values[-1]
-    known = jnp.sum(jnp.where(used, (vectors.T @ r) ** 2 / jnp.where(used, values, 1.0), 0.0))
-    return jnp.where(size[column] > 0, 1 - known, 0.0)
+    is_used = values > RANK * values[-1]
+    explained = jnp.sum(jnp.where(is_used, (vectors.T @ r) ** 2 / jnp.where(is_used, values, 1.0), 0.0))
+    return jnp.where(lengths[column] > 0, 1 - explained, 0.0)
 
 
-def _considered(signal: Signal, channel: SecondOrder, gain: jax.Array, innovation: jax.Array) -> Gaussian:
-    """x after m + K e with any gain: the error is (L - K slopes) xi - K v."""
+def _correct_by_gain(signal: Signal, channel: SecondOrder, gain: jax.Array, innovation: jax.Array) -> Gaussian:
+    """Correct the mean to m + K e with any gain: the error is then (L - K slopes) xi - K v."""
     prior, slopes = signal.prior, jnp.asarray(channel.mean_gain) @ signal.slopes
     left = Columns(prior.root - gain @ slopes, prior.variances)
     return of_columns(prior.mean + gain @ innovation, joined(left, received_noise(signal, channel).through(gain)))
