@@ -30,7 +30,7 @@ test: .venv/.test  ## Check style and types, run the tests that guard daily work
 	$(BIN)/pytest $(SPREAD) -m "not slow"; tests=$$?; \
 	wait $$types && exit $$tests
 
-check: .venv/.check  ## Run all other tests: studies from end to end, kills, brokers, a browser (ten to eighteen more)
+check: .venv/.test  ## Run all other tests: studies from end to end, kills, brokers, a browser (ten to eighteen more)
 	$(BIN)/pytest $(SPREAD) -m slow
 
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
@@ -75,12 +75,6 @@ $(CREATED):
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all]'
 	@touch .venv/.demo $@
 
-# The extra `motor` by its package: with all the others, which are there by now, it takes twenty times as long.
-.venv/.check: .venv/.test
-	@echo "Installing the simulator of a motor drive into .venv ..."
-	@$(BIN)/python $(INSTALL) -c constraints.txt gym-electric-motor
-	@touch $@
-
 .venv/.docs: .venv/.test
 	@echo "Installing what builds the documentation into .venv ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all,docs]'
@@ -92,12 +86,12 @@ constraints:  ## Pin the newest versions in constraints.txt (needs Python 3.11 a
 	@set -e; work=$$(mktemp -d); trap 'rm -rf "$$work"' EXIT; export LC_ALL=C; \
 	for python in $(PYTHONS); do \
 	  "$$python" -m venv "$$work/venv" --clear; \
-	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all,docs,motor]'; \
+	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all,docs]'; \
 	  "$$work/venv/bin/python" -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==[^ ]+$$' \
 	    | sort > "$$work/$$(echo "$$python" | tr / _).txt"; \
 	done; \
 	set -- $(subst /,_,$(PYTHONS)); old="$$work/$$1.txt"; new="$$work/$$2.txt"; \
-	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all,docs,motor] resolves to.'; \
+	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all,docs] resolves to.'; \
 	  { comm -12 "$$old" "$$new"; \
 	    comm -23 "$$old" "$$new" | sed 's/$$/; python_version < "3.12"/'; \
 	    comm -13 "$$old" "$$new" | sed 's/$$/; python_version >= "3.12"/'; } | sort -f; } > constraints.txt

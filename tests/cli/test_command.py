@@ -127,7 +127,6 @@ def test_lists_do_not_load_jax():
             "demo",
             "late-data",
             "live",
-            "motor-drive",
             "uwb",
             "without-centre",
         )

@@ -212,6 +212,12 @@ def test_as_published_nothing_differs_and_nothing_is_written_without_a_folder(st
     assert [section.title for section in page.sections] == ["Table"]
 
 
+def test_a_package_that_is_missing_is_said_before_the_work_starts(study, tmp_path):
+    with pytest.raises(ModuleNotFoundError, match="no_such_package"):
+        replace(study, needs=["no_such_package"]).run(Setting(), out=tmp_path / "out")
+    assert not calls and not (tmp_path / "out").exists()
+
+
 def test_a_study_that_fails_keeps_its_stages(study, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(

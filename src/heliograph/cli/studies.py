@@ -23,6 +23,7 @@ PAGES = {  # what is a page of the documentation, with blocks that run, by the n
     "fusion": "fusion.md",
     "learning": "learning.md",
     "links-with-memory": "memory.md",
+    "motor-drive": "motor_drive.md",
     "network-design": "design_from_arrays.md",
     "range-bearing": "angles.md",
     "smoothing": "smoothing.md",

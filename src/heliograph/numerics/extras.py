@@ -22,7 +22,6 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "bokeh": "explore",
     "dask": "cluster",
     "distributed": "cluster",
-    "gym_electric_motor": "motor",
     "msgspec": "live",
     "pydantic": "live",
     "pydantic_core": "live",
