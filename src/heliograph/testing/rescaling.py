@@ -19,7 +19,8 @@ from heliograph.filters.linear.scheduled import LinearSystemFilter
 from heliograph.filters.modes.mixture import Components, MixtureFilter
 from heliograph.filters.modes.modal import ModalFilter, ObservationModel
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
-from heliograph.filters.modes.side_information import SideInformation, SideInformationFilter
+from heliograph.filters.modes.patterns import SideInformation
+from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.modes.uncertain import UncertainModalFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps

@@ -10,7 +10,7 @@ from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.side_information import SideInformation, by_pattern
+from heliograph.filters.modes.patterns import SideInformation, by_pattern
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, given_bounds
 from heliograph.model.fading import uncertain_chain

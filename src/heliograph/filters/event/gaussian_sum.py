@@ -18,7 +18,7 @@ from heliograph.filters.event.moments import Link, arriving, augmented, moved, p
 from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
 from heliograph.filters.gaussian.belief import smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.side_information import SideInformation, pattern_of
+from heliograph.filters.modes.patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation

@@ -17,7 +17,7 @@ from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.multiple_model import receive, repeated
-from heliograph.filters.modes.side_information import SideInformation, append_flag
+from heliograph.filters.modes.patterns import SideInformation, append_flag
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation

@@ -16,7 +16,7 @@ from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, Move, move_of, predicted, prior_belief
 from heliograph.filters.linear.linear import corrected_linear
 from heliograph.filters.modes.modal import claim_of_modes
-from heliograph.filters.modes.side_information import append_flag
+from heliograph.filters.modes.patterns import append_flag
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain, with_flag

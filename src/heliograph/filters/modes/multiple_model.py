@@ -29,7 +29,7 @@ from heliograph.filters.gaussian.belief import predicted, process_noise, smoothe
 from heliograph.filters.gaussian.signal import Signal, corrected_by, noise_through, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
-from heliograph.filters.modes.side_information import SideInformation, by_pattern, pattern_of
+from heliograph.filters.modes.patterns import SideInformation, by_pattern, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation

@@ -20,7 +20,7 @@ from heliograph.filters.gaussian.belief import predicted, start_of
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.multiple_model import by_mode, receive, repeated, together
-from heliograph.filters.modes.side_information import SideInformation
+from heliograph.filters.modes.patterns import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first

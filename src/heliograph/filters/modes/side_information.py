@@ -1,6 +1,5 @@
 """Filters with side information on the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -35,6 +34,7 @@ from heliograph.filters.modes.modal import (
     sum_of_modes,
     without_common,
 )
+from heliograph.filters.modes.patterns import SideInformation, append_flag, by_pattern, pattern_of
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain, with_flag
@@ -45,37 +45,9 @@ from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import memories
-from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
-from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import divided, symmetric_product, undivided
-
-
-class SideInformation(Module):
-    """A channel at one step, by mode and by pattern of arrivals.
-
-    transition: of the modes from the step before to this one. For each pattern of components that arrive: `present`,
-    its `chance` in each mode, and in that mode and pattern E[(G, n)] and, as in `SecondOrder`, `gain_spread` and
-    `noise`. flags: P(flag | mode).
-
-    Shapes: transition (M, M), present (A, m), chance (M, A), mean (M, A, m, p + 1), gain_spread (M, A, m, m, p + 1,
-    p + 1), noise (M, A, m, m), flags (M, F).
-    """
-
-    transition: Float[Array, "M M"]
-    present: Bool[Array, "A m"]
-    chance: Float[Array, "M A"]
-    mean: Float[Array, "M A m p1"]
-    gain_spread: Float[Array, "M A m m p1 p1"]
-    noise: Columns
-    flags: Float[Array, "M F"]
-
-    @property
-    def spread(self) -> Float[Array, "M A m m p1 p1"]:
-        """E[((G, n) - mean) Y ((G, n) - mean)' | mode, pattern] as a tensor."""
-        return undivided(self.gain_spread, self.noise)
+from heliograph.random_affine.modes import joint_modes
 
 
 class SideInformationBelief(NamedTuple):
@@ -333,21 +305,6 @@ def uncorrelated(
     return rows, numbers, jnp.stack(variances)
 
 
-def pattern_of(channel: SideInformation, arrived: Bool[Array, " m"]) -> jax.Array:
-    """Return the index of the smallest possible pattern in which all components that arrived arrive."""
-    present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
-    fits = jnp.all(present | ~arrived, axis=1) & possible
-    return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
-
-
-def append_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Innovation of a flag, which is known and not estimated: 0, or NaN if missing; uncorrelated with everything."""
-    nis = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
-    lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), nis))
-    wide = jnp.pad(covariance, ((0, 1), (0, 1)))
-    return nis, jnp.where(lost[:, None] | lost, jnp.nan, jnp.nan_to_num(wide))
-
-
 def side_information_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Float[ArrayLike, "modes flags"] | None = None
 ) -> SideInformationFilter:
@@ -399,35 +356,3 @@ def _describe(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformatio
     steps = [joint_modes(c) for c in unstack(channel)]
     is_known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
     return steps[0].initial, by_pattern(steps, np.ones((len(steps[0].initial), 1))), is_known
-
-
-def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
-    """Moments of the channel at each step by mode and pattern of arrivals, with the patterns of all steps."""
-    by_step = [[outcomes(m) for m in step.maps] for step in steps]
-    distinct = {tuple(o.arrived) for modes in by_step for parts in modes for o in parts}
-    patterns = sorted(distinct, key=lambda kind: (sum(kind), kind))
-    before = [steps[0], *steps[:-1]]
-    return [_side_information(modes, patterns, last, flags) for modes, last in zip(by_step, before, strict=True)]
-
-
-def _side_information(
-    outcomes: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
-) -> SideInformation:
-    m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
-    shape = (len(outcomes), len(kinds))
-    # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].
-    chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
-    for j, of_mode in enumerate(outcomes):
-        for outcome in of_mode:
-            a, (first_order, second_order) = kinds.index(tuple(outcome.arrived)), second_moments(outcome.map)
-            chance[j, a] += outcome.probability
-            mean[j, a] += outcome.probability * first_order
-            second[j, a] += outcome.probability * second_order
-    # Conditional moments given mode and pattern.
-    divisor = np.where(chance > 0, chance, 1.0)
-    mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
-    spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
-    gains, noises = zip(*(divided(part) for row in spread for part in row), strict=True)
-    noise = Columns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
-    present = np.array(kinds).reshape(len(kinds), m)
-    return SideInformation(before.transition, present, chance, mean, np.reshape(gains, spread.shape), noise, flags)

@@ -24,7 +24,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.signal import link_noise
 from heliograph.filters.linear.belief import LinearBelief, Move, predicted
 from heliograph.filters.linear.plan import PlannedFilter, plan
-from heliograph.filters.modes.side_information import append_flag
+from heliograph.filters.modes.patterns import append_flag
 from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link, delayed
 from heliograph.model.enlarged import with_past
