@@ -86,6 +86,17 @@ def test_noise_of_one_side_is_no_bias(link):
     assert summary.bias_low < 0 < summary.bias_high
 
 
+def test_outliers_to_one_side_are_no_memory():
+    """Innovations that count keep a mean, which squared is no correlation; the filter is within 1 % of the best one's
+    error, by a grid.
+    """
+    sensor = hg.LinearSensor([[1.0]], hg.Contaminated.one_sided(0.25, 0.2, 4.0), outputs=["y"])
+    network = hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(), {"score": hg.robust_filter(PLANT, sensor, hg.perfect())})})
+    z = hg.monte_carlo(network, STEPS, 1, key=0).measurements["a"][0]
+    health = health_of(network, {"a": z})
+    assert health.warnings() == [] and abs(health.filters[0].test.correlation[0]) < 0.1  # 4 of its deviations
+
+
 @pytest.mark.parametrize("size", [0.12, 1.0])
 def test_small_innovations_do_not_make_a_filter_cautious(size):
     """A slow error of the sensor leaves small innovations: the page says that they cannot tell."""

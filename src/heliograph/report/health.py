@@ -13,7 +13,7 @@ from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
 from heliograph.random_affine.erasure import outcomes
 from heliograph.report.arrivals import Arrivals, rows_are_messages
-from heliograph.report.outputs import OutputHealth, listeners, outputs_of
+from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
 from heliograph.simulation.claims import beliefs
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -172,7 +172,7 @@ def examine(
         if filter.claim != "none" and filter.received:
             white = whitened_innovations(z, filter, inputs)
             outputs += outputs_of(network, listener, record, inputs)
-            test = _test_of(white)
+            test = _test_of(about_mean(white) if weighs(filter) else white)
         lost = np.any(record.estimates[node][name].claims == "none")
         filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
     others = tuple(belief.words for belief in beliefs(network))
@@ -210,6 +210,15 @@ def arrivals_of(network: Network, times: np.ndarray, received: Mapping[str, np.n
                 Arrivals(node, name, time, by_time(there), z[there, i], may_be_lost, declared, stated, messages)
             )
     return links
+
+
+def about_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+    """Innovations less their mean: those that count of a law with outliers to one side have one, and no memory by it.
+
+    Their median tells of a bias.
+    """
+    there = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
+    return np.asarray(white - np.nansum(white, axis=0) / there)
 
 
 def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
