@@ -152,9 +152,10 @@ def correlated_mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     count = max(int(there.sum()), 1)
     mean = float(values[there].sum() / count)
     apart = np.where(there, values - mean, 0.0)
-    width = int(np.ceil(len(values) ** (1 / 3)))
-    terms = [apart @ apart, *(2 * (1 - t / (width + 1)) * (apart[:-t] @ apart[t:]) for t in range(1, width + 1))]
-    return mean, float(np.sqrt(max(sum(terms), 0.0)) / count)
+    # sum over t of (1 - |t| / width) sum_k e_k e_(k+t) is the mean over a window's width of squares of its moving sums.
+    width = int(np.ceil(len(values) ** (1 / 3))) + 1
+    sums = np.convolve(apart, np.ones(width))
+    return mean, float(np.sqrt(np.mean(sums**2) * (len(sums) / width)) / count)
 
 
 def innovations_of(
