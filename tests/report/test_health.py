@@ -91,7 +91,8 @@ def test_outliers_to_one_side_are_no_memory():
     error, by a grid.
     """
     sensor = hg.LinearSensor([[1.0]], hg.Contaminated.one_sided(0.25, 0.2, 4.0), outputs=["y"])
-    network = hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(), {"score": hg.robust_filter(PLANT, sensor, hg.perfect())})})
+    filters = {"score": hg.robust_filter(PLANT, sensor, hg.perfect())}
+    network = hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(), filters)})
     z = hg.monte_carlo(network, STEPS, 1, key=0).measurements["a"][0]
     health = health_of(network, {"a": z})
     assert health.warnings() == [] and abs(health.filters[0].test.correlation[0]) < 0.1  # 4 of its deviations
