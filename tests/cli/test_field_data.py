@@ -389,6 +389,14 @@ def test_inspect_proposes_what_looks_like_the_measurement_and_the_count(folder, 
     (folder / "table.csv").write_text("battery,level,seq,at\n98,1.5,1,2026-09-27T10:00:00Z\n")
     assert cli.main(["inspect", "table.csv"]) == 0
     assert "json_field('level', node='NODE', output='OUTPUT', time='at', sequence='seq')" in capsys.readouterr().out
+    # Numbers that are dates of these years are the time, in their unit, and no measurement; nor is 2.4 GHz a date.
+    stamps = [f'{{"t": {1_700_000_000_000 + 500 * k}, "v": 20.{k}, "tuned": 2412000000}}' for k in range(3)]
+    (folder / "stamped.jsonl").write_text("\n".join(stamps))
+    assert cli.main(["inspect", "stamped.jsonl"]) == 0
+    said = capsys.readouterr().out
+    assert "json_field('v', node='NODE', output='OUTPUT', time='t', time_unit='ms')" in said and "2 Hz" in said
+    (folder / "seconds.log").write_text("1700000000.25 attic 20.1\n1700000000.75 attic 20.2\n")
+    assert cli.main(["inspect", "seconds.log"]) == 0 and "2 Hz" in capsys.readouterr().out
     # Of several dates the one that is not the same in all, as of Influx.
     rows = [f",,0,2026-09-27T09:00:00Z,2026-09-27T11:00:00Z,2026-09-27T10:0{k}:00Z,2{k}.1" for k in range(3)]
     (folder / "flux.csv").write_text("\n".join([",result,table,_start,_stop,_time,_value", *rows, ""]))

@@ -12,10 +12,10 @@ import numpy as np
 
 from heliograph.files.bags.bag import OFTEN, Progress, fields_of, opened
 from heliograph.files.bags.mcap_chunks import messages_of as bag_messages
-from heliograph.files.fields import decoded, nanoseconds
+from heliograph.files.fields import TimeUnit, arrived, decoded, nanoseconds
 from heliograph.files.message_files import is_message_file, message_name, messages_of, payload_of
 from heliograph.numerics.check import InputError, fail, shown_error
-from heliograph.numerics.dates import looks_like_date
+from heliograph.numerics.dates import UNITS, looks_like_date
 
 SECOND = 1e9  # nanoseconds
 STAMP = "header.stamp"
@@ -32,6 +32,7 @@ COUNTS = re.compile(
     r"f_cnt|fcnt|fcntup|seq|sequence|seq_no|seqno|counter|count|cnt|packet|packet_id|msg_id|frame_count"
 )
 PAYLOADS = ("decoded_payload", "object", "value", "state", "measurement")  # levels under which values stand
+YEARS = range(946_684_800, 2_366_841_600)  # seconds since 1970 of the years 2000 to 2044: 2.4 GHz is none of them
 NO_NUMBERS = ("string", "wstring", "list", "char", "wchar")
 
 
@@ -47,6 +48,8 @@ class Topic:
         logged: when each was logged, or arrived, in nanoseconds since 1970.
         late: seconds from the time in each to its logging.
         dates: by dotted path the dates in the messages, in nanoseconds since 1970, and how late these are.
+        units: by dotted path the unit of dates that are numbers.
+        messages: how many there were.
     """
 
     kind: str
@@ -55,6 +58,8 @@ class Topic:
     logged: "array[int]" = field(default_factory=lambda: array("q"))
     late: "array[float]" = field(default_factory=lambda: array("d"))
     dates: "dict[str, tuple[array[int], array[float]]]" = field(default_factory=dict)
+    units: dict[str, TimeUnit] = field(default_factory=dict)
+    messages: int = 0
 
     def choose_time(self) -> None:
         """Take for the time of the messages the first date that is not the same in all of them, or else the first."""
@@ -72,7 +77,7 @@ class Topic:
 
     def measured(self) -> list[str]:
         """Return the fields, those first that look like measurements."""
-        return sorted((path for path in self.fields if path != self.count), key=_unlikely)
+        return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_unlikely)
 
     def row(self) -> list[str]:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
@@ -86,7 +91,13 @@ class Topic:
             if self.late
             else "-"
         )
-        return [self.kind, f"{len(times)}", rate, f"{apart.max():.3g} s" if len(apart) else "-", late]
+        return [
+            self.kind,
+            f"{max(len(times), self.messages)}",
+            rate,
+            f"{apart.max():.3g} s" if len(apart) else "-",
+            late,
+        ]
 
 
 def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str, Topic], str]:
@@ -128,19 +139,30 @@ def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int
 
 def _note(topics: dict[str, Topic], name: str, content: object, kind: str, arrival: int | None) -> None:
     topic = topics.setdefault(name, Topic(kind))
+    topic.messages += 1
     if arrival is not None:
         topic.logged.append(arrival)
     for path, value in _leaves(content):
         if isinstance(value, int | float) and path not in topic.fields:
             topic.fields.append(path)
         # A date in a message may be the time of its measurement.
-        if isinstance(value, str) and looks_like_date(value):
+        unit = "s" if isinstance(value, str) and looks_like_date(value) else _unit(value)
+        if unit is not None:
             with suppress(InputError):
-                time = nanoseconds(value, "s", path)
+                time = nanoseconds(value, unit, path)
                 moments, late = topic.dates.setdefault(path, (array("q"), array("d")))
                 moments.append(time)
                 if arrival is not None:
                     late.append((arrival - time) / SECOND)
+                if not isinstance(value, str):
+                    topic.units[path] = unit
+
+
+def _unit(value: object) -> TimeUnit | None:
+    """Return the unit in which a number is a date of these years; None of any other."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return next((unit for unit, size in UNITS.items() if YEARS.start <= value * size / SECOND < YEARS.stop), None)
 
 
 def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
@@ -157,7 +179,7 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
         name = message.topic or message_name(path)
         came = None
         with suppress(InputError):
-            came = None if message.arrival is None else nanoseconds(message.arrival, "s", message.where)
+            came = None if message.arrival is None else arrived(message.arrival, message.where)
         if message.topic is not None and isinstance(message.content, str) and came is not None:
             note(topics, name, message.content, came)
             continue
@@ -184,6 +206,8 @@ def suggestion(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) 
             continue
         more = ", ".join(fields[1:FEW]) + (", ..." if len(fields) > FEW else "")
         when = "" if topic.time is None else f", time={topic.time!r}"
+        unit = "s" if topic.time is None else topic.units.get(topic.time, "s")
+        when += "" if unit == "s" else f", time_unit={unit!r}"
         when += "" if topic.count is None else f", sequence={topic.count!r}"
         lines.append(f"    {name!r}: hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{when}),")
         lines += [f"    #   or {more}"] if more else []
