@@ -172,6 +172,19 @@ def test_arrivals_in_seconds_date_the_lines_of_a_log(world, tmp_path):
     np.testing.assert_array_equal(rows.measurements["gps"][:, 0], [1.5, 2.5, 3.5])
 
 
+def test_a_mapped_table_with_semicolons_says_what_rewrites_it(world, tmp_path):
+    network, _, *_ = world
+    path = tmp_path / "log.csv"
+    path.write_text("time;value\n2026-01-01T00:00:00Z;20,1\n2026-01-01T00:00:01Z;20,2\n")
+    sources = {"log.csv": hg.files.json_field("value", "gps", time="time")}
+    with pytest.raises(ValueError, match="names separated by commas, got semicolons") as said:
+        hg.files.read_messages(path, network, sources)
+    remedy = str(said.value)
+    exec(remedy[remedy.index("pandas.") : remedy.rindex(" rewrites it")], {"pandas": pytest.importorskip("pandas")})
+    rows = hg.files.read_messages(path, network, sources).recording()
+    np.testing.assert_array_equal(rows.measurements["gps"][:, 0], [20.1, 20.2])
+
+
 def test_inputs_hold_and_repeated_events_count_once(world):
     """Input 2 from second 1 on: the row at 1 has what held before it, the next has 2; time since the row before."""
     network, *_ = world

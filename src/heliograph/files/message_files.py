@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from heliograph.files.fields import decoded, unquoted
-from heliograph.files.table import csv_header, csv_lines, kind_of, opened_text
+from heliograph.files.table import check_separators, csv_header, csv_lines, kind_of, opened_text
 from heliograph.numerics.check import InputError, fail, shown
 
 TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
@@ -154,6 +154,7 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any] | InputError]]:
                 continue
             if header is None:
                 header = [name.strip() for name in line]
+                check_separators(path, header)
                 twice = [name for i, name in enumerate(header) if name and name in header[:i]]
                 if twice:
                     raise fail(f"{path}, header", "distinct columns", f"{twice[0]!r} more than once")

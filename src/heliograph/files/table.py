@@ -277,13 +277,19 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
     line = ",".join(header)
     if line.startswith(COMMENTS):
         raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: {_uncommented(path)}")
+    check_separators(path, header)
+    _check_distinct(f"{path}, header", header)
+
+
+def check_separators(path: Path, header: Sequence[str]) -> None:
+    """Raise ValueError, with what rewrites the file, where the only column is several names with other separators."""
+    line = ",".join(header)
     for mark, name in SEPARATORS.items() if len(header) == 1 else ():
         if mark in line:
-            with path.open(encoding="utf-8-sig", errors="replace") as file:
+            with opened_text(path) as file:
                 commas = re.search(r"\d,\d", file.read(10_000))
             remedy = _rewriting(path, sep=mark, decimal=",") if commas else _rewriting(path, sep=mark)
             raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}: {remedy}")
-    _check_distinct(f"{path}, header", header)
 
 
 def _uncommented(path: Path) -> str:
