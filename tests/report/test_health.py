@@ -30,6 +30,15 @@ def test_outliers_that_a_gate_refused_do_not_count_against_it():
     assert not any("too sure" in line for line in health.warnings())
 
 
+def test_a_gate_that_refuses_all_is_doubted():
+    """It began a thousand deviations off, so that nothing counts, and no innovation that counts tells of it."""
+    gate = hg.robust_filter(PLANT, SENSOR, hg.perfect(), hg.filters.Gate(9.0))
+    network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {"gate": gate})})
+    z = 1000 + np.random.default_rng(1).standard_normal((STEPS, 1))
+    (line,) = health_of(network, {"a": z}).warnings()
+    assert line.startswith(f"a/gate left out {STEPS} of {STEPS} values of y")
+
+
 def test_each_output_is_judged_by_itself():
     """One output 2.6 times, another a third of what is claimed: their mean is near 1 and says nothing."""
     rng = np.random.default_rng(1)

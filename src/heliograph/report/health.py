@@ -97,6 +97,7 @@ class Health:
 
     def _doubts(self, health: FilterHealth) -> Iterator[str]:
         """Say which claims innovations contradict: the size of each output's, of all together, and their memory."""
+        yield from self._left_out(health)
         if health.test is None:
             return
         test, name = health.test, f"{health.node}/{health.filter}"
@@ -122,6 +123,17 @@ class Health:
                 "(hg.model.with_bias, hg.model.with_past, a link with memory), the size of innovations cannot tell how "
                 "large the errors are"
             )
+
+    def _left_out(self, health: FilterHealth) -> Iterator[str]:
+        """Say of which outputs a filter that weighs left out more than half: of outliers it would be less."""
+        for output in self.outputs:
+            summary, mine = output.judged.summary, (output.node, output.filter) == (health.node, health.filter)
+            if mine and output.weighs and summary.share.low > 0.5:
+                yield (
+                    f"{health.node}/{health.filter} left out {summary.down_weighted} of {summary.received} values of "
+                    f"{output.judged.output}: more than outliers would be; it may be wrong itself, by its start or "
+                    "after an outage, and then it does not come back"
+                )
 
 
 def _departure(size: float, error: float, level: float) -> int:
