@@ -125,7 +125,7 @@ class Turned(AbstractRandomAffine):
 '''),
     "random_affine/__init__.pyi": ("", "\nfrom .NAME import Turned as Turned\n"),
     "planning/transmitters.py": (
-        "        case ModeOutput():\n            return channel, position\n",
+        "        case ModeOutput() | Rotation():\n            return channel, position\n",
         "        case _ if type(channel).__name__ == 'Turned':\n            return channel, position\n",
     ),
     "simulation/description/diagram.py": (

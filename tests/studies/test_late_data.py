@@ -92,9 +92,9 @@ def test_a_log_too_short_is_said_in_one_line(tmp_path, capsys):
 
 
 def test_another_example_takes_no_trace(tmp_path, capsys):
-    assert main(["example", "fusion", "--out", str(tmp_path), "--trace", "x"]) == 2
+    assert main(["example", "live", "--out", str(tmp_path), "--trace", "x"]) == 2
     error = capsys.readouterr().err
-    assert error == "heliograph: --trace: expected an example that takes it, got 'fusion'\n"
+    assert error == "heliograph: --trace: expected an example that takes it, got 'live'\n"
 
 
 def test_a_log_is_known_by_what_it_holds_and_shown_by_its_name(tmp_path):
