@@ -41,7 +41,7 @@ class Row(NamedTuple):
     Args:
         name: the number's name.
         estimate: the estimate.
-        low: lower end of the interval (95 % unless another level was asked for); NaN if not identified.
+        low: lower end of the interval (95 % unless another level is given); NaN if not identified.
         high: upper end.
         standard_error: standard error of the estimate; NaN at a boundary or if not identified.
         form: "linear" or "conditional".

@@ -208,7 +208,8 @@ def _plus(a: _Powers, b: _Powers, outputs: int) -> _Powers:
 @cached_arrays
 def _ways(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     """Terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
-    names, ways = exponents(outputs + 1, degree), [[] for _ in range(degree + 1)]  # type: ignore[var-annotated]
+    names = exponents(outputs + 1, degree)
+    ways: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
     for c, b, rest, weight in zip(*sum_plan(outputs, degree), strict=True):
         if not names[c][-1]:
             at = [position(outputs, sum(names[i][:-1]))[names[i][:-1]] for i in (c, b, rest)]
