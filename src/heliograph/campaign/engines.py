@@ -197,7 +197,7 @@ def _submit(
     flying = collect(loop=client.loop)
     while waiting or jobs:
         # Submit a few jobs more than the cluster has threads, so that none of them waits.
-        room = max(LOOK_AHEAD * sum(_reached(client, client.nthreads).values()), 1) - len(jobs)
+        room = max(LOOK_AHEAD * sum(_ask_cluster(client, client.nthreads).values()), 1) - len(jobs)
         for _ in range(min(room, len(waiting))):
             job = waiting.popleft()
             future = client.submit(perform, campaign, store, job.setting, job.chunk, pure=False)
@@ -222,10 +222,10 @@ def _next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
             return None
         time.sleep(LOOK)
         waited += LOOK
-    return _reached(client, lambda: next(flying))
+    return _ask_cluster(client, lambda: next(flying))
 
 
-def _reached(client: Untyped, ask: Callable[[], Untyped]) -> Untyped:
+def _ask_cluster(client: Untyped, ask: Callable[[], Untyped]) -> Untyped:
     try:
         return ask()
     except (OSError, RuntimeError, TimeoutError):

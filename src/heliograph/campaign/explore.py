@@ -151,7 +151,7 @@ def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None 
         kicker="Explore a campaign",
         title=finding(scores),
         lead=f"{Path(campaign.path).name}: {len(campaign.settings)} settings, {campaign.runs} runs each of "
-        f"{campaign.horizon} steps; {_described(settings, campaign, shown, scores)} A case is a node in a setting.",
+        f"{campaign.horizon} steps; {_describe_cut(settings, campaign, shown, scores)} A case is a node in a setting.",
         sections=[
             Section("Results", pictures(campaign, scores), STATIC),
             Section("All scores", [score_table(campaign, scores)], STATIC),
@@ -173,7 +173,7 @@ MEANING = (
 )
 
 
-def _described(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
+def _describe_cut(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
     if len(shown) == len(scores):
         return f"{len(shown)} rows, one for each setting, node and filter."
     return (
@@ -200,17 +200,17 @@ def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> l
         for s in scores
     ]  # fmt: skip
     if look is None:
-        return [_scored(campaign, scored)]
+        return [_explore_scores(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
     detailed = look(settings[:1], steps)
     detailed += look(settings[1 : ROWS // max(len(detailed), 1)], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
-    return [_scored(campaign, scored), _over_time(campaign, [detail for detail in detailed if detail.step])]
+    return [_explore_scores(campaign, scored), _explore_steps(campaign, [detail for detail in detailed if detail.step])]
 
 
-def _scored(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+def _explore_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     columns, parameters = _columns(campaign, rows, SCORED), list(campaign.parameters)
     x = _axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")
@@ -221,7 +221,7 @@ def _scored(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     )
 
 
-def _over_time(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+def _explore_steps(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     steps = {"time": [row.step for row in rows]}
     columns = steps | _columns(campaign, rows, OVER_TIME)
     dimensions = ["time", "setting", *campaign.parameters, *NAMES]

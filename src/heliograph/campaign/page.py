@@ -45,7 +45,7 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
         kicker="Heliograph campaign",
         title=finding(scores),
         lead=f"{name}: {len(campaign.settings)} settings, {campaign.runs} runs each of {campaign.horizon} steps; "
-        f"{there} of {len(campaign.settings) * campaign.runs} runs are there. {_failed(failures)} A case "
+        f"{there} of {len(campaign.settings) * campaign.runs} runs are there. {_describe_failures(failures)} A case "
         "is a node in a setting.",
         sections=[
             *([_failures(failures)] if failures else []),
@@ -75,7 +75,7 @@ def finding(scores: Sequence[Score]) -> str:
     return f"“{visible(name)}” has the least error in {count} of {len(compared)} cases"
 
 
-def _failed(failures: Sequence[Failure]) -> str:
+def _describe_failures(failures: Sequence[Failure]) -> str:
     return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
 
 
@@ -206,7 +206,7 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
             y, error = _columns(curve, quantity)
             rows = [settings.index(score.setting) + shift for score in curve]
             axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=in_figure(name))
-        axes.set_yticks(range(len(settings)), [_named(campaign, setting) for setting in settings])
+        axes.set_yticks(range(len(settings)), [_name_setting(campaign, setting) for setting in settings])
         axes.set_ylim(len(settings) - 0.5, -0.5)
         axes.set_title(in_figure(node))
         if quantity is NEES:
@@ -219,7 +219,7 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
     return figure
 
 
-def _named(campaign: Campaign, setting: int) -> str:
+def _name_setting(campaign: Campaign, setting: int) -> str:
     text = ", ".join(f"{name} = {value}" for name, value in campaign.settings[setting].items())
     return in_figure(text if len(text) <= 36 else text[:35] + "…")
 

@@ -97,11 +97,11 @@ def _network(table: Mapping[str, object], name: str) -> str:
     value = table.get("network")
     file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     if not file.endswith(".py") or not function.isidentifier():
-        raise fail(f"{name}, network", 'a file and a function in it, as "my_network.py:build"', _shown(value))
+        raise fail(f"{name}, network", 'a file and a function in it, as "my_network.py:build"', _show_value(value))
     return str(value)
 
 
-def _shown(value: object) -> str:
+def _show_value(value: object) -> str:
     return "none" if value is None else repr(value)
 
 
@@ -118,7 +118,7 @@ def _chunk(value: object, name: str) -> int:
 
 def _timeout(value: object, name: str) -> float:
     if not isinstance(value, int | float) or not _is_number(value) or value <= 0:
-        raise fail(f"{name}, timeout", "a positive number of seconds", _shown(value))
+        raise fail(f"{name}, timeout", "a positive number of seconds", _show_value(value))
     return float(value)
 
 
@@ -149,7 +149,7 @@ def _short(value: object) -> str:
 def _settings(table: Mapping[str, object], name: str) -> list[Setting]:
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
-    settings = _grid(table["grid"], name) if "grid" in table else _listed(table["settings"], name)
+    settings = _grid(table["grid"], name) if "grid" in table else _list_settings(table["settings"], name)
     taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
     # Parameters become coordinates of the store: their names must be free there, their values plain.
     for i, setting in enumerate(settings):
@@ -170,14 +170,14 @@ def _settings(table: Mapping[str, object], name: str) -> list[Setting]:
 
 def _grid(grid: object, name: str) -> list[Setting]:
     if not isinstance(grid, dict) or not grid:
-        raise fail(f"{name}, grid", "a table of lists of values by parameter", _shown(grid))
+        raise fail(f"{name}, grid", "a table of lists of values by parameter", _show_value(grid))
     for key, values in grid.items():
         if not isinstance(values, list) or not values:
             raise fail(f"{name}, grid.{key}", "a list of values", repr(values))
     return [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
 
 
-def _listed(settings: object, name: str) -> list[Setting]:
+def _list_settings(settings: object, name: str) -> list[Setting]:
     if not isinstance(settings, list) or not settings or not all(isinstance(s, dict) for s in settings):
         raise fail(f"{name}, settings", "tables [[settings]]", repr(settings))
     return settings

@@ -232,18 +232,18 @@ def _sync(folder: Path, start: str) -> None:
 
 def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     """Return (setting, chunk) of the chunks whose files all exist."""
-    return set.intersection(*(set(_written(path / name, 2)) for name in variables(campaign)))
+    return set.intersection(*(set(_find_chunks(path / name, 2)) for name in variables(campaign)))
 
 
 def described(path: Path) -> set[tuple[int, ...]]:
     """Return (setting,) of the settings whose claims are written."""
-    return set(_written(path / CLAIM, 1))
+    return set(_find_chunks(path / CLAIM, 1))
 
 
 def remove_damaged(path: Path, campaign: Campaign) -> list[Path]:
     """Remove the files of chunks that do not agree with their checksums; return these files."""
-    files = [file for name in variables(campaign) for file in _written(path / name, 2).values()]
-    damaged = [file for file in (*files, *_written(path / CLAIM, 1).values()) if not _whole(file)]
+    files = [file for name in variables(campaign) for file in _find_chunks(path / name, 2).values()]
+    damaged = [file for file in (*files, *_find_chunks(path / CLAIM, 1).values()) if not _whole(file)]
     for file in damaged:
         file.unlink()
     return damaged
@@ -255,7 +255,7 @@ def _whole(file: Path) -> bool:
     return len(data) > 4 and google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
 
 
-def _written(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
+def _find_chunks(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
     """Return files of chunks by the first indices of the chunk."""
     files = ((name, name.split(".")[1:]) for name in os.listdir(folder) if name.startswith("c."))
     return {tuple(map(int, parts[:indices])): folder / name for name, parts in files if all(map(str.isdigit, parts))}

@@ -81,7 +81,7 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
     for setting in range(len(campaign.settings)):
         # Averages over time of each run, for the chunks that are done.
         parts = [
-            _per_run(group, setting, slice(chunk.start, chunk.stop), claims[setting])
+            _average_over_time(group, setting, slice(chunk.start, chunk.stop), claims[setting])
             for chunk in campaign.chunks(setting)
             if (setting, chunk.number) in done
         ]
@@ -96,7 +96,7 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
     return scores
 
 
-def _per_run(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
+def _average_over_time(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
     """Return squared error summed over the state and NEES per dimension, averaged over time, (2, run, node, filter)."""
     error, variance, nees = (_read(group, name, setting, runs) for name in ("error", "variance", "nees_per_dimension"))
     squared = np.sum(error**2, axis=-1).mean(axis=1)

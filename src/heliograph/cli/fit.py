@@ -104,7 +104,7 @@ def learn(
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
-    fitted = _fitted(build, recording, cut, starts, seed, truth, advance, stop)
+    fitted = _fit_with_progress(build, recording, cut, starts, seed, truth, advance, stop)
     fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
     # Predictions before and after the fit, then statistics of the losses.
     z, u = recording.measurements, recording.inputs
@@ -156,7 +156,7 @@ def _data(
     return data
 
 
-def _fitted(
+def _fit_with_progress(
     build: "Callable[[], Network]",
     recording: "Recording",
     rows: int,

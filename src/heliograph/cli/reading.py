@@ -91,7 +91,7 @@ def read_measured(
             raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
         return [_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]
-    measured = [_of_events(events.of(plant), plant, options) for plant in wanted]
+    measured = [_convert_events(events.of(plant), plant, options) for plant in wanted]
     # What was read is said once.
     measured[0].warnings.extend(said_of(path, events))
     measured[-1].summary.extend(events.notes)
@@ -147,7 +147,7 @@ def _rows(path: Path, network: "Network", options: ReadingOptions) -> Measured:
     return Measured("", recording, warnings=[str(doubt.message) for doubt in doubts])
 
 
-def _of_events(events: "EventTable", plant: str, options: ReadingOptions) -> Measured:
+def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -> Measured:
     """Return the rows of a plant, and the verdicts on its events by node."""
     import numpy as np
 

@@ -52,7 +52,7 @@ def replay(
     check_seed("--seed", seed)
     # Events of each plant of the recording, and those that arrive through the link.
     sent = []
-    for i, (name, events, origin) in enumerate(_recorded(recording, network, strict)):
+    for i, (name, events, origin) in enumerate(_read_events(recording, network, strict)):
         received = through(events, link, seed + i) if trace is None else along(events, trace)
         sent.append(lines(received, name if plant is None else plant, origin))
     # Wait for each arrival on the clock, speeded up.
@@ -68,7 +68,7 @@ def replay(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _recorded(path: Path, reference: str, strict: bool) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
+def _read_events(path: Path, reference: str, strict: bool) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
     """Yield the events of each plant with its name, and the date of time 0, which is that of all."""
     from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_module

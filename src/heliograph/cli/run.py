@@ -76,21 +76,21 @@ def run(
         done = []
         for data in measured:
             advance(f"filtering {len(data.recording.time)} rows")
-            record, doubts = _filtered(loaded, data.recording, later)
+            record, doubts = _filter_rows(loaded, data.recording, later)
             place = out and _place(out, data.plant, len(measured) > 1)
-            written = _of_rows(record, data.rows)
-            lines = [*_doubted(loaded, record), *data.summary]
+            written = _select_rows(record, data.rows)
+            lines = [*_describe_doubted(loaded, record), *data.summary]
             if place is not None:
                 advance(f"writing {place}")
                 write = _writer(data.events, module)
                 write(written, place)
-                lines += _lagged(loaded, data, lag, options, place, write)
+                lines += _write_lagged(loaded, data, lag, options, place, write)
             done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines))
     # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, {data.plant: (record, data.recording) for data, record, *_ in done}, report)
     for _, _, written, place, doubts, lines in done:
-        _print_lines(list(dict.fromkeys(doubts)), [*_written(written, place, report), *lines])
+        _print_lines(list(dict.fromkeys(doubts)), [*_write_results(written, place, report), *lines])
 
 
 def _place(out: Path, plant: str, several: bool) -> Path:
@@ -98,7 +98,7 @@ def _place(out: Path, plant: str, several: bool) -> Path:
     return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
 
 
-def _of_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
+def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
     """Return some of the rows of a record, and of what is smoothed, whose rows are the last ones."""
     from dataclasses import replace
 
@@ -116,7 +116,7 @@ def _of_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
         for node, filters in record.estimates.items()
     }
     measurements = {node: z[rows] for node, z in record.measurements.items()}
-    later = None if record.smoothed is None else _of_rows(record.smoothed, rows[-len(record.smoothed.time) :])
+    later = None if record.smoothed is None else _select_rows(record.smoothed, rows[-len(record.smoothed.time) :])
     truth = None if record.truth is None else np.asarray(record.truth)[rows]
     return replace(
         record,
@@ -131,7 +131,7 @@ def _of_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
     )
 
 
-def _lagged(
+def _write_lagged(
     network: "Network", data: "Measured", lag: float | None, options: ReadingOptions, place: Path, write: "Write"
 ) -> list[str]:
     """Write the estimates of a lag later beside the others, and say so; nothing without a lag."""
@@ -194,7 +194,7 @@ def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "W
     return write
 
 
-def _filtered(
+def _filter_rows(
     network: "Network", recording: "Recording", smooth: "AbstractSmoothing | None"
 ) -> tuple["Record", list[str]]:
     """Filter rows; return the record, and what the filters doubted in lines."""
@@ -204,7 +204,7 @@ def _filtered(
     return record, [str(doubt.message) for doubt in doubts]
 
 
-def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:
+def _write_results(record: "Record", out: Path | None, report: Path | None) -> list[str]:
     """Describe what was written where in a line, and the errors of each filter."""
     filters = [
         f"{node}/{name} ({_claim(estimate)})"
@@ -229,7 +229,7 @@ def _errors(record: "Record") -> list[str]:
     return lines
 
 
-def _doubted(network: "Network", record: "Record") -> list[str]:
+def _describe_doubted(network: "Network", record: "Record") -> list[str]:
     """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
     from heliograph.report.outputs import weighed_outputs
 

@@ -85,7 +85,7 @@ def chosen(
     engine = setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
-    choice = _cached(function, arguments, differs, LONG if engine == "native" else most)
+    choice = _find_code(function, arguments, differs, LONG if engine == "native" else most)
     if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
         choice = Choice(None, why)
     if choice.code is None and engine == "native":
@@ -157,7 +157,9 @@ def attempted(make: Callable[[], Code]) -> Code | None:
         return None
 
 
-def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int) -> Choice:
+def _find_code(
+    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int
+) -> Choice:
     """Return code for the structure of a function and its arguments, which may be objects with arrays."""
     # Arrays become arguments; all other leaves are part of the cached key.
     leaves, form = jax.tree.flatten((function, *arguments))
@@ -171,7 +173,7 @@ def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differ
     )
     # A leaf without a hash has no key: XLA computes.
     try:
-        code, why = _made(form, kinds, most)
+        code, why = _compile_structure(form, kinds, most)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
@@ -190,7 +192,7 @@ class _Array(NamedTuple):
 @lru_cache(COMPILED)
 @with_room
 @no_collector()
-def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Any, str]:
+def _compile_structure(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Any, str]:
     """Compile code for one structure, and the shapes and types of its arrays."""
     arrays = [k for k in kinds if isinstance(k, _Array)]
 

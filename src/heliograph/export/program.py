@@ -81,7 +81,7 @@ def step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram
     named += [Member("estimate_covariance", np.asarray(estimate.covariance))]
     try:
         symmetric = _symmetric(step, examples)
-        whole = _to_c(step, examples, symmetric, prefix, real)
+        whole = _write_step(step, examples, symmetric, prefix, real)
         # The estimate is a member of its own only if it is no array of the state.
         kept = list(range(len(leaves)))
         places = [_place(n, whole, named) for n in (len(leaves), len(leaves) + 1)]
@@ -94,7 +94,7 @@ def step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram
 
         names = [*(m.name for m in named[: len(leaves)]), "z", "u", "step"]
         results = [*(f"next_{m.name}" for m in members), "implausible", "spoilt"]
-        compute = _to_c(chosen, examples, symmetric, prefix, real, (names, results))
+        compute = _write_step(chosen, examples, symmetric, prefix, real, (names, results))
         starts = [m.start for m in members]
         initial = to_c(
             lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), [m.name for m in members])
@@ -113,7 +113,7 @@ def _place(number: int, code: Any, named: Sequence[Member]) -> int:
     return next((n for n in same if np.array_equal(named[n].start, start, equal_nan=True)), number)
 
 
-def _to_c(
+def _write_step(
     step: Callable[..., Any],
     examples: tuple[Any, ...],
     symmetric: set[int],
@@ -142,7 +142,7 @@ def _symmetric(step: Callable[..., Any], examples: tuple[Any, ...]) -> set[int]:
     """
     symmetric = {n for n, leaf in enumerate(map(np.asarray, examples[0])) if _is_symmetric(leaf)}
     while True:
-        results = _to_c(step, examples, symmetric, "step", "double").results if symmetric else []
+        results = _write_step(step, examples, symmetric, "step", "double").results if symmetric else []
         lost = {n for n in symmetric if not results[n].symmetric}
         if not lost:
             return symmetric

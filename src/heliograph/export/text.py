@@ -139,9 +139,9 @@ def _comment(program: StepProgram, form: Form) -> str:
         "6 the inputs are none: dt is negative, beyond 2^53 units or the wrapped difference of unsigned counters of 32",
         "bits, or a function of the inputs returned no finite numbers, or no covariance.",
         "",
-        *_numbered("z", form.received, [""] * len(form.received)),
-        *_numbered("u", filter.inputs, [""] * len(filter.inputs)),
-        *_numbered("mean", filter.states, units),
+        *_number_entries("z", form.received, [""] * len(form.received)),
+        *_number_entries("u", filter.inputs, [""] * len(filter.inputs)),
+        *_number_entries("mean", filter.states, units),
         f"covariance[{len(filter.states)} * i + j] is that of the errors of mean[i] and mean[j].",
         "All numbers are in the units in which the plant and the sensor were described.",
         f"Claim: {claim}, {MEANING[claim]}.",
@@ -151,7 +151,7 @@ def _comment(program: StepProgram, form: Form) -> str:
     return "\n".join(f" * {visible(line).replace('*/', '* /').replace('/*', '/ *')}".rstrip() for line in lines)
 
 
-def _numbered(array: str, names: Sequence[str], notes: Sequence[str]) -> list[str]:
+def _number_entries(array: str, names: Sequence[str], notes: Sequence[str]) -> list[str]:
     if not names:
         return [f"{array}: not used"]
     return [f"{array}[{i}]: {name}{note}" for i, (name, note) in enumerate(zip(names, notes, strict=True))]

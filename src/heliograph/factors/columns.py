@@ -154,7 +154,7 @@ def eliminated(covariance: jax.Array, least: float = 0.0) -> Columns:
     n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
-        variances.append(_at_least(column[j], least * covariance[j, j]))
+        variances.append(_bound_below(column[j], least * covariance[j, j]))
         share = _below(j, outer(column, lax.reshape(reciprocal(variances[j]), (1,))))
         rest = symmetric(rest - outer(share, column))
         lower.append(share)
@@ -249,7 +249,7 @@ def outer(a: jax.Array, b: jax.Array) -> jax.Array:
     return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
 
 
-def _at_least(pivot: jax.Array, floor: jax.Array) -> jax.Array:
+def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
     """Return the larger of both; not by a maximum, which halves the derivative where both are zero."""
     return jnp.where(pivot >= floor, pivot, floor)
 
@@ -291,7 +291,7 @@ def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rest, lower, variances = carry
-        d = _at_least(rest[j, j], least * whole[j])
+        d = _bound_below(rest[j, j], least * whole[j])
         share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal(d), 0.0)
         return rest - jnp.outer(share, rest[j]), lower.at[:, j].add(share), variances.at[j].set(d)
 

@@ -114,7 +114,7 @@ class LastWords:
         conditions = self.about(topic)
         if not conditions:
             return False
-        said, before = _said(payload, where), self._number(topic)
+        said, before = _decode_payload(payload, where), self._number(topic)
         for condition in conditions:
             offline = said != "" and condition.says_offline(said, where)
             self._heard.add(condition)
@@ -144,7 +144,7 @@ class LastWords:
         return bool(self._offline) and (condition, condition.of(topic)) in self._offline
 
 
-def _said(payload: object, where: str) -> object:
+def _decode_payload(payload: object, where: str) -> object:
     """Return what a payload says: JSON, or the text itself."""
     if isinstance(payload, bytes):
         payload = payload.decode(errors="replace")

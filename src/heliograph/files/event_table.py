@@ -202,7 +202,7 @@ class EventTable:
 
     def in_order(self) -> Iterator[Event]:
         """Yield the events in order of arrival, with times in seconds from the origin, in steps, or as they are."""
-        events, matrices, names = self._settled(), self._matrices(), [*self.network.names, INPUTS]
+        events, matrices, names = self._sort_by_arrival(), self._matrices(), [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
         # Exact differences of whole nanoseconds before they are floats.
         for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
@@ -249,7 +249,7 @@ class EventTable:
             window: how late an event may be, in seconds or steps (default any).
             ahead: how much later than its arrival the time of an event may be (default a tenth of a second).
         """
-        events, verdicts = self._judged(window, ahead)
+        events, verdicts = self._judge_events(window, ahead)
         names = [*self.network.names, INPUTS]
         counts = {names[node]: found for node, found in counted(events.node, verdicts).items()}
         gaps = {}
@@ -285,7 +285,7 @@ class EventTable:
         Raises:
             ValueError: what `recording` refuses.
         """
-        events, verdicts = self._judged(window, ahead)
+        events, verdicts = self._judge_events(window, ahead)
         events = events.of(verdicts == USED)
         if not len(events.time):
             raise fail("events", "at least one that is used", "none")
@@ -309,7 +309,7 @@ class EventTable:
             tables.append(table)
         for n, name in enumerate(self.network.names):
             self._fill_losses(name, tables[n], row, events, n)
-        inputs = self._inputs(_held(tables.pop()), times)
+        inputs = self._inputs(_fill_forward(tables.pop()), times)
         origin = self.origin
         time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
@@ -338,7 +338,7 @@ class EventTable:
         """Return the values of each node, and last those of the inputs, whose number is -1."""
         return [self.columns[name].matrix() for name in (*self.network.names, INPUTS)]
 
-    def _settled(self) -> Events:
+    def _sort_by_arrival(self) -> Events:
         """Return the events in order of arrival; those without a count are told apart by their order at a time."""
         parts = []
         for node, name in enumerate((INPUTS, *self.network.names), -1):
@@ -357,8 +357,8 @@ class EventTable:
         time, arrival = ((moments - first + half) // self.step for moments in (events.time, events.arrival))
         return events._replace(time=time, arrival=arrival)
 
-    def _judged(self, window: float, ahead: float) -> tuple[Events, Int[np.ndarray, " events"]]:
-        events, matrices = self._settled(), self._matrices()
+    def _judge_events(self, window: float, ahead: float) -> tuple[Events, Int[np.ndarray, " events"]]:
+        events, matrices = self._sort_by_arrival(), self._matrices()
 
         def values(i: int) -> np.ndarray:
             return np.asarray(matrices[events.node[i]][events.place[i]])
@@ -386,7 +386,7 @@ def counts_losses(network: Network, name: str) -> bool:
     return node.trigger.side_information(len(node.outputs)) == 1
 
 
-def _held(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
+def _fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
     """Fill what is missing with the value before it, 0 before the first."""
     rows = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])
     last = np.maximum.accumulate(rows, axis=0) if len(values) else rows

@@ -234,13 +234,16 @@ def json_field(
     count = Count(sequence) if isinstance(sequence, str) else sequence
     if not isinstance(count, Count | None):
         raise fail("json_field, sequence", "a text or hg.files.Count", shown(sequence))
-    whose, of = _named("node", node), Field(plant) if isinstance(plant, str) else plant
+    whose, of = _check_name("node", node), Field(plant) if isinstance(plant, str) else plant
     seconds = None if step is None else float(scalar("json_field, step", step, TINY))
     if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.offset)):
         raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
-    factors, shifts = (_per_path(name, value, len(paths)) for name, value in (("scale", scale), ("offset", offset)))
+    factors, shifts = (
+        _broadcast_to_paths(name, value, len(paths)) for name, value in (("scale", scale), ("offset", offset))
+    )
     return Source(
-        paths, whose, outputs, factors, shifts, stamp, time_unit, count, None if of is None else _named("plant", of),
+        paths, whose, outputs, factors, shifts, stamp, time_unit, count,
+        None if of is None else _check_name("plant", of),
         seconds, *_conditions(where), flag("json_field, quoted", quoted),
     )  # fmt: skip
 
@@ -342,7 +345,7 @@ def _paths(value: object) -> tuple[str | Yaw, ...]:
     return tuple(items)
 
 
-def _named(name: str, value: object) -> Any:
+def _check_name(name: str, value: object) -> Any:
     """Check what names a node or a plant."""
     if not isinstance(value, str | Level | Field):
         raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", shown(value))
@@ -378,7 +381,7 @@ def _texts(name: str, value: object) -> tuple[str, ...]:
     return tuple(items)
 
 
-def _per_path(name: str, value: ArrayLike, count: int) -> tuple[float, ...]:
+def _broadcast_to_paths(name: str, value: ArrayLike, count: int) -> tuple[float, ...]:
     """Return one number for each path."""
     try:
         values = np.atleast_1d(np.asarray(value, dtype=object))

@@ -77,7 +77,7 @@ def messages_of(path: Path) -> Iterator[FileMessage | InputError]:
         yield from _lines(path)
         return
     for where, row in _csv_rows(path) if kind == ".csv" else _parquet_rows(path):
-        yield row if isinstance(row, InputError) else _of_row(where, row)
+        yield row if isinstance(row, InputError) else _convert_row(where, row)
 
 
 def log_line(text: str) -> tuple[str, str, str | None] | None:
@@ -95,7 +95,7 @@ def of_log(content: object) -> tuple[str, str, Any, bool] | None:
     return content[TOPIC], inner if isinstance(inner, str) else json.dumps(inner), arrival, bool(content.get("retain"))
 
 
-def _of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
+def _convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
     arrival = row.get("arrival")
     if TOPIC not in row:
         return FileMessage(where, None, row, arrival)
@@ -112,13 +112,13 @@ def _lines(path: Path) -> Iterator[FileMessage | InputError]:
             except (ValueError, RecursionError):
                 lines = enumerate(text.splitlines(), 1)
             else:
-                yield from (_of_object(f"{path}, message {n}", item) for n, item in enumerate(_flat(whole), 1))
+                yield from (_convert_object(f"{path}, message {n}", item) for n, item in enumerate(_flat(whole), 1))
                 return
         else:
             lines = enumerate(file, 1)
         for number, line in lines:
             if line.strip():
-                yield _of_line(f"{path}, line {number}", line)
+                yield _convert_line(f"{path}, line {number}", line)
 
 
 def _flat(content: object) -> Iterator[object]:
@@ -127,15 +127,15 @@ def _flat(content: object) -> Iterator[object]:
         yield from _flat(item) if isinstance(item, list) else [item]
 
 
-def _of_line(where: str, line: str) -> FileMessage | InputError:
+def _convert_line(where: str, line: str) -> FileMessage | InputError:
     try:
-        return _of_object(where, decoded(line, where))
+        return _convert_object(where, decoded(line, where))
     except InputError as error:
         parts = log_line(line)
         return error if parts is None else FileMessage(where, *parts)
 
 
-def _of_object(where: str, content: object) -> FileMessage:
+def _convert_object(where: str, content: object) -> FileMessage:
     logged = of_log(content)
     if logged is None:
         return FileMessage(where, None, content, content.get("arrival") if isinstance(content, dict) else None)

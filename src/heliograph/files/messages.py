@@ -69,7 +69,7 @@ def read_messages(
     elif holds_events(path):
         events = _own(path, network, strict, ignore_unknown)
     else:
-        events = _mapped(path, network, known, strict)
+        events = _map_messages(path, network, known, strict)
     if known is not None:
         _conclude(path, known, events)
     events.finish(str(path))
@@ -93,7 +93,7 @@ def _own(path: Path, network: Network, strict: bool, ignore_unknown: bool) -> Ev
     return own.events()
 
 
-def _mapped(path: Path, network: Network, sources: Sources | None, strict: bool) -> EventTable:
+def _map_messages(path: Path, network: Network, sources: Sources | None, strict: bool) -> EventTable:
     """Read messages by their topics, and those in our own form among them."""
     events = None if sources is None else EventTable(network, sources.step)
     own = OwnMessages(network, path, False)

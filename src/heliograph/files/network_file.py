@@ -48,12 +48,12 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
             got = "a folder" if path.is_dir() else "nothing of that name"
             raise fail(f"network {source_name}", "a Python file", got)
         with _importing_from(path.parent):
-            module = _guarded(lambda: _run_source(path, path.read_bytes()), source_name, path)
+            module = _call_user_code(lambda: _run_source(path, path.read_bytes()), source_name, path)
             return _pick(module, name, source_name, path), vars(module)
     # A module, by its name.
     with _importing_from(Path.cwd()):
-        source = _guarded(lambda: _source(source_name), source_name, None)
-        module = _guarded(lambda: importlib.import_module(source_name), source_name, source)
+        source = _call_user_code(lambda: _source(source_name), source_name, None)
+        module = _call_user_code(lambda: importlib.import_module(source_name), source_name, source)
         return _pick(module, name, source_name, source), vars(module)
 
 
@@ -69,7 +69,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     reference = f"{path.name}:{name}"
     # The module itself, then the function in it.
     with _importing_from(path.parent):
-        module = _guarded(lambda: _run_source(path, source), path.name, path)
+        module = _call_user_code(lambda: _run_source(path, source), path.name, path)
     function = getattr(module, name, None)
     if not callable(function):
         came = "an unknown name" if function is None else type(function).__name__
@@ -79,7 +79,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
         with _importing_from(path.parent):
-            network = _guarded(lambda: function(*args, **kwargs), reference, path)
+            network = _call_user_code(lambda: function(*args, **kwargs), reference, path)
         if not isinstance(network, Network):
             raise fail(f"network {reference}", "a heliograph.Network", type(network).__name__)
         return network
@@ -90,7 +90,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
 def _pick(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
-        return _named(module, name, file, path, networks)
+        return _get_network(module, name, file, path, networks)
     if len({id(network) for network in networks.values()}) == 1:
         return next(iter(networks.values()))
     if networks:
@@ -99,7 +99,7 @@ def _pick(module: ModuleType, name: str, file: str, path: Path | None) -> Networ
     raise fail(f"network {file}", f"a heliograph.Network (or {file}:FUNCTION that returns one)", "none in the module")
 
 
-def _named(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
+def _get_network(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)
         holds = ", ".join(networks) or "no networks"
@@ -107,7 +107,7 @@ def _named(module: ModuleType, name: str, file: str, path: Path | None, networks
         raise fail(f"network {file}:{name}", f"a name in the module, which holds {holds}", f"an unknown name{hint}")
     value = getattr(module, name)
     if callable(value) and not isinstance(value, Network):
-        value = _guarded(value, f"{file}:{name}", path)
+        value = _call_user_code(value, f"{file}:{name}", path)
     if not isinstance(value, Network):
         raise fail(f"network {file}:{name}", "a heliograph.Network", type(value).__name__)
     return value
@@ -137,7 +137,7 @@ def _run_source(path: Path, source: str | bytes) -> ModuleType:
     return module
 
 
-def _guarded(call: Callable[[], T], name: str, path: Path | None) -> T:
+def _call_user_code(call: Callable[[], T], name: str, path: Path | None) -> T:
     """Call the user's code; an error in it becomes one line with its type, message and line."""
     try:
         return call()

@@ -97,7 +97,7 @@ class OwnMessages:
         node = row[NODE]
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", shown(node))
-        values = _received(row, self.components[node], where, node in self._numbered)
+        values = _read_values(row, self.components[node], where, node in self._numbered)
         sequence = _whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
         time, dated = self._moment(row[TIME], f"{where}, column {TIME!r}")
         arrival = time
@@ -107,7 +107,7 @@ class OwnMessages:
         if self._table is None:
             self._table = EventTable(self.network, numbers=not dated)
         if isinstance(row.get(INPUTS), list) and node != INPUTS:
-            given = _received({VALUES: row[INPUTS]}, self.components[INPUTS], where)
+            given = _read_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
             self._table.add(Reading(plant, INPUTS, sequence, time, given), arrival)
         self._table.add(Reading(plant, node, sequence, time, values), arrival)
 
@@ -154,7 +154,7 @@ class HeaderError(InputError):
     """The columns of a file are not those of events."""
 
 
-def _received(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
+def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
     """Return the values of one event; where it is `numbered` the last, of what was lost, may be left to its count."""
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]

@@ -80,7 +80,7 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
     instance("recording", recording, Recording, "a Recording")
     instance("network", network, Network, "a Network")
     columns = {TIME: recording.time, **dict(zip(network.inputs, recording.inputs.T, strict=True))}
-    for node, names in _received_columns(network).items():
+    for node, names in _list_received_columns(network).items():
         if node in recording.measurements:
             columns |= {name[0]: z for name, z in zip(names, recording.measurements[node].T, strict=True)}
     if recording.truth is not None:
@@ -90,7 +90,7 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
 
 def _truth_columns(network: Network) -> dict[str, str]:
     """Return the name of the column of each state's true value, unless a node's component has it."""
-    received = {name for node in _received_columns(network).values() for names in node for name in names}
+    received = {name for node in _list_received_columns(network).values() for names in node for name in names}
     return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
 
 
@@ -110,7 +110,7 @@ def _headers(network: Network) -> dict[str, str]:
 
 
 def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
-    inputs, received = network.inputs, _received_columns(network)
+    inputs, received = network.inputs, _list_received_columns(network)
     # A relay whose measurements are left out altogether loses its filter only.
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
@@ -132,7 +132,7 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
         raise fail(f"{source}, row {row + 1}, column {TIME!r}", "a time that does not go backwards", came)
     _warn_of_equal_times(time, source)
     measurements = {
-        node: np.stack([_measured(columns, find(names), source) for names in components], axis=1)
+        node: np.stack([_read_measurements(columns, find(names), source) for names in components], axis=1)
         for node, components in received.items()
     }
     # Inputs; a missing dt is the difference of the times.
@@ -146,7 +146,7 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
         return Recording(measurements, u, time)
     unknown = np.full(len(time), np.nan)
     known = [true.get(state, "") for state in network.states]
-    truth = [_measured(columns, name, source) if name in columns else unknown for name in known]
+    truth = [_read_measurements(columns, name, source) if name in columns else unknown for name in known]
     return Recording(measurements, u, time, np.stack(truth, axis=1))
 
 
@@ -161,7 +161,7 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
             later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in later:
                 known = _claims(record.states, record.units, later[name])
-                columns += [(f"{prefix}smoothed.{key}", _at_the_end(values, len(record.time))) for key, values in known]
+                columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in known]
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
         raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")
@@ -183,7 +183,7 @@ def write_estimates(record: Record, path: str | Path) -> None:
     write_table(estimate_columns(record), path)
 
 
-def _headed(name: str, unit: str | None) -> str:
+def _make_header(name: str, unit: str | None) -> str:
     """Return the name of a column, with its unit where there is one."""
     return f"{name} ({unit})" if unit else str(name)
 
@@ -194,28 +194,28 @@ def _claims(states: Sequence[str], units: Mapping[str, str], estimate: Estimate)
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     columns = []
     for i, state in enumerate(states):
-        columns.append((_headed(state, units.get(state)), mean[:, i]))
+        columns.append((_make_header(state, units.get(state)), mean[:, i]))
         if estimate.claim != "none":
             variance = bound[:, i, i]
             columns.append(
-                (_headed(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
+                (_make_header(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
             )
     # Covariances of two states have the product of their units.
     if estimate.claim != "none":
         for i, a in enumerate(states):
             for j in range(i + 1, len(states)):
                 of = " ".join(units[name] for name in (a, states[j]) if name in units)
-                columns.append((_headed(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
+                columns.append((_make_header(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
     return [*columns, ("valid", is_sound(estimate))]
 
 
-def _at_the_end(values: np.ndarray, rows: int) -> np.ndarray:
+def _pad_start(values: np.ndarray, rows: int) -> np.ndarray:
     """Extend a column at its start by NaN, or false, to a number of rows."""
     none = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
     return np.concatenate([none.astype(values.dtype), values])
 
 
-def _received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
+def _list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
     """Return the allowed column names of each node's components, the preferred one first."""
     names = {node: receiver.received_names for node, receiver in network.nodes.items()}
     uses = Counter([TIME, *network.inputs])
@@ -275,7 +275,7 @@ def _complete(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.n
     return values
 
 
-def _measured(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+def _read_measurements(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
     values = _numbers(columns, name, source)
     _refuse(
         np.isinf(values),

@@ -80,7 +80,7 @@ class Sources:
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", shown(table))
-        self._table = {topic: self._checked(topic, items) for topic, items in table.items()}
+        self._table = {topic: self._check_sources(topic, items) for topic, items in table.items()}
         self._known: dict[str, list[Mapped]] = {}
         mapped = [single for several in self._table.values() for single in several]
         self.words = LastWords(condition for single in mapped for condition in single.source.available)
@@ -241,7 +241,7 @@ class Sources:
         self.found.add(key)
         return count(value, f"{where}, field {path!r}", source.quoted), False
 
-    def _checked(self, topic: object, items: object) -> list[Mapped]:
+    def _check_sources(self, topic: object, items: object) -> list[Mapped]:
         """Check the sources of a topic, and look up where their values are in the measurement of each node."""
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", shown(topic))

@@ -60,7 +60,7 @@ def _values(values: Any, name: str) -> np.ndarray:
     if column.dtype.kind in "fiub":
         return numbers_of(column)
     if column.dtype.kind in "OUT":
-        return _of_objects(column, name)
+        return _convert_objects(column, name)
     raise fail(name, "numbers or dates", f"{column.dtype}")
 
 
@@ -85,7 +85,7 @@ def in_nanoseconds(column: np.ndarray, name: str) -> np.ndarray:
     return np.asarray(moments)
 
 
-def _of_objects(column: np.ndarray, name: str) -> np.ndarray:
+def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
     """Convert numbers with None among them, or dates; refuse text, even if it reads as a number."""
     column = np.array([None if is_absent(value) else value for value in column], dtype=object)
     some = next((value for value in column if value is not None), None)
@@ -276,7 +276,9 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
 def _check_header(path: Path, header: Sequence[str]) -> None:
     line = ",".join(header)
     if line.startswith(COMMENTS):
-        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: {_uncommented(path)}")
+        raise fail(
+            f"{path}, header", "names of columns", f"a comment, {shown(line)}: {_suggest_without_comments(path)}"
+        )
     check_separators(path, header)
     _check_distinct(f"{path}, header", header)
 
@@ -292,7 +294,7 @@ def check_separators(path: Path, header: Sequence[str]) -> None:
             raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}: {remedy}")
 
 
-def _uncommented(path: Path) -> str:
+def _suggest_without_comments(path: Path) -> str:
     """Return the pandas call that converts a table whose first lines are comments, the last maybe its header."""
     with opened_text(path) as file:
         lines = [line.strip() for line in file.read(100_000).splitlines() if line.strip()]

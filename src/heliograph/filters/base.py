@@ -121,7 +121,7 @@ class AbstractFilter(Module):
                 that is NaN.
         """
         z, u = measured(self, z), given(self, u)
-        return _with_state(self, state, _step, z, u, step_number(self, k))
+        return _call_with_state(self, state, _step, z, u, step_number(self, k))
 
     def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
         """Run the filter over rows of data from its initial state: for each row predict, then correct.
@@ -148,7 +148,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses.
         """
         z, u = measured(self, z), given(self, u)
-        return _with_state(self, state, step_with_judgement, z, u, step_number(self, k))[:3]
+        return _call_with_state(self, state, step_with_judgement, z, u, step_number(self, k))[:3]
 
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
@@ -159,7 +159,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses; a filter that cannot be smoothed.
         """
         z, u = measured(self, z), given(self, u)
-        return _with_state(self, state, _step_with_smoother, z, u, step_number(self, k))
+        return _call_with_state(self, state, _step_with_smoother, z, u, step_number(self, k))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return what the backward pass needs of a step, from the filter's states around it.
@@ -249,7 +249,7 @@ def sized(claim: Claim, like: HasStates, received: int) -> Sizes:
     return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
 
 
-def _with_state(filter: AbstractFilter, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
+def _call_with_state(filter: AbstractFilter, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
     """Call `function(filter, state, *data)`; where it fails with no state of the filter, say so."""
     try:
         return function(filter, state, *data)
@@ -300,7 +300,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _checked(predict, given)
+    return _check_calls(predict, given)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
@@ -309,7 +309,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _checked(correct, measured)
+    return _check_calls(correct, measured)
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
@@ -322,19 +322,19 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(estimate)
     def call(filter: AbstractFilter, state: PyTree) -> R:
-        return _with_state(filter, state, run)
+        return _call_with_state(filter, state, run)
 
     return cast(Callable[P, R], call)
 
 
-def _checked(
+def _check_calls(
     function: Callable[P, R], check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]]
 ) -> Callable[P, R]:
     run = cast(Callable[..., R], compiled(function))
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
-        return _with_state(filter, state, run, check(filter, data), step_number(filter, k))
+        return _call_with_state(filter, state, run, check(filter, data), step_number(filter, k))
 
     return cast(Callable[P, R], call)
 

@@ -166,7 +166,7 @@ def judge(
     reason = jnp.where(unsound & came & ~far, Reason.UNSOUND, reason)
     reason = jnp.where(predicted, Reason.PREDICTION, reason)
     # Inputs that move the mean to where its deviation is below its rounding.
-    digits = _any_true(_rounded_away(prior) & ~_rounded_away(before)).astype(value.dtype)
+    digits = _any_true(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(value.dtype)
     input_verdict = jnp.nan if claim == "none" else digits
     distance = jnp.where((count > 0) & (sound | (reason > 0)), distance, jnp.nan)
     return Judgement(distance, count, reason.astype(value.dtype), jnp.asarray(input_verdict))
@@ -230,7 +230,7 @@ def _is_real(leaf: Array) -> bool:
     return bool(jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating))
 
 
-def _rounded_away(estimates: Estimate) -> jax.Array:
+def _mask_rounded_away(estimates: Estimate) -> jax.Array:
     """Mask of the states whose deviation is positive but below the rounding of their mean."""
     mean = jnp.asarray(estimates.mean)
     variance = diagonal_of(jnp.asarray(estimates.covariance))

@@ -112,13 +112,13 @@ def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
     later = len(state.mean) - n - size
     # The line of past reports shifts by one step.
     if later:
-        stored = _shifted(nodes, n, later)
+        stored = _make_shift_matrix(nodes, n, later)
         transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), stored])
         new, drift = jnp.pad(new, (0, later)), jnp.pad(drift, (0, later))
     return Knowledge(
         transition @ state.mean + drift,
         symmetric(transition @ state.covariance @ transition.T + new),
-        _with_new(state.past, happened, links),
+        _prepend_present(state.past, happened, links),
         None if state.spill is None else symmetric(transition @ state.spill @ transition.T),
     )
 
@@ -146,12 +146,12 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     # S = O P O' + N, with quantizers' errors as white noise of variance D^2 / 3.
     total = symmetric(output @ state.covariance @ output.T + noise)
     cross = jnp.where(present[:, None], output @ state.covariance, 0.0)
-    push = _quantized(state.past, present)
+    push = _make_quantizer_matrix(state.past, present)
     wide = push @ (jnp.ravel(state.past.error)[:, None] ** 2 / 3 * push.T)
-    gain = pseudo_solve(_of_present(present, total + wide), cross, rounding(0.0, total, RANK)).T
+    gain = pseudo_solve(_mask_absent(present, total + wide), cross, rounding(0.0, total, RANK)).T
     # Joseph's form, sums of squares; the errors mu themselves enter the bound (Young, Cauchy).
     keep = jnp.eye(len(state.mean)) - gain @ output
-    covariance = symmetric(keep @ state.covariance @ keep.T + gain @ _of_present(present, noise) @ gain.T)
+    covariance = symmetric(keep @ state.covariance @ keep.T + gain @ _mask_absent(present, noise) @ gain.T)
     spill = None
     if state.spill is not None:
         spill = symmetric(_sum(keep @ state.spill @ keep.T, _within(gain @ push, jnp.ravel(state.past.error))))
@@ -164,7 +164,7 @@ def fused_estimate(state: Knowledge, n: int) -> Fused:
     return state.mean[:n], covariance if state.spill is None else _sum(covariance, state.spill[:n, :n])
 
 
-def _with_new(past: Past, happened: Happened, links: Links) -> Past:
+def _prepend_present(past: Past, happened: Happened, links: Links) -> Past:
     """Put the present reports before those of earlier steps."""
     errors = happened.errors
     mean = errors.mean - errors.bias
@@ -181,7 +181,7 @@ def _with_new(past: Past, happened: Happened, links: Links) -> Past:
     return Past(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
 
 
-def _shifted(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
+def _make_shift_matrix(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
     """Shift matrix of the line: x - e_i becomes the report of one step ago, and so on."""
     size = nodes * n
     sent = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size), np.zeros((size, later))], axis=1)
@@ -199,11 +199,11 @@ def _output(past: Past, length: int) -> Float[jax.Array, "M N"]:
     return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
 
 
-def _of_present(present: jax.Array, matrix: jax.Array) -> jax.Array:
+def _mask_absent(present: jax.Array, matrix: jax.Array) -> jax.Array:
     return jnp.where(present[:, None] & present, matrix, 0.0)
 
 
-def _quantized(past: Past, present: jax.Array) -> Float[jax.Array, "M S"]:
+def _make_quantizer_matrix(past: Past, present: jax.Array) -> Float[jax.Array, "M S"]:
     """Matrix by which the quantizers' errors, (age, node, n) flattened, enter the reports that arrived."""
     return jnp.where(present[:, None], _along_diagonal(past.gain), 0.0)
 

@@ -43,7 +43,7 @@ def intersect(
     Differences of the means are used, since the matrices that multiply them have lost the digits that nearly dependent
     components cost: the means themselves may be millions of deviations from zero.
     """
-    covariance = inverse(_weighted_sum(weights, information))
+    covariance = inverse(_sum_weighted(weights, information))
     off = add([w * times_vector(j, x - means[0]) for w, j, x in zip(weights, information, means, strict=True)])
     return means[0] + times_vector(covariance, off), covariance
 
@@ -94,7 +94,7 @@ def _trace_derivatives(
 ) -> tuple[Float[jax.Array, "*#runs"], Float[jax.Array, "count *#runs"], Float[jax.Array, "count count *#runs"]]:
     """Return tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
     count, n, rest = information.shape[0], information.shape[1], information.shape[3:]
-    p = inverse(_weighted_sum(w, information))
+    p = inverse(_sum_weighted(w, information))
     half = _product(information.reshape(count * n, n, *rest), p).reshape(count, n, n, *rest)  # J_k P
     full = _product(p, jnp.swapaxes(half, 0, 1).reshape(n, count * n, *rest)).reshape(n, count, n, *rest)
     gradient = jnp.stack([-trace(full[:, k]) for k in range(count)])
@@ -106,7 +106,7 @@ def _trace_derivatives(
 _product = runs_last(times)
 
 
-def _weighted_sum(
+def _sum_weighted(
     w: Float[jax.Array, "count *#runs"], information: Float[jax.Array, "count n n *#runs"]
 ) -> Float[jax.Array, "n n *#runs"]:
     """Return sum_k w_k J_k."""
@@ -204,11 +204,11 @@ def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count
     variances = jnp.diagonal(matrices, axis1=1, axis2=2)
     largest = jnp.max(variances, axis=0)
     reference = jnp.where(variances > 0, variances, jnp.where(largest > 0, largest, 1.0))
-    return jax.vmap(_widened_inverse)(matrices, KNOWN * reference)
+    return jax.vmap(_invert_widened)(matrices, KNOWN * reference)
 
 
 @runs_last
-def _widened_inverse(a: jax.Array, least: jax.Array) -> jax.Array:
+def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
     _, scales = factor(a)  # 1 / root of what those before it leave of a component: rounding where that is next to none
     none = jnp.stack([jnp.where((s == 0) | (s**2 * low > 1), 1.0, 0.0) for s, low in zip(scales, least, strict=True)])
     return inverse(a + diagonal(none * least))

@@ -181,7 +181,7 @@ class UniformQuantizer(AbstractQuantizer):
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the fixed amplitude."""
-        return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
+        return state, _quantize_as_published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
 
     def error(self, n: int) -> Float[Array, " n"]:
         """Half of a segment's length."""
@@ -190,7 +190,7 @@ class UniformQuantizer(AbstractQuantizer):
         return bound
 
 
-def _published(
+def _quantize_as_published(
     x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
 ) -> Quantized:
     """Equations (10), (11) and (13), with d for values from d on and -d for values below -d."""

@@ -133,7 +133,7 @@ class AbstractIntersection(AbstractFusion):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """Lower the weakest claim to "upper" at most."""
-        return _of_covariances(claims, "upper")
+        return _combine_claims(claims, "upper")
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
         """Weights on the simplex of estimates with these P_i and P_i^-1."""
@@ -251,7 +251,7 @@ class InverseCovarianceIntersection(AbstractFusion):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """Lower a claim to "nominal": the assumed form of the correlation is not checked."""
-        return _of_covariances(claims, "nominal")
+        return _combine_claims(claims, "nominal")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Fuse the first two, the result with the third, and so on."""
@@ -261,7 +261,7 @@ class InverseCovarianceIntersection(AbstractFusion):
         return mean, covariance
 
 
-def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
+def _combine_claims(claims: list[Claim], strongest: Claim) -> Claim:
     """Weakest claim, for rules whose weights come from covariances."""
     if "none" in claims:
         raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")

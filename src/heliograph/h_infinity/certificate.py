@@ -99,7 +99,7 @@ def certify_level(
     initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
     # distance from failing, free of units
     definite = np.array([smallest_eigenvalue(p) for p in P])
-    margin = min(initial_margin, *(-_scaled_largest(phi) for phi in matrices))
+    margin = min(initial_margin, *(-_find_scaled_largest(phi) for phi in matrices))
     # every condition that fails, in words
     reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
     if not initial_margin > ROUNDING:
@@ -109,7 +109,7 @@ def certify_level(
     assumed: list[str] = []
     for letter, of in (("f", system.growth), ("h", system.output_growth)):
         reasons += _against(of, findings[letter])
-        assumed += _assumed(letter, of, findings[letter])
+        assumed += _list_assumed(letter, of, findings[letter])
     count = T if negative.all() else int(np.argmin(negative))
     about = tuple(findings["f"] + findings["h"]), tuple(reasons), tuple(assumed)
     return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *about)
@@ -141,7 +141,7 @@ def _positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
     return list(dict.fromkeys(float(value) for value in constants if value > 0))
 
 
-def _assumed(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
+def _list_assumed(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """List a function's constants that no finding proves.
 
     A bound of the slopes in a box bounds differences in it, and with f(0) = 0 and 0 in the box the function itself.
@@ -206,7 +206,7 @@ def theorem_matrix(
     sizes = [level**2] * (v + r)
     phi[4 * n + 2 * y :, 4 * n + 2 * y :] -= np.diag(sizes)
     _add_growth(phi, at, y, system, k, multipliers)
-    return _without_absent(phi, at, y, system)
+    return _drop_absent(phi, at, y, system)
 
 
 def _add_growth(
@@ -227,7 +227,7 @@ def _add_growth(
         phi[point, point] += weight_of * constant**2 * np.eye(n)
 
 
-def _without_absent(
+def _drop_absent(
     phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
 ) -> Float[np.ndarray, "kept kept"]:
     """Phi without f and f~, or h and h~, where the function is zero throughout."""
@@ -255,10 +255,10 @@ def is_negative(phi: Float[np.ndarray, "q q"]) -> bool:
 
     Scaling preserves definiteness and lets weights of very different sizes stand in one matrix.
     """
-    return _scaled_largest(phi) < -ROUNDING
+    return _find_scaled_largest(phi) < -ROUNDING
 
 
-def _scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
+def _find_scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
     """Largest eigenvalue after scaling the diagonal to -1; infinite where it is not negative."""
     diagonal = np.diagonal(phi)
     if not np.all(diagonal < 0):

@@ -194,8 +194,8 @@ class _Tools:
 
     def __init__(self, function: Function, width: float):
         self.width, self.function = width, function
-        self.jacobian = _by_part(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
-        self.values = _by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
+        self.jacobian = _compile_by_part(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
+        self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Norm of the Jacobian at each point; infinite where it is no number."""
@@ -222,7 +222,7 @@ class _Tools:
         return size if np.isfinite(size) else np.inf
 
 
-def _by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
+def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
     """Compile a function of points for as many at a time as a climb tries, so that it is one program."""
     compute = compiled(function)
 
@@ -307,12 +307,12 @@ def slope_bound(
             whole = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
             evaluate(jax.make_jaxpr(plain)(example), [whole], continuous=True)
             slopes = jax.make_jaxpr(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(example)
-            return SlopeBound(_sharpened(slopes, low, high, goal), "")
+            return SlopeBound(_sharpen(slopes, low, high, goal), "")
     except UnknownError as reason:
         return SlopeBound(np.inf, f"cannot follow {reason}")
 
 
-def _sharpened(
+def _sharpen(
     slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> float:
     bottoms, tops, done, seen = low[None], high[None], 0.0, 0
@@ -325,7 +325,7 @@ def _sharpened(
         done = max(done, float(np.max(bounds[~undecided], initial=0.0)))
         if seen + 2 * np.count_nonzero(undecided) > LIMIT:
             return max(done, float(np.max(bounds)))
-        bottoms, tops = _halved(bottoms[undecided], tops[undecided], high - low)
+        bottoms, tops = _halve(bottoms[undecided], tops[undecided], high - low)
     return done
 
 
@@ -341,7 +341,7 @@ def _bounds(slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarr
     return np.where(finite.all(axis=(1, 2)), norms, np.inf)[: len(low)]
 
 
-def _halved(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _halve(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Every box in two, across its widest side, in shares of the whole box's."""
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))

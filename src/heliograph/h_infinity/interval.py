@@ -57,7 +57,7 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
         elif name == "stop_gradient" and continuous and not np.array_equal(*inputs[0]):
             raise UnknownError("a slope that is stopped")
         elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):  # whole numbers are not rounded
-            results = _moved(equation, inputs)
+            results = _apply_to_ends(equation, inputs)
         else:
             results = [_operation(equation, inputs, continuous)]
         values.update(zip(equation.outvars, results, strict=True))
@@ -103,10 +103,10 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
             return exact(equation.primitive.bind(**params))
         # what may be true in a part of the interval alone is not decided
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
-            return _decided(_compare(name, *x), continuous)
+            return _decide(_compare(name, *x), continuous)
         case "sign":
             sign = Interval(np.sign(x[0].low), np.sign(x[0].high))
-            return _decided(sign, continuous)
+            return _decide(sign, continuous)
         case "and" | "or":
             combine = np.logical_and if name == "and" else np.logical_or
             return Interval(combine(x[0].low, x[1].low), combine(x[0].high, x[1].high))
@@ -117,14 +117,14 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
     raise UnknownError(name)
 
 
-def _decided(interval: Interval, continuous: bool) -> Interval:
+def _decide(interval: Interval, continuous: bool) -> Interval:
     """Interval of a decision, refused where it is open and the function has to be continuous."""
     if continuous and not np.array_equal(interval.low, interval.high):
         raise UnknownError("a decision that depends on where in the region x is")
     return interval
 
 
-def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
+def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
     """Intervals of numbers that only change places: move the low ends, and the high ends; places are whole numbers."""
     if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
         raise UnknownError("a place that depends on x")

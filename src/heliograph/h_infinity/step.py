@@ -52,7 +52,7 @@ def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
     spreads = [link.spreads() for link in system.channel]
     count = max(len(s) for s in spreads)
     padded = [np.concatenate([s, np.zeros((count - len(s), *s.shape[1:]))]) for s in spreads]
-    return [_at(system, k, padded[k], separate) for k in range(system.steps)]
+    return [_take_step(system, k, padded[k], separate) for k in range(system.steps)]
 
 
 def all_multipliers(
@@ -66,7 +66,7 @@ def all_multipliers(
     return full
 
 
-def _at(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool) -> StepMatrices:
+def _take_step(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool) -> StepMatrices:
     """Matrices of step k."""
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y = system.channel[k], system.states, system.output.shape[1]
@@ -231,11 +231,11 @@ class Coordinates(NamedTuple):
     def weight(self, scaled: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
         """Weight P_k in the user's units."""
         half = np.linalg.solve(self.states[k].T, scaled)
-        return self.unit**2 * _symmetrised(np.linalg.solve(self.states[k].T, half.T))
+        return self.unit**2 * _symmetrise(np.linalg.solve(self.states[k].T, half.T))
 
     def initial_weight(self, weight: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
         """Weight P_0 in scaled coordinates."""
-        return _symmetrised(self.states[0].T @ weight @ self.states[0]) / self.unit**2
+        return _symmetrise(self.states[0].T @ weight @ self.states[0]) / self.unit**2
 
     def gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
         """Gain of step k in the user's units."""
@@ -247,7 +247,7 @@ class Coordinates(NamedTuple):
         return np.asarray(self.unit**2 * unknowns.multipliers / self.forms[k])
 
 
-def _symmetrised(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
+def _symmetrise(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
     return np.asarray((a + a.T) / 2)
 
 
@@ -265,7 +265,7 @@ def scale(
     for k, step in enumerate(steps):
         spread = _signals(system, k, step, x, e)
         target = max(target, float(np.trace(step.target @ spread)))
-        x, e, measured, best = _moved(step, spread, None if gains is None else gains[k])
+        x, e, measured, best = _propagate(step, spread, None if gains is None else gains[k])
         nominal = best if gains is not None or k == 0 else _steady_gain(nominal, best, measured, e)
         sizes.append(_sizes(x, e, plain))
         received.append(_nonzero(np.sqrt(np.diagonal(measured))))
@@ -321,7 +321,7 @@ def _signals(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e:
     return total
 
 
-def _moved(
+def _propagate(
     step: StepMatrices, spread: np.ndarray, given: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Covariances of x+, of e+ with the given or the best gain and of what is received, and that gain."""
@@ -335,7 +335,7 @@ def _moved(
     before, left = step.error @ spread @ step.error.T, step.error - gain @ step.received
     after = left @ spread @ left.T + gain @ (received - step.received @ spread @ step.received.T) @ gain.T
     floor = SMALLEST**2 * np.diag(np.diagonal(before))
-    return step.state @ spread @ step.state.T, _symmetrised(after) + floor, received, gain
+    return step.state @ spread @ step.state.T, _symmetrise(after) + floor, received, gain
 
 
 def _steady_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -370,8 +370,8 @@ def _congruent(
         np.linalg.solve(after[n:, n:], (step.error - nominal @ step.received) @ unit),
         step.received @ unit / received[:, None],
         step.spreads @ unit / received[:, None],
-        _symmetrised(unit.T @ step.target @ unit),
-        _symmetrised(unit.T @ step.energy @ unit),
+        _symmetrise(unit.T @ step.target @ unit),
+        _symmetrise(unit.T @ step.energy @ unit),
         step.growth * np.diagonal(unit) ** 2 / forms[:, None],
         np.linalg.solve(after[n:, n:], nominal * received),
     )

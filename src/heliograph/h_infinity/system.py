@@ -64,16 +64,16 @@ def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
     cannot make is refused. Uncertain probabilities count as nominal.
     """
     gain: DisturbedGain = fold(channel, {
-        GainAndNoise: lambda hop, _: _of_hop(hop),
-        Series: lambda _, parts: reduce(_after, parts),
-        Mixture: lambda mixture, parts: _of_mixture(mixture, parts),
+        GainAndNoise: lambda hop, _: _disturb_hop(hop),
+        Series: lambda _, parts: reduce(_compose, parts),
+        Mixture: lambda mixture, parts: _disturb_mixture(mixture, parts),
         Stack: lambda stack, parts: _stack(parts, stack.inputs),
         Superposed: lambda channel, _: disturbed_gain(channel.as_stack),
     }, "channel", "hops, series, mixtures, stacks and sums of them")  # fmt: skip
     return gain
 
 
-def _of_hop(channel: GainAndNoise) -> DisturbedGain:
+def _disturb_hop(channel: GainAndNoise) -> DisturbedGain:
     covariance = np.asarray(channel.noise.covariance)
     unit = standard_deviations(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # of correlations: free of units
@@ -94,15 +94,15 @@ def _of_hop(channel: GainAndNoise) -> DisturbedGain:
     )
 
 
-def _after(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
+def _compose(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
     """[G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2], with independent factors."""
-    passed = _stack([first, _known(np.eye(then.disturbances))], shared=0)
+    passed = _stack([first, _disturb_known(np.eye(then.disturbances))], shared=0)
     mean = then.mean @ passed.mean
     second = np.einsum("aicj,ibjd->abcd", then.second, passed.second)
     return DisturbedGain(mean, second, first.inputs)
 
 
-def _of_mixture(channel: Mixture, parts: list[DisturbedGain]) -> DisturbedGain:
+def _disturb_mixture(channel: Mixture, parts: list[DisturbedGain]) -> DisturbedGain:
     widened = [_place(gain, channel.inputs, parts, i) for i, gain in enumerate(parts)]
     weights = np.asarray(channel.choice.probabilities)
     mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
@@ -110,7 +110,7 @@ def _of_mixture(channel: Mixture, parts: list[DisturbedGain]) -> DisturbedGain:
     return DisturbedGain(mean, second, channel.inputs)
 
 
-def _known(matrix: np.ndarray) -> DisturbedGain:
+def _disturb_known(matrix: np.ndarray) -> DisturbedGain:
     return DisturbedGain(matrix, np.multiply.outer(matrix, matrix), 0)
 
 
@@ -239,20 +239,20 @@ def growth_system(
     """
     check_count("steps", steps)
     # sizes n, v, y from B and D; the channel must take y outputs
-    B = _over(steps, "disturbance matrix", disturbance, (None, None))
+    B = _repeat_over(steps, "disturbance matrix", disturbance, (None, None))
     n, v = B.shape[1:]
-    D = _over(steps, "feedthrough matrix", feedthrough, (None, v))
+    D = _repeat_over(steps, "feedthrough matrix", feedthrough, (None, v))
     y = D.shape[1]
     links = _links(steps, channel)
     if links[0].inputs != y:
         raise fail("channel", f"one that takes the sensor's {y} outputs", f"{links[0].inputs} inputs")
     # every matrix once for each step
     return GrowthSystem(
-        _over(steps, "transition matrix", np.zeros((n, n)) if transition is None else transition, (n, n)),
+        _repeat_over(steps, "transition matrix", np.zeros((n, n)) if transition is None else transition, (n, n)),
         B,
-        _over(steps, "output matrix", np.zeros((y, n)) if output is None else output, (y, n)),
+        _repeat_over(steps, "output matrix", np.zeros((y, n)) if output is None else output, (y, n)),
         D,
-        _over(steps, "wanted matrix", target, (None, n)),
+        _repeat_over(steps, "wanted matrix", target, (None, n)),
         _growth(steps, "growth", growth),
         _growth(steps, "output growth", output_growth),
         links,
@@ -260,7 +260,9 @@ def growth_system(
     )
 
 
-def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) -> Float[np.ndarray, "steps ..."]:
+def _repeat_over(
+    steps: int, name: str, value: Varying, shape: tuple[int | None, ...]
+) -> Float[np.ndarray, "steps ..."]:
     """Matrix of every step, (steps, *shape)."""
     if not isinstance(value, OverTime):
         matrix: np.ndarray = array(name, value, shape)
@@ -292,7 +294,7 @@ def _growth(steps: int, name: str, value: Constants) -> Growth:
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
         raise fail(name, "a number, or a pair (of the function, of its differences)", value)
-    constants = [_over(steps, name, constant, ()) for constant in pair]
+    constants = [_repeat_over(steps, name, constant, ()) for constant in pair]
     for constant in constants:
         if np.any(constant < 0):
             raise fail(name, "no negative constant", float(constant.min()))

@@ -122,7 +122,12 @@ class Fit:
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences on starts, boundaries, forms that disagree, and what the data cannot identify."""
-        return (*_of_climb(self), *_of_boundaries(self.best), *_of_forms(self.solutions), *self.identified.sentences)
+        return (
+            *_describe_climb(self),
+            *_describe_boundaries(self.best),
+            *_describe_forms(self.solutions),
+            *self.identified.sentences,
+        )
 
     def __str__(self) -> str:
         """Table and sentences as text."""
@@ -188,7 +193,7 @@ def fit(
     surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
     points = _starts(surfaces[0], starts, check_seed("seed", seed))
     identified = identified_by(surfaces[-1], points[0], seed)
-    solutions, ends, stopped = _searched(surfaces, points, seed, identified.ridges, progress or (lambda line: None))
+    solutions, ends, stopped = _search_forms(surfaces, points, seed, identified.ridges, progress or (lambda line: None))
     try:
         identified = identified.at(solutions[-1])
     except KeyboardInterrupt:  # what is left out are the intervals in its sentences
@@ -196,7 +201,7 @@ def fit(
     return Fit(description, tuple(solutions), identified, ends, stopped, delays)
 
 
-def _searched(
+def _search_forms(
     surfaces: list[Surface], points: np.ndarray, seed: int, ridges: int, progress: Progress
 ) -> tuple[list[Solution], Float[np.ndarray, " starts"], bool]:
     """Search each form, from the best end of the one before: solutions, ends of the first, and whether it was stopped.
@@ -278,7 +283,7 @@ def _progress(surface: Surface, say: Progress) -> Callable[[Maximum], None]:
     return watch
 
 
-def _of_climb(fitted: Fit) -> list[str]:
+def _describe_climb(fitted: Fit) -> list[str]:
     sentences = []
     if fitted.stopped:
         sentences.append("Stopped before the end: this is the best so far.")
@@ -295,11 +300,11 @@ def _of_climb(fitted: Fit) -> list[str]:
     return sentences
 
 
-def _of_boundaries(best: Solution) -> list[str]:
+def _describe_boundaries(best: Solution) -> list[str]:
     return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
 
 
-def _of_forms(solutions: tuple[Solution, ...]) -> list[str]:
+def _describe_forms(solutions: tuple[Solution, ...]) -> list[str]:
     if len(solutions) < 2:
         return []
     sentences = []

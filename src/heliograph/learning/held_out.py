@@ -95,7 +95,9 @@ def changes(
         for key, old in before.nodes[name].filters.items():
             if old.claim == "none" or not old.received:
                 continue
-            single, other = (_expected(filter, z, inputs, cut) for filter in (old, after.nodes[name].filters[key]))
+            single, other = (
+                _score_expected(filter, z, inputs, cut) for filter in (old, after.nodes[name].filters[key])
+            )
             received = ~np.all(np.isnan(single.white), axis=1)
             gain = (
                 compared((other.log_likelihood - single.log_likelihood)[received]) if received.sum() >= LAGS else None
@@ -111,7 +113,7 @@ def uniformity(
     uniform = []
     for name, z in measurements.items():
         of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
-        by_law = _by_law(network, node, z, inputs) if isinstance(node, Node) else None
+        by_law = _integrate_law(network, node, z, inputs) if isinstance(node, Node) else None
         if by_law is not None:
             uniform.append(Uniformity(name, by_law[cut:], True))
         elif of_node:
@@ -119,7 +121,7 @@ def uniformity(
     return uniform
 
 
-def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
+def _integrate_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
     parts = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in parts) or first(node.channel).remembers:
         return None
@@ -129,7 +131,7 @@ def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> 
         return None
 
 
-def _expected(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
+def _score_expected(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
     likelihood, white = (np.asarray(values)[cut:] for values in innovations_of(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS

@@ -88,10 +88,10 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     points = _points(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):
-        z = _drawn(objective, x, u, check_seed("seed", seed) + i)
+        z = _draw_data(objective, x, u, check_seed("seed", seed) + i)
         data = Data(z[None], u[None], (len(z),))
         ranks.append(rank_of(Surface(objective, data).evaluations(x[None]).late[0]))
-    return _identified(description.parameters, points, ranks)
+    return _judge_identifiability(description.parameters, points, ranks)
 
 
 def identified_by(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
@@ -102,7 +102,7 @@ def identified_by(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -
     if not sound:
         points, late, sound = [start], surface.evaluations(start[None]).late, [0]
     ranks = [rank_of(late[i]) for i in sound]
-    return _identified(surface.objective.description.parameters, [points[i] for i in sound], ranks)
+    return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 
 
 def _points(start: np.ndarray, seed: int) -> list[np.ndarray]:
@@ -112,7 +112,7 @@ def _points(start: np.ndarray, seed: int) -> list[np.ndarray]:
     ]
 
 
-def _identified(parameters: Parameters, points: list[np.ndarray], ranks: list[Rank]) -> Identifiability:
+def _judge_identifiability(parameters: Parameters, points: list[np.ndarray], ranks: list[Rank]) -> Identifiability:
     groups = tuple(confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
@@ -123,7 +123,7 @@ def _identified(parameters: Parameters, points: list[np.ndarray], ranks: list[Ra
 def sentences(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
     """Sentences on what is not identified, and on what is in its place."""
     names = identifiability.parameters.coordinates
-    lines = [_of_group(identifiability.parameters, group, solution) for group in identifiability.groups]
+    lines = [_describe_group(identifiability.parameters, group, solution) for group in identifiability.groups]
     if solution is not None and any(
         group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups
     ):
@@ -136,28 +136,28 @@ def sentences(identifiability: Identifiability, solution: "Solution | None") -> 
     return tuple(lines)
 
 
-def _of_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
+def _describe_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
     names = [parameters.coordinates[i] for i in group.places]
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
     # products or sums that are identified, each with its interval
     left = len(names) - group.fix - len(group.exponents) - len(group.weights)
     if group.fix == len(names):
-        return f"Nothing in the data tells {_listed(names)}."
+        return f"Nothing in the data tells {_join_names(names)}."
     outputs = [
         *(product_text(names, row) + _interval(parameters, group, row, solution, log=True) for row in group.exponents),
         *(sum_text(names, row) + _interval(parameters, group, row, solution, log=False) for row in group.weights),
     ]
     if not outputs:
-        return f"The data tell only {_counted(left, 'combination')} of {_listed(names)}; {fix}."
+        return f"The data tell only {_count_in_words(left, 'combination')} of {_join_names(names)}; {fix}."
     # one sentence: sum, product or combination, singular or plural
     kind = "sum" if len(group.weights) else "product" if np.all(group.exponents >= 0) else "combination"
-    others = f" and {_counted(left, 'other combination')}" if left else ""
+    others = f" and {_count_in_words(left, 'other combination')}" if left else ""
     verb = "is" if len(outputs) == 1 and not left else "are"
     several = kind + ("s" if len(outputs) > 1 else "")
-    return f"Of {_listed(names)} only the {several} {_listed(outputs)}{others} {verb} identified; {fix}."
+    return f"Of {_join_names(names)} only the {several} {_join_names(outputs)}{others} {verb} identified; {fix}."
 
 
-def _counted(count: int, what: str) -> str:
+def _count_in_words(count: int, what: str) -> str:
     return f"one {what}" if count == 1 else f"{count} {what}s"
 
 
@@ -181,18 +181,18 @@ def _interval(
     return f" ({middle:.3g}, 95 % {low:.3g}..{high:.3g})"
 
 
-def _listed(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _drawn(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
+def _draw_data(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
     """Draw data with the mean and covariance that the filter expects of them, Gaussian given those before."""
     with jax.enable_x64(True):
-        return np.asarray(_expected(objective, x, u, jax.random.key(seed)))
+        return np.asarray(_draw_expected(objective, x, u, jax.random.key(seed)))
 
 
 @quickly_compiled
-def _expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
+def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
     filter = objective.filter(jnp.asarray(x))
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:

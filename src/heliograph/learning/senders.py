@@ -128,7 +128,7 @@ def fit_sender(
     # The best of several starts, and the profile of each number.
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
-    x, total, converged, stopped = _searched(likelihood, points)
+    x, total, converged, stopped = _search_starts(likelihood, points)
     rows = list[Row]()
     for i in range(len(parameters.entries)):
         row = _row_without_ends(description, x, i)
@@ -140,7 +140,7 @@ def fit_sender(
     return SenderFit(description, x, total, tuple(rows), converged, stopped)
 
 
-def _searched(
+def _search_starts(
     likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]
 ) -> tuple[Float[np.ndarray, " p"], float, bool, bool]:
     """The best point from several starts, its likelihood, whether its search converged, and whether it was stopped.

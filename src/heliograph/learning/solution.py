@@ -158,18 +158,18 @@ class Solution:
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """Hessian of -l along the identified directions."""
         observed = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
-        reduced = self._reduced(observed)
+        reduced = self._reduce(observed)
         if np.linalg.eigvalsh(reduced)[:1].sum() > 0:
             return reduced
         information = self.surface.evaluations(self.top.x[None]).information[0]
-        return self._reduced(information[np.ix_(self.active, self.active)])
+        return self._reduce(information[np.ix_(self.active, self.active)])
 
     @property
     def basis(self) -> Float[np.ndarray, "active r"]:
         """Identified directions, in columns."""
         return np.asarray(self.rank.unit[:, None] * self.rank.rest)
 
-    def _reduced(self, matrix: np.ndarray) -> np.ndarray:
+    def _reduce(self, matrix: np.ndarray) -> np.ndarray:
         return np.asarray(self.basis.T @ matrix @ self.basis)
 
     @cached_property
@@ -192,7 +192,7 @@ class Solution:
             scores, known = of_model(scores, back.T @ self.hessian @ back, self.few)
         estimate = long_run(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
-            estimate = estimate._replace(covariance=estimate.covariance + self._reduced(known))
+            estimate = estimate._replace(covariance=estimate.covariance + self._reduce(known))
         return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
@@ -209,7 +209,7 @@ class Solution:
         for entry, value, slope in zip(self.parameters.entries, values, slopes, strict=True):
             error = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
             if entry.coordinate is not None and not self.active[entry.coordinate]:
-                rows.append(self._at_boundary(entry, float(value), level))
+                rows.append(self._make_boundary_row(entry, float(value), level))
             elif not self.identifies(slope):
                 rows.append(Row(entry.name, float(value), np.nan, np.nan, np.nan, self.form, False, False))
             else:
@@ -239,7 +239,7 @@ class Solution:
         center = float(link(entry.domain, value))
         few = entry.coordinate is not None and self.few[np.count_nonzero(self.active[: entry.coordinate])]
         if method == "bootstrap" and not few:
-            low, high = center + self._drawn(slopes, level)
+            low, high = center + self._draw_ends(slopes, level)
             return low, high
         half = quantile(freedom, level) * error
         return center - half, center + half
@@ -255,13 +255,13 @@ class Solution:
         size = np.linalg.norm(along)
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
-    def _drawn(self, slopes: np.ndarray, level: float) -> np.ndarray:
+    def _draw_ends(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Ends of an interval by blocks of scores drawn anew, less the estimate."""
         drawn = np.linalg.solve(self.hessian, block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
         return ends
 
-    def _at_boundary(self, entry: Entry, value: float, level: float) -> Row:
+    def _make_boundary_row(self, entry: Entry, value: float, level: float) -> Row:
         """Row of a number at the end of its domain: from there to where the profile has fallen so far.
 
         The square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.

@@ -77,7 +77,7 @@ def samples_to_tell(
     name, node = _the_node(network)
     count = HORIZON if inputs is None else len(np.asarray(inputs))
     # mean and long-run deviation of the ratio under each law
-    channels = [_with_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
+    channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
     of_laws = []
     for channel, alternative in (channels, channels[::-1]):
         ratio = _ratios(network, name, node, channel, alternative, inputs, count, seed, nodes)
@@ -98,7 +98,7 @@ def _the_node(network: Network) -> tuple[str, Node]:
     return next(iter(received.items()))
 
 
-def _with_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
+def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
     """Channel with `law` in the place of the gain in question."""
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     laws = [

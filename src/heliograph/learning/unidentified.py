@@ -68,7 +68,7 @@ def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ra
         _basis(slopes[:, None] * rank.unit[:, None] * rank.flat)
         for (_, rank), (slopes, _) in zip(used, scales, strict=True)
     ]
-    return [_in_words(group, logs, plain) for group in _groups(logs)]
+    return [_describe_group(group, logs, plain) for group in _groups(logs)]
 
 
 def _scales(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +95,7 @@ def _groups(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
     return [group for group in groups if joined[group, group].any()]
 
 
-def _in_words(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
+def _describe_group(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
     places = list(group)
     size = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
     none = np.zeros((0, len(group)))
@@ -111,10 +111,10 @@ def _everywhere_known(bases: list[np.ndarray]) -> np.ndarray:
     """Rows orthogonal to the flat directions of all points, reduced."""
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))
-    return _reduced(right[rank:])
+    return _reduce_to_echelon(right[rank:])
 
 
-def _reduced(rows: np.ndarray) -> np.ndarray:
+def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
     """Row echelon form, leading entries 1."""
     reduced, lead, pivot = rows.copy(), 0, 0
     for row in range(len(reduced)):

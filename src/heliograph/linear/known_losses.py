@@ -92,26 +92,26 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
     parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
     # Value iteration, renormalised where covariances grow.
-    noise, gains = 1.0, _improved(system, parts, 1.0)
+    noise, gains = 1.0, _improve_gains(system, parts, 1.0)
     for step in range(1, ITERATIONS + 1):
         (parts,) = system.closed(gains, noise).after(parts)
         grown = np.trace(parts.sum(axis=0)) / size
         if grown > NEGLIGIBLE:
             parts, noise = parts / grown, noise / grown
-        before, gains = gains, _improved(system, parts, noise)
+        before, gains = gains, _improve_gains(system, parts, noise)
         if _change(before, gains) < CONVERGED:
             break
         if step.bit_count() == 1 and system.closed(gains).radius() < BELOW_ONE:
             break
     # Policy iteration, and the certificate rho(operator) < 1.
-    gains = _polished(system, gains)
+    gains = _iterate_policy(system, gains)
     if system.closed(gains).radius() < BELOW_ONE:
         return gains
     fresh = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
     return min(gains, fresh, key=lambda items: system.closed(items).radius())
 
 
-def _polished(system: KnownLossSystem, gains: KindGains) -> KindGains:
+def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
     """Policy iteration: gains for what remains under the last ones, their steady bound or the part that grows most."""
     jumps = system.closed(gains)
     values, vectors = np.linalg.eig(jumps.operator())
@@ -119,7 +119,7 @@ def _polished(system: KnownLossSystem, gains: KindGains) -> KindGains:
     for _ in range(POLISHING):
         below = radius < BELOW_ONE
         parts = jumps.steady()[0] if below else _fastest(jumps.shape, values, vectors)
-        better = _improved(system, parts, 1.0 if below else 1 / NEGLIGIBLE)
+        better = _improve_gains(system, parts, 1.0 if below else 1 / NEGLIGIBLE)
         jumps = system.closed(better)
         values, vectors = np.linalg.eig(jumps.operator())
         reached = float(np.max(np.abs(values)))
@@ -135,7 +135,7 @@ def _fastest(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) ->
     return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
 
-def _improved(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
+def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
     """Gains that are best for U of the V given, of all modes together if V is."""
     results: list[np.ndarray] = []
     before: Parts = mixed(system.chain, parts)

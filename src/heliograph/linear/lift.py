@@ -186,13 +186,13 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     mean, spread = mean_and_spread(before)
     start_lost = EPS * np.diag(before)[:-1]
     varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
-    steps, process_rounding, received_rounding = _lifted_steps(routes, degree, moments, varies)
+    steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
     rounding = process_rounding, received_rounding, start_lost
     system = LinearSystem(steps, mean, spread, linear_rows(n, degree), *rounding)
     return believing(system, Premise(plant, sensor, channel, order=2 * degree))
 
 
-def _lifted_steps(
+def _lift_steps(
     routes: Sequence[Route], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
     """Return the system's steps and the rounding of both noises; `varies`: whether plant and measurement do.

@@ -69,9 +69,9 @@ def modal_system(
     parts = []
     for step in steps:
         maps = [m.maps for m in step.maps if isinstance(m, Stack)]
-        move_moments, received = (_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
+        move_moments, received = (_take_moments_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
         # F, Cov(w) and E_i of one step; Cov(v) = sum_j Spread_j(E_j).
-        transition, process, moments = _after(move_moments, rows, moments)
+        transition, process, moments = _propagate_modes(move_moments, rows, moments)
         noise = np.einsum("jabcd,jcd->ab", received[1], moments)
         output = np.concatenate(list(received[0]), axis=1)
         parts.append((transition, np.zeros(len(transition)), process, output, np.zeros(len(output)), noise))
@@ -80,13 +80,13 @@ def modal_system(
     return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), np.kron(law, mean), start, whole)
 
 
-def _by_mode(items: list[tuple[np.ndarray, np.ndarray]]) -> Moments:
+def _take_moments_by_mode(items: list[tuple[np.ndarray, np.ndarray]]) -> Moments:
     mean = np.array([first_order for first_order, _ in items])
     second = np.array([second_order for _, second_order in items])
     return mean, second - np.array([symmetric_product(m, m) for m in mean])
 
 
-def _after(
+def _propagate_modes(
     move: Moments, rows: np.ndarray, moments: np.ndarray
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
     """F, Cov(w) and E[y~+ y~+' 1{j}]."""

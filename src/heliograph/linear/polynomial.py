@@ -52,7 +52,7 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
     moments = push_known(beginning, 4, initial_moments(start, 4))
     before = second_moments(moments, total + 1, 2)
     mean, spread = mean_and_spread(before)
-    received, parts, rounding, stored = _received_products(n, m), [], [], _Recorded()
+    received, parts, rounding, stored = _make_received_products(n, m), [], [], _Recorded()
     for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
         move, listen = stored.move(route.plant, m), _listen(Gains(*(field[k] for field in linear.gains)))
         wide = stored.widen(route.measurement, n)
@@ -110,7 +110,7 @@ class _Recorded:
         return self.wide
 
 
-def _received_products(n: int, m: int) -> np.ndarray:
+def _make_received_products(n: int, m: int) -> np.ndarray:
     """Rows that read (monomials of z up to degree 2, z_i q_j) off the square of (x, q, z)."""
     total = 2 * n + m
     places = {powers: i for i, powers in enumerate(exponents(total + 1, 2))}

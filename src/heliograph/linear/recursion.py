@@ -40,10 +40,10 @@ class Corrected(NamedTuple):
 def noises_of(s: Steps, size: Float[np.ndarray, " N"]) -> Noises:
     """Roots of Cov(w) and Cov(v), beside those of the rounding of a state that had the second moments `size`."""
     reach = np.abs(s.output) @ np.sqrt(size)
-    return Noises(_rounded_root(s.process, size), _rounded_root(s.noise, reach**2))
+    return Noises(_take_rounded_root(s.process, size), _take_rounded_root(s.noise, reach**2))
 
 
-def _rounded_root(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
+def _take_rounded_root(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
     """Root of a noise and of the rounding of numbers with these second moments, which it is added to."""
     rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
@@ -112,7 +112,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
         worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
     gains = Gains(*(over_horizon(values, system.horizon) for values in zip(*parts, strict=True)))
-    return believing(Schedule(gains, system.mean, _supported(claim, worst, when)), system.kept.premise)
+    return believing(Schedule(gains, system.mean, _support_claim(claim, worst, when)), system.kept.premise)
 
 
 def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
@@ -134,7 +134,7 @@ def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool
     )
 
 
-def _supported(claim: Claim, lost: float, step: int) -> Claim:
+def _support_claim(claim: Claim, lost: float, step: int) -> Claim:
     """The claim that is left where rounding is `lost` of a claimed variance."""
     remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
     if lost > DIGITS_TOLERANCE:

@@ -216,7 +216,7 @@ class Schedule(Module):
             (time, q, q), (time, q, q), (time, m, m),
         )  # fmt: skip
         named = zip(Gains._fields, gains, shapes, strict=True)
-        self.gains = Gains(*((_known if f in PERHAPS else array)(f"schedule {f}", v, s) for f, v, s in named))
+        self.gains = Gains(*((_fill_unknown if f in PERHAPS else array)(f"schedule {f}", v, s) for f, v, s in named))
         if len(self.start) != n:
             raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
         if not isinstance(claim, str) or claim not in STRENGTH:
@@ -234,7 +234,7 @@ class Schedule(Module):
             np.savez(file, start=self.start, claim=np.array(self.claim), **self.gains._asdict())
 
 
-def _known(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _fill_unknown(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """An array of the given shape, NaN where it is not known."""
     unknown = np.isnan(value)
     checked = array(name, np.where(unknown, 0.0, value), shape)

@@ -69,7 +69,7 @@ class Fleet:
         instance("lanes", lanes, Lanes, "Lanes")
         instance("options", options, Options, "Options")
         network = self.network = lanes.network
-        self.options, self.lanes = _checked(options), lanes
+        self.options, self.lanes = _check_options(options), lanes
         self.pool = Pool(lanes, alone)
         # Index and size of each node's measurement, and of the inputs; their columns in a row, in this order.
         self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
@@ -181,7 +181,7 @@ class Fleet:
         """Return how many values an event has without the numbers of lost ones; None if it has no such numbers."""
         return self._numbered.get(self.sizes[node][0])
 
-    def _lost_column(self, node: int) -> tuple[str, int] | None:
+    def _find_lost_column(self, node: int) -> tuple[str, int] | None:
         """Return the name of a node whose running count says what was lost, and the column of the number."""
         outputs = self._numbered.get(node)
         if outputs is None or self.size(node) != outputs + 1:
@@ -234,7 +234,7 @@ class Fleet:
         if verdict != "used":
             return verdict
         self.end_silence(plant)
-        plant.take(event, key, self.pool.take, self.width, self._lost_column(event.node_index))
+        plant.take(event, key, self.pool.take, self.width, self._find_lost_column(event.node_index))
         plant.pass_time(clock, said, now, leap, sure)
         return verdict
 
@@ -323,7 +323,7 @@ class Fleet:
             self.pool.give(row.left)
 
 
-def _checked(options: Options) -> Options:
+def _check_options(options: Options) -> Options:
     step = None if options.step is None else float(scalar("step", options.step, TINY))
     leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
     window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))

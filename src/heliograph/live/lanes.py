@@ -54,7 +54,10 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
     for x in (mean, mean + spread):
-        whole, parts = _moved(plant, dt, x, cuts.sum(axis=1, keepdims=True)), _moved(plant, dt, x, cuts)
+        whole, parts = (
+            _integrate_parts(plant, dt, x, cuts.sum(axis=1, keepdims=True)),
+            _integrate_parts(plant, dt, x, cuts),
+        )
         for i, (s, t) in enumerate(CUTS):
             for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
                 gap = float(np.abs(at_once[i] - in_two[i]).max())
@@ -67,7 +70,7 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
 
 
 @compiled
-def _moved(
+def _integrate_parts(
     plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
 ) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
     """Return state, Jacobian and noise covariance after the parts of each cut."""

@@ -88,14 +88,14 @@ class Sweep(Module):
 
     def outputs(self, steps: NetworkSmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""
-        by_kind, central = _over_filters(lambda step, later: step.estimate_from(later), steps, later)
+        by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
         parts = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:
             central |= fusion.step((), parts, jnp.asarray(0))[1]
         return by_kind, central
 
 
-def _over_filters(function: Callable[..., object], steps: NetworkSmootherStep, *rest: PyTree) -> PyTree:
+def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *rest: PyTree) -> PyTree:
     """Map a function of one filter's step over the filters of each kind, (filter, node, ...), and the central ones."""
     by_kind = {
         kind: jax.vmap(jax.vmap(function))(step, *(tree[0][kind] for tree in rest)) for kind, step in steps[0].items()
@@ -135,12 +135,12 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
         ) -> tuple[StepOfRow, NetworkSmootherStep, PyTree]:
             now, steps, later = carry
             before = into(sweep, history, now)
-            passed = _over_filters(lambda step, later: step.back(later), steps, later)
-            ends = _over_filters(lambda step: step.after, before)
+            passed = _map_filters(lambda step, later: step.back(later), steps, later)
+            ends = _map_filters(lambda step: step.after, before)
             later = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), ends, passed)
             return earlier(history, now), before, later
 
-        begun = last, blank, _over_filters(lambda step: step.after, blank)
+        begun = last, blank, _map_filters(lambda step: step.after, blank)
         _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
         return sweep.outputs(steps, later)
 
@@ -181,7 +181,9 @@ class Sweeper:
 
     def __init__(self, network: Network, dt: int | None):
         self.network = network
-        kinds = tuple(k for k, kind in enumerate(network.kinds) if _can_smooth(_of(network, k, kind.filters[0])))
+        kinds = tuple(
+            k for k, kind in enumerate(network.kinds) if _can_smooth(_get_filter(network, k, kind.filters[0]))
+        )
         filters = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         central = {name: filter for name, filter in filters.items() if _can_smooth(filter)}
         if not kinds and not central:
@@ -239,7 +241,7 @@ def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Est
     return with_sound_claim(Estimate(np.asarray(outputs.mean)[where], np.asarray(outputs.covariance)[where], claim))
 
 
-def _of(network: Network, kind: int, name: str) -> AbstractFilter:
+def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
     return network.nodes[network.groups[network.kinds[kind].group][0]].filters[name]
 
 

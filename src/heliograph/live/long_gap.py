@@ -96,17 +96,17 @@ def _states_after(
         return as_covariances(step(as_factors(states, places), k), places)
 
     for i in range(min(PROBES, count // PROBED)):
-        passed.append(_walked(step, passed[-1], at + i * PROBED, PROBED))
+        passed.append(_walk(step, passed[-1], at + i * PROBED, PROBED))
         if not (moving := _moving(*seen(passed[-2:]))).any():
             return passed[-1]
         if i & (i + 1) == 0:  # after 1, 2, 4, ... probes
-            jumped = _jumped(by_covariances, seen(passed[-2:]), moving, at + i * PROBED, count - i * PROBED)
+            jumped = _jump(by_covariances, seen(passed[-2:]), moving, at + i * PROBED, count - i * PROBED)
             if jumped is not None:
                 return _alone(jumped, places)
     done = PROBED * (len(passed) - 1)
     if count - done < PROBED:
-        return _walked(step, passed[-1], at + done, count - done)
-    return _alone(_extrapolated(seen(passed), count - done), places)
+        return _walk(step, passed[-1], at + done, count - done)
+    return _alone(_extrapolate(seen(passed), count - done), places)
 
 
 def _alone(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Float[np.ndarray, " state"]:
@@ -115,7 +115,7 @@ def _alone(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Flo
     return alone
 
 
-def _extrapolated(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
+def _extrapolate(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
     """Let go on what moved over the last quarter of some probes as it did over the quarter before."""
     quarter = len(passed) // 4
     end, middle, begin = (passed[-1 - i * quarter] for i in range(3))
@@ -127,7 +127,7 @@ def _extrapolated(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> 
     return moved
 
 
-def _walked(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -> Float[np.ndarray, " state"]:
+def _walk(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -> Float[np.ndarray, " state"]:
     """Take steps one by one."""
     states = state[None]
     for k in range(at + 1, at + count + 1):
@@ -144,7 +144,7 @@ def _moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " stat
     return moving
 
 
-def _jumped(step: Step, probe: Sequence[Float[np.ndarray, " state"]], moving: np.ndarray,
+def _jump(step: Step, probe: Sequence[Float[np.ndarray, " state"]], moving: np.ndarray,
             at: int, count: int) -> Float[np.ndarray, " state"] | None:  # fmt: skip
     """Return the state `count` steps after the begin of a probe by the affine map there; None if the step is none."""
     state, probed = probe

@@ -49,7 +49,7 @@ class Link:
         `period`: after how many messages the count begins at 0 again; 0 if it does not.
         """
         setattr(self, verdict, getattr(self, verdict) + 1)
-        sequence = self._unwrapped(sequence, time, period)
+        sequence = self._unwrap_count(sequence, time, period)
         if verdict == "used":
             self.latest = max(self.latest, time)
             if sequence - 1 == self.newest >= 0 and time >= self.at:  # the next, as most are
@@ -75,7 +75,7 @@ class Link:
         elif sequence < self.newest:
             self.lost -= self.lost > 0  # it had only been overtaken
 
-    def _unwrapped(self, sequence: int, time: float, period: int) -> int:
+    def _unwrap_count(self, sequence: int, time: float, period: int) -> int:
         """Return a count that goes on where the node's own begins at 0 again; one that is too far is a new start."""
         if not period or self.newest < 0:
             return sequence
@@ -204,7 +204,7 @@ class Plant:
         if leap is not None and not sure:
             if time < leap.time - most or (time == leap.time and clock == leap.clock):
                 return  # from before it, which says nothing of now; or of the same message
-            leap = self._confirmed_by(clock, leap, time, most)
+            leap = self._confirm_leap(clock, leap, time, most)
         elif sure:
             leap = None
         if now > before + most and not sure and (leap is None or leap.believed):
@@ -212,7 +212,7 @@ class Plant:
             leap = Leap(time, time, before, moments, clock, earlier=leap)
         self.now, self.leap = max(before, now), leap
 
-    def _confirmed_by(self, clock: str, leap: Leap, time: float, most: float) -> Leap | None:
+    def _confirm_leap(self, clock: str, leap: Leap, time: float, most: float) -> Leap | None:
         """Return what is left of a leap after an event on its farther side."""
         if clock != leap.clock:
             return None

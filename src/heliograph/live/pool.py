@@ -65,7 +65,7 @@ class Pool:
         """
         dt, table = self.lanes.dt, self.table
         u = np.where(np.isnan(given), table[before, self.held], given)
-        u = u if dt is None else _with_time_step(u, dt, np.ones(len(u)))
+        u = u if dt is None else _insert_time_step(u, dt, np.ones(len(u)))
         k = np.minimum(table[before, self.at.start] + 1, last)
         nothing = np.full((len(before), self.lanes.received), np.nan)
         done = self.step_rows(np.concatenate([table[before, self.state], nothing, u, k[:, None]], axis=1), self._alone)
@@ -86,7 +86,7 @@ class Pool:
             received, u = np.where(there, received, np.nan), np.where(there, now_held, held)
             now_held, k = u, at
         else:
-            u = _with_time_step(held, dt, numbers[:, -1] - table[before, -1])
+            u = _insert_time_step(held, dt, numbers[:, -1] - table[before, -1])
             k = table[before, self.at.start] + 1
         done = self.step_rows(np.concatenate([table[before, self.state], received, u, k[:, None]], axis=1), self._alone)
         table[after, : self.outputs.stop] = done
@@ -97,7 +97,7 @@ class Pool:
         dt, table = self.lanes.dt, self.table
         u = table[after if dt is None else before, self.held]
         if dt is not None:
-            u = _with_time_step(u[None], dt, table[[after], self.numbers.stop - 1] - table[[before], -1])[0]
+            u = _insert_time_step(u[None], dt, table[[after], self.numbers.stop - 1] - table[[before], -1])[0]
         return u, int(table[after, self.at.start])
 
     def jump(self, slot: int, to: int) -> None:
@@ -124,7 +124,7 @@ class Pool:
         return History(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start].astype(int), outputs)
 
 
-def _with_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[np.ndarray, " row"]) -> np.ndarray:
+def _insert_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[np.ndarray, " row"]) -> np.ndarray:
     """Insert the time steps among the inputs, as number `dt`."""
     return np.concatenate([u[:, :dt], steps[:, None], u[:, dt:]], axis=1)
 

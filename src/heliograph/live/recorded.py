@@ -90,16 +90,19 @@ def play(
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
     late = None if lag is None else _record(network, lagged)
-    return Played(_joined(finals), late, timeline.counts, timeline.forced)
+    return Played(_join_records(finals), late, timeline.counts, timeline.forced)
 
 
 def _arrival(event: Event) -> float:
     return event.time if event.arrival is None else event.arrival
 
 
-def _joined(parts: Sequence[Record]) -> Record:
+def _join_records(parts: Sequence[Record]) -> Record:
     estimates = {
-        node: {name: _stacked([record.estimates[node][name] for record in parts], np.concatenate) for name in filters}
+        node: {
+            name: _stack_estimates([record.estimates[node][name] for record in parts], np.concatenate)
+            for name in filters
+        }
         for node, filters in parts[0].estimates.items()
     }
     return Record(np.concatenate([record.time for record in parts]), parts[0].states, None, {}, estimates)
@@ -108,12 +111,15 @@ def _joined(parts: Sequence[Record]) -> Record:
 def _record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
     results = [estimates for _, estimates in parts]
     estimates = {
-        node: {name: _stacked([estimates_then[node][name] for estimates_then in results], np.stack) for name in filters}
+        node: {
+            name: _stack_estimates([estimates_then[node][name] for estimates_then in results], np.stack)
+            for name in filters
+        }
         for node, filters in (results[0] if results else {}).items()
     }
     return Record(np.array([time for time, _ in parts]), network.states, None, {}, estimates)
 
 
-def _stacked(parts: Sequence[Estimate], how: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
+def _stack_estimates(parts: Sequence[Estimate], how: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
     mean, covariance = (how([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
     return Estimate(mean, covariance, parts[0].claim)

@@ -94,7 +94,7 @@ class XlaStepper:
         return [np.asarray(leaf) for leaf in self._estimate]
 
 
-def _judged(
+def _judge_step(
     static: Static, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
     """Step a filter from its arrays; return judgement, whether to refuse, leaves of the state and of the estimate."""
@@ -110,7 +110,7 @@ def by_xla(static: Static) -> Any:
     """Compile (numbers, state, z, u, k) to (judgement, whether to refuse, leaves of the state, of the estimate)."""
 
     def step(*data: PyTree) -> PyTree:
-        return _judged(static, *data)
+        return _judge_step(static, *data)
 
     return jax.jit(step, compiler_options=understood())
 
@@ -119,11 +119,11 @@ def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: 
     """Compile native code with arguments (numbers, state, z, u, k), flattened; None if XLA has to step the filter."""
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
-    return _made(static, shapes, (len(numbers), len(leaves)), tree, setting())
+    return _compile_stepper(static, shapes, (len(numbers), len(leaves)), tree, setting())
 
 
 @lru_cache
-def _made(
+def _compile_stepper(
     static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
 ) -> Any:
     """Compile the native code, once for each structure, set of shapes and engine."""
@@ -132,7 +132,7 @@ def _made(
     def step(*leaves: jax.Array) -> PyTree:
         before, (z, u, k) = leaves[numbers : numbers + state], leaves[numbers + state :]
         # The step, and the state that replaces the old one: unchanged if the step was flagged.
-        judged, flagged, after, estimate = _judged(static, leaves[:numbers], tree.unflatten(before), z, u, k)
+        judged, flagged, after, estimate = _judge_step(static, leaves[:numbers], tree.unflatten(before), z, u, k)
         if any(a.shape != b.shape or a.dtype != b.dtype for a, b in zip(after, before, strict=True)):
             raise Unsupported("a state whose shape or type changes")
         placed = [jnp.where(flagged, b, a) for a, b in zip(after, before, strict=True)]

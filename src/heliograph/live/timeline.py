@@ -116,7 +116,7 @@ class Timeline:
         return {"network": self.network, "saved": packed(head, arrays)}
 
     def __setstate__(self, stored: dict[str, Any]) -> None:
-        vars(self).update(vars(self._resumed(stored["network"], *unpacked(stored["saved"]))))
+        vars(self).update(vars(self._resume(stored["network"], *unpacked(stored["saved"]))))
 
     @property
     def engine(self) -> str:
@@ -156,7 +156,7 @@ class Timeline:
             ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
                 is counted, and everything stays as it was.
         """
-        event, dropped, beyond = self._fleet.within(node, self._known(node, sequence, time, values, arrival))
+        event, dropped, beyond = self._fleet.within(node, self._convert_event(node, sequence, time, values, arrival))
         plant, before = self._plant, self._plant.clock
         verdict = self._fleet.take(plant, event, arrival is not None)
         if verdict == "used":
@@ -204,9 +204,9 @@ class Timeline:
         if self._lanes.dt is None:
             now = np.floor(min(now, self._fleet.end_step))
         if newest.key[1] != BEFORE and now <= newest.key[0]:
-            return self._judged(self._outputs(newest.slot))
+            return self._arrange_judgements(self._outputs(newest.slot))
         self._fleet.look(newest, now, self._spare)
-        return self._judged(self._outputs(self._spare))
+        return self._arrange_judgements(self._outputs(self._spare))
 
     def senders(self) -> dict[str, SenderStatus]:
         """Return the status of each node's sender that decides when to send: what its silence means by now.
@@ -247,7 +247,7 @@ class Timeline:
         are kept.
         """
         time, outputs = self._finals.take()
-        return Record(time, self.network.states, None, {}, self._named(outputs))
+        return Record(time, self.network.states, None, {}, self._arrange_outputs(outputs))
 
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
@@ -283,13 +283,13 @@ class Timeline:
         head, arrays = unpacked(data)
         mine, other = shared_lanes(network).identity, head.get("of", {})
         if accept_changes and mine != other:
-            arrays = arrays | {"plant": cls._carried(network, head, arrays["plant"].tobytes())}
-            return cls._resumed(network, head, arrays)
+            arrays = arrays | {"plant": cls._carry_over(network, head, arrays["plant"].tobytes())}
+            return cls._resume(network, head, arrays)
         check_same("snapshot", mine, other, SAME)
-        return cls._resumed(network, head, arrays)
+        return cls._resume(network, head, arrays)
 
     @classmethod
-    def _carried(cls, network: Network, head: Mapping[str, Any], plant: bytes) -> np.ndarray:
+    def _carry_over(cls, network: Network, head: Mapping[str, Any], plant: bytes) -> np.ndarray:
         """Return the bytes of a plant that another network or version saved, as this one would."""
         window, ahead, capacity = head["options"]
         fleet = Fleet(shared_lanes(network), Options(window, ahead, capacity=capacity), alone=True)
@@ -306,7 +306,7 @@ class Timeline:
             raise fail("snapshot", "rows of the filters that are here", f"other ones: {error}") from None
 
     @classmethod
-    def _resumed(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
+    def _resume(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
         """Make a timeline from a saved state."""
         window, ahead, capacity = head["options"]
         with warnings.catch_warnings():  # the warning was given when the timeline was made
@@ -317,7 +317,7 @@ class Timeline:
         new._finals.add(arrays["final.time"], arrays["final"])
         return new
 
-    def _known(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
+    def _convert_event(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
         """Convert an event to numbers."""
         sizes, name = self._fleet.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
@@ -338,9 +338,9 @@ class Timeline:
             self._finals.add(np.array([row.key[0] for row in read]), self._outputs([row.slot for row in read]))
         self._fleet.forget(results)
 
-    def _judged(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+    def _arrange_judgements(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Arrange the outputs of a row by node and filter, with what each filter made of what arrived there."""
-        estimates = self._named(outputs)
+        estimates = self._arrange_outputs(outputs)
         for place in self._lanes.places:
             estimate, judged = estimates[place.node][place.filter], place.judgement or place.tested
             if judged is not None:
@@ -352,7 +352,7 @@ class Timeline:
                 )
         return estimates
 
-    def _named(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+    def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Arrange outputs by node and filter."""
         estimates = self._lanes.step_rows.outputs.tree(outputs)
         mean = by_name(self.network, estimates, lambda estimate: np.asarray(estimate.mean), -3)

@@ -42,8 +42,8 @@ def differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         believed: what the filter was made for.
         own: plant, sensor, channel and trigger of the place where it stands.
     """
-    order, own = believed.order, _as_enlarged(believed, own)
-    parts = [] if _at_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
+    order, own = believed.order, _enlarge_own(believed, own)
+    parts = [] if _test_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:
         agree = same(believed.relays, own.relays) and _same_gains(believed, own)
         return (*parts, *([] if agree else [RELAYS]))
@@ -53,17 +53,17 @@ def differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         return (*parts, SENSOR)
     if not _same_trigger(believed.trigger, own.trigger):
         parts.append(TRIGGER)
-    sensors = _at_all_steps(_same_sensor, believed.sensor, own.sensor, order)
+    sensors = _test_all_steps(_same_sensor, believed.sensor, own.sensor, order)
     channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
     if sensors and channels:
         return tuple(parts)
     observations = (believed.sensor, believed.channel), (own.sensor, own.channel)
-    if _at_all_steps(_same_observation, *observations, order):
+    if _test_all_steps(_same_observation, *observations, order):
         return tuple(parts)
     return tuple(parts + [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree])
 
 
-def _as_enlarged(believed: Premise, own: Premise) -> Premise:
+def _enlarge_own(believed: Premise, own: Premise) -> Premise:
     """The world with its past signals as states, where the filter was made for these: of them it tells the first."""
     if own.sensor is None or own.channel is None or not first(own.channel).past:
         return own
@@ -94,7 +94,7 @@ def part_of(premise: Premise, rows: Sequence[int]) -> Premise:
     return premise.replaced(channel=at_each_step(lambda channel: Series([channel, chosen]), premise.channel))
 
 
-def _at_all_steps(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
+def _test_all_steps(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
     """Test whether two models agree at each step; one that does not vary is the same at all of them."""
     if same(a, b):
         return True
@@ -204,7 +204,7 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
         return True
     if first(a).remembers or first(b).remembers:
         return False
-    return _at_all_steps(lambda x, y, o: _same_map(x, y, o, loses), a, b, order)
+    return _test_all_steps(lambda x, y, o: _same_map(x, y, o, loses), a, b, order)
 
 
 def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None, loses: bool) -> bool:
@@ -277,7 +277,7 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
     """
     if is_bounded(a) != is_bounded(b):
         return False
-    believed, own = (_given_arrivals(channel) for channel in (a, b))
+    believed, own = (_take_moments_by_arrival(channel) for channel in (a, b))
     whole = [moments for there, moments in believed if there.all()]
     return bool(whole and own) and all(_agree(whole[0], moments, there) for there, moments in [*believed, *own])
 
@@ -285,7 +285,7 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
 Moments = tuple[np.ndarray, np.ndarray]  # E[(G, n)] (m, p + 1) and the tensor of E[z z' | y] (m, m, p + 1, p + 1)
 
 
-def _given_arrivals(channel: AbstractRandomAffine) -> list[tuple[np.ndarray, Moments]]:
+def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.ndarray, Moments]]:
     """Return the moments of what arrives, for each set of components that may, and in each mode on which losses depend.
 
     Raises:
@@ -322,13 +322,13 @@ def _same_observation(
     """Test whether what is received of the state agrees, though sensors and channels are written in other ways."""
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False
-    maps = [whole for observation in (a, b) if (whole := _of_state(*observation)) is not None]
+    maps = [whole for observation in (a, b) if (whole := _compose_with_sensor(*observation)) is not None]
     if len(maps) < 2 or is_bounded(a) != is_bounded(b):
         return False
     return _same_map(without_names(maps[0]), without_names(maps[1]), order, True)
 
 
-def _of_state(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
+def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
     """Return the map from the state to what is received, of a linear sensor without angles."""
     matrix = matrix_of(sensor)
     if matrix is None or sensor.angles or channel.past:

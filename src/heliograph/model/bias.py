@@ -70,7 +70,7 @@ def with_bias(
             else [f"bias{i}" for i in range(seen.shape[1])]
         )
         bias = _gauss_markov(plant, named, bias, time, dt)
-    return driven_by(plant, bias, entering), _biased(sensor, seen, n)
+    return driven_by(plant, bias, entering), _bias_sensor(sensor, seen, n)
 
 
 def _gauss_markov(
@@ -78,8 +78,10 @@ def _gauss_markov(
 ) -> LinearPlant:
     """Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2."""
     count = len(names)
-    sizes = [scalar("deviation of a bias", x, 0.0) for x in _of_each("deviation of a bias", deviation, count)]
-    rates = [_rate(x) for x in _of_each("time of a bias", time, count)]
+    sizes = [
+        scalar("deviation of a bias", x, 0.0) for x in _spread_over_biases("deviation of a bias", deviation, count)
+    ]
+    rates = [_rate(x) for x in _spread_over_biases("time of a bias", time, count)]
     size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (sizes, rates))
     # With a step that is a number, or as functions of the input that says it.
     xp = library(size, rate)
@@ -172,7 +174,7 @@ class Biased(Module):
         return self.sensor.measure(x[: self.states]) + jnp.asarray(self.loading) @ x[self.states :]
 
 
-def _biased(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
+def _bias_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
     """The sensor of [x; b]."""
     if not isinstance(sensor, LinearSensor):
         return Sensor(Biased(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
@@ -180,7 +182,7 @@ def _biased(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearS
     return LinearSensor(stacked, sensor.noise, sensor.outputs, sensor.circular)
 
 
-def _of_each(name: str, value: ArrayLike, count: int) -> list[Any]:
+def _spread_over_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
     """Values of the biases, from one or from as many."""
     given: Any = value
     values = list(given) if rank(name, value) else [given] * count

@@ -40,11 +40,11 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
         ValueError: a reference of another length than what is sent; a channel that is late or erases: put
             `centred` inside, as in `delayed(centred(link, r), d)` and `erasure(centred(link, r), p)`.
     """
-    less_reference: Channel = at_each_step(_centred, channel, reference)
+    less_reference: Channel = at_each_step(_centre, channel, reference)
     return less_reference
 
 
-def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
+def _centre(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
     (channel,) = as_maps("channel less a reference", [channel])
     if channel.past or channel.erases:
         what = "late" if channel.past else "one that erases"

@@ -322,7 +322,7 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
         return ()
     match channel:
         case GainAndNoise():
-            return _through(channel, sent)
+            return _trace_angles(channel, sent)
         case Series():
             for affine in channel.maps:
                 sent = carried(affine, sent)
@@ -348,26 +348,26 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             results = {carried(affine, sent) for affine in channel.maps}
             if len(results) == 1:
                 return results.pop()
-    raise _refused(type(channel).__name__)
+    raise _refuse(type(channel).__name__)
 
 
-def _through(channel: GainAndNoise, sent: Angles) -> Angles:
+def _trace_angles(channel: GainAndNoise, sent: Angles) -> Angles:
     matrix = channel.matrix
     if is_traced(matrix):
-        raise _refused("a gain that is traced")
+        raise _refuse("a gain that is traced")
     of_angles = np.asarray(matrix)[:, list(sent)]
     touched = np.flatnonzero(np.any(of_angles != 0, axis=1))
     if not touched.size:
         return ()
     if not isinstance(channel.law, Constant) or is_traced(channel.law.value):
-        raise _refused(f"a gain that is {type(channel.law).__name__}")
+        raise _refuse(f"a gain that is {type(channel.law).__name__}")
     rows = float(channel.law.value) * np.asarray(matrix)[touched]
     whole = np.abs(rows - np.round(rows)) <= ROUNDING
     if not np.all(whole & (np.round(rows) >= 0)) or np.any(np.round(rows).sum(axis=1) != 1):
-        raise _refused(f"the gains {rows[rows != 0].tolist()}")
+        raise _refuse(f"the gains {rows[rows != 0].tolist()}")
     return tuple(int(i) for i in touched)
 
 
-def _refused(got: str) -> ValueError:
+def _refuse(got: str) -> ValueError:
     expected = "gain 1 on circular outputs (behind any other, send sine and cosine, which are no angles)"
     return fail("channel", expected, got)

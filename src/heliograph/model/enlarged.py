@@ -40,13 +40,13 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     """
     check_linear("plant and sensor behind a random delay", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states), late=True)
-    moved: AnyPlant = at_each_step(partial(_with_line, past=first(channel).past), plant, sensor)
+    moved: AnyPlant = at_each_step(partial(_append_line, past=first(channel).past), plant, sensor)
     n, total = len(first(plant).states), len(first(moved).states)
     everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
     return moved, everything, on_delay_line(channel)
 
 
-def _with_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
+def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     """Return x+ = A x + B u + w, y+ = C x+ + v as one plant whose line of past outputs is shifted by one."""
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant behind a random delay", "a covariance or a noise law", "a function of the inputs")

@@ -27,7 +27,7 @@ def function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, " inpu
     """
     given = f", u = {u.tolist()}" if len(u) else ""
     with jax.enable_x64(True):
-        for x in _tried(before):
+        for x in _iterate_trials(before):
             states = [x]
             for plant in (at(part, step) for part in plants_in(filter)):
                 if _takes(plant, x, u):
@@ -36,13 +36,13 @@ def function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, " inpu
                         return f"transition(x, u) returned {states[-1].tolist()} for x = {x.tolist()}{given}"
             for sensor in (at(part, step) for part in parts_in(filter, AbstractSensor)):
                 for state in states:
-                    y = _measured(sensor, state)
+                    y = _measure(sensor, state)
                     if not np.isfinite(y).all():
                         return f"measure(x) of the sensor returned {y.tolist()} for x = {state.tolist()}"
     return ""
 
 
-def _tried(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
+def _iterate_trials(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
     """Yield the mean, and the states one deviation from it."""
     mean = np.asarray(before.mean)
     variances = np.diag(np.asarray(before.covariance))
@@ -56,7 +56,7 @@ def _takes(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
     return len(plant.states) == len(x) and len(plant.inputs) == len(u)
 
 
-def _measured(sensor: AbstractSensor, x: np.ndarray) -> np.ndarray:
+def _measure(sensor: AbstractSensor, x: np.ndarray) -> np.ndarray:
     """Return h(x); zeros where the sensor takes another state."""
     try:
         return np.asarray(sensor.measure(jnp.asarray(x)))

@@ -125,17 +125,17 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
 
 def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
     for name, function in _functions(first(plant)).items():
-        values = np.concatenate(list(_in_parts(plant, function, u, step)))
+        values = np.concatenate(list(_evaluate_in_parts(plant, function, u, step)))
         wrong = covariances_wrong(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
             given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
             where = f"row {row + 1}" if len(u) > 1 else f"step {step}"
-            came = f"{_shortened(values[row])} in {where}, for {given}"
+            came = f"{_shorten(values[row])} in {where}, for {given}"
             raise fail(name, "a covariance" if name == NOISE else "finite numbers", came)
 
 
-def _in_parts(
+def _evaluate_in_parts(
     plant: AnyPlant, function: MatrixOfInputs, u: Float[np.ndarray, "steps inputs"], step: int
 ) -> Iterator[Float[np.ndarray, "steps n m"]]:
     """Yield what a function returns, some steps at a time."""
@@ -147,7 +147,7 @@ def _in_parts(
             )
 
 
-def _shortened(value: np.ndarray) -> str:
+def _shorten(value: np.ndarray) -> str:
     shown = str(np.round(value, 12).tolist())
     return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
 

@@ -28,7 +28,7 @@ class OverTime(Module):
     values: PyTree
 
     def __init__(self, values: object):
-        self.values = jax.tree.map(_as_array, values)
+        self.values = jax.tree.map(_convert_leaf, values)
         steps = {leaf.shape[0] if leaf.ndim else None for leaf in _arrays(self.values)}
         if len(steps) != 1 or None in steps:
             raise fail("OverTime", "arrays that share one leading time axis", f"lengths {sorted(map(str, steps))}")
@@ -39,7 +39,7 @@ class OverTime(Module):
         return int(_arrays(self.values)[0].shape[0])
 
 
-def _as_array(leaf: object) -> object:
+def _convert_leaf(leaf: object) -> object:
     return np.asarray(leaf, dtype=np.float64) if isinstance(leaf, int | float | list) else leaf
 
 

@@ -87,7 +87,7 @@ class Sensor(AbstractSensor):
         outputs: Names | None = None,
         circular: Sequence[str] = (),
     ):
-        self.function = _of_state(measure)
+        self.function = _take_state_alone(measure)
         _refuse_function("sensor noise", noise)
         dimension = (components(noise) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", noise, dimension)
@@ -142,7 +142,7 @@ class LinearSensor(AbstractSensor):
             raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
 
 
-def _of_state(measure: object) -> Callable[[jax.Array], ArrayLike]:
+def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
     """Return a function of the state alone, refused where it needs anything else."""
     checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
     try:
@@ -188,7 +188,7 @@ def without_output_names(model: T) -> T:
 
     Models that differ in these names alone are then of one structure, and one program is for all of them.
     """
-    unnamed: T = jax.tree.map(_unnamed, model, is_leaf=_is_sensor)
+    unnamed: T = jax.tree.map(_drop_names, model, is_leaf=_is_sensor)
     return unnamed
 
 
@@ -196,11 +196,11 @@ def _is_sensor(model: object) -> bool:
     return isinstance(model, AbstractSensor)
 
 
-def _unnamed(model: Any) -> Any:
+def _drop_names(model: Any) -> Any:
     if not _is_sensor(model) or "outputs" not in vars(model):
         return model
     parts, tree = jax.tree.flatten(model, is_leaf=lambda part: part is not model and _is_sensor(part))
-    bare = jax.tree.unflatten(tree, [_unnamed(part) for part in parts])
+    bare = jax.tree.unflatten(tree, [_drop_names(part) for part in parts])
     object.__setattr__(bare, "outputs", names("sensor outputs", None, len(model.outputs), "y"))
     object.__setattr__(bare, "circular", tuple(f"y{i}" for i in model.angles))
     return bare

@@ -42,15 +42,17 @@ OPTIONS: Options = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passe
 
 def quickly_compiled(function: Callable[P, R], donate: Donated = "none") -> Callable[P, R]:
     """Compile a function as `equinox.filter_jit` does, with options that halve the time it takes."""
-    return _compiled(function, understood, donate)
+    return _compile_at_call(function, understood, donate)
 
 
 def fully_optimised(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a small function that runs millions of steps, at the compiler's last level."""
-    return _compiled(function, lambda: {name: value for name, value in understood().items() if name != LEVEL})
+    return _compile_at_call(function, lambda: {name: value for name, value in understood().items() if name != LEVEL})
 
 
-def _compiled(function: Callable[P, R], options: Callable[[], Options], donate: Donated = "none") -> Callable[P, R]:
+def _compile_at_call(
+    function: Callable[P, R], options: Callable[[], Options], donate: Donated = "none"
+) -> Callable[P, R]:
     """The compiler is asked for its options at the first call, not where a function is defined."""
 
     @cache
@@ -107,7 +109,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
-        if _traced((args, kwargs)):
+        if _is_traced((args, kwargs)):
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
@@ -127,7 +129,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if _traced((args, kwargs)):
+        if _is_traced((args, kwargs)):
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
@@ -137,7 +139,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-def _traced(tree: PyTree) -> bool:
+def _is_traced(tree: PyTree) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 

@@ -124,16 +124,16 @@ def line(value: object, depth: int) -> str:
         return _array(value)
     # Containers, item by item.
     if isinstance(value, Mapping) and not _ours(value):
-        return _joined(
+        return _join_some(
             "{", value.items(), len(value), depth, lambda pair: f"{pair[0]!r}: {line(pair[1], depth - 1)}", "}"
         )
     if isinstance(value, tuple | list) and not _ours(value):
         marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
-        return _joined(marks[0], value, len(value), depth, lambda entry: line(entry, depth - 1), marks[1])
+        return _join_some(marks[0], value, len(value), depth, lambda entry: line(entry, depth - 1), marks[1])
     # Objects with fields.
     if _ours(value) or is_dataclass(value):
         name, parts = type(value).__name__, list(islice(_parts(value), LARGE))
-        return _joined(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
+        return _join_some(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
     if isinstance(value, partial):
         return line(value.func, depth)
     if callable(value):
@@ -160,16 +160,16 @@ def _array(value: np.ndarray | np.generic | jax.Array) -> str:
     if isinstance(value, jax.core.Tracer) or value.size > FEW or value.dtype.kind not in "fiub":
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     numbers = np.asarray(value).tolist()
-    return repr(numbers) if value.dtype.kind != "f" else _rounded(numbers)
+    return repr(numbers) if value.dtype.kind != "f" else _round_numbers(numbers)
 
 
-def _rounded(numbers: object) -> str:
+def _round_numbers(numbers: object) -> str:
     if isinstance(numbers, list):
-        return f"[{', '.join(map(_rounded, numbers))}]"
+        return f"[{', '.join(map(_round_numbers, numbers))}]"
     return f"{numbers:.4g}"
 
 
-def _joined(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
+def _join_some(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
     if count and depth <= 0:
         return f"{start}…{end}"
     more = [f"… {count - SOME} more"] if count > SOME else []

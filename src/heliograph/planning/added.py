@@ -181,9 +181,11 @@ def closed_form(links: Links, total: float, caps: Vector) -> Vector | None:
         return None
 
     def at(nu: float) -> Vector:
-        return np.asarray(np.sign(b) * _capped(np.abs(b), diagonal + nu * links.unit, links.floor - nu * total, caps))
+        return np.asarray(
+            np.sign(b) * _cap_amplitudes(np.abs(b), diagonal + nu * links.unit, links.floor - nu * total, caps)
+        )
 
-    best: np.ndarray = np.sign(b) * _capped(np.abs(b), diagonal, links.floor, caps)
+    best: np.ndarray = np.sign(b) * _cap_amplitudes(np.abs(b), diagonal, links.floor, caps)
     if best**2 @ links.unit <= total:
         return best
     low, high = 0.0, links.floor / total
@@ -193,7 +195,7 @@ def closed_form(links: Links, total: float, caps: Vector) -> Vector | None:
     return at(high)
 
 
-def _capped(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
+def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
     """a_i = min(theta b_i / D_i, cap_i) at the theta at which theta b' a = a' D a + N."""
     ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
 

@@ -41,8 +41,8 @@ class Budget(Module):
         peak: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
     ):
         self.total = None if total is None else float(scalar("total power", total, 0.0))
-        self.per_transmitter = _checked("power per transmitter", per_transmitter)
-        self.peak = _checked("peak power", peak)
+        self.per_transmitter = _check_limit("power per transmitter", per_transmitter)
+        self.peak = _check_limit("peak power", peak)
         if self.total is None and self.per_transmitter is None and self.peak is None:
             raise fail("budget", "a total, a limit per transmitter or a peak", "none")
 
@@ -58,7 +58,7 @@ def as_budget(value: object) -> Budget:
     return Budget(number)
 
 
-def _checked(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
+def _check_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
     if value is None:
         return None
     if isinstance(value, Mapping):
@@ -139,7 +139,7 @@ def power_limits(
     Raises:
         ValueError: limits for transmitters that there are not, powers of the others above the budget.
     """
-    mean_limit, peak = (_by_name(name, getattr(budget, name), names) for name in ("per_transmitter", "peak"))
+    mean_limit, peak = (_list_by_name(name, getattr(budget, name), names) for name in ("per_transmitter", "peak"))
     fixed = np.where(free, 0.0, powers)
     mean, total = fixed.mean(axis=0), np.inf if budget.total is None else budget.total
     needs = [(f"power of {name!r}", *pair) for name, *pair in zip(names, mean, mean_limit, strict=True)]
@@ -151,7 +151,7 @@ def power_limits(
     return PowerLimits(np.tile(peak[free], (len(powers), 1)), mean_limit[free], max(total - mean.sum(), 0.0))
 
 
-def _by_name(what: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
+def _list_by_name(what: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)
     unknown = sorted(set(limit) - set(names))

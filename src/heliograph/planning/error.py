@@ -109,7 +109,7 @@ class Criterion(NamedTuple):
 
     def smooth(self, p: Matrices) -> tuple[float, Matrices]:
         """Number at these covariances, smoothed where it is an eigenvalue, and its derivative by each P."""
-        values, weights = self._by_step(p)
+        values, weights = self._differentiate_steps(p)
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
     def exact(self, p: Matrices) -> float:
@@ -123,7 +123,7 @@ class Criterion(NamedTuple):
         """Linear function <V, P> that touches the number at p and is a lower bound of it everywhere."""
         if self.sharpness is None:
             return self
-        weights, root = self._by_step(p)[1], np.linalg.pinv(_root(self.weight))
+        weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_root(self.weight))
         size = np.trace(root @ weights @ root, axis1=1, axis2=2)
         return self._replace(weight=weights / size[:, None, None], sharpness=None)
 
@@ -131,7 +131,7 @@ class Criterion(NamedTuple):
         """Criteria from the smoothest to this one."""
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 
-    def _by_step(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
+    def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
         """f and its derivative at each step."""
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight

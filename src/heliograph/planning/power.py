@@ -95,7 +95,7 @@ def power(
     start = first(network.plant)
     rate = spectral_radius(np.asarray(start.matrix)) ** 2 if isinstance(start, LinearPlant) else float("nan")
     if network.relays is not None:
-        sent = _of_relays(network, horizon)
+        sent = _compute_relay_powers(network, horizon)
         return SentPower(sent, {name: np.zeros_like(power) for name, power in sent.items()}, rate)
     sources = _sources(network)
     covered = steps_covered((network.plant, sources))
@@ -114,7 +114,7 @@ def power(
     elif horizon is None:
         raise fail("power", "a horizon, since plant or sensor is not linear", "none")
     else:
-        y = _drawn(network.plant, sources, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
+        y = _draw_moments(network.plant, sources, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
     for name, filter in _feedback_filters(network).items():
         y[name], rate = _innovation_moments(filter, u, horizon), float("nan")
     # What the hops make of it.
@@ -163,7 +163,7 @@ def _innovation_moments(filter: FedBackFilter, inputs: Float[np.ndarray, "steps 
     return np.array([moments])
 
 
-def _of_relays(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
+def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
     """Powers of relays that filter: exact for schedules made as if a relay's estimate were everybody's."""
     relays = network.relays
     assert relays is not None
@@ -187,17 +187,17 @@ def _of_relays(network: Network, horizon: int | None) -> dict[str, Float[np.ndar
     return {SENSOR: sensor, **given_design(relays, gains).power}
 
 
-def _drawn(
+def _draw_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], runs: int, seed: int
 ) -> dict[str, Moments]:
     """E (y, 1)(y, 1)' of each sensor over each batch of drawn trajectories."""
     keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
     sensors = {name: sensor for name, (sensor, _) in sources.items()}
-    return {name: np.asarray(y) for name, y in _drawn_moments(plant, sensors, jnp.asarray(inputs), keys).items()}
+    return {name: np.asarray(y) for name, y in _average_draws(plant, sensors, jnp.asarray(inputs), keys).items()}
 
 
 @compiled
-def _drawn_moments(
+def _average_draws(
     plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, keys: jax.Array
 ) -> dict[str, jax.Array]:
     def run(key: jax.Array) -> dict[str, jax.Array]:

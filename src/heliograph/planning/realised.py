@@ -48,27 +48,27 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     plant = instance("network", network, Network, "a Network").plant
     instance("error", error, Error, "an Error")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    powers = _checked(powers, nodes, error.steps)
+    powers = _check_powers(powers, nodes, error.steps)
     # Channels with these powers, step by step.
     seconds = [steady_moment(plant)] * error.period if error.horizon is None else moments_over(plant, error.horizon)
     steps = [
         {
             name: allocate(
-                at(node.channel, k), measurement_moment(node.sensor, second, k), _of_node(name, powers, k), k
+                at(node.channel, k), measurement_moment(node.sensor, second, k), _select_node(name, powers, k), k
             )
             for name, node in nodes.items()
         }
         for k, second in enumerate(seconds)
     ]
-    channels = {name: _over_time([step[name] for step in steps]) for name in nodes}
+    channels = {name: _make_over_time([step[name] for step in steps]) for name in nodes}
     designed = {name: with_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
     if len(nodes) > 1:
         # All sensors and channels as one node, for the filter of all that is received.
         sensors = {name: node.sensor for name, node in nodes.items()}
         covered = min((sensor.steps for sensor in sensors.values() if isinstance(sensor, OverTime)), default=1)
-        joint = _over_time([joint_sensor({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
-        fused = {BEST: linear_filter(plant, joint, _over_time([parallel(list(step.values())) for step in steps]))}
+        joint = _make_over_time([joint_sensor({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
+        fused = {BEST: linear_filter(plant, joint, _make_over_time([parallel(list(step.values())) for step in steps]))}
     realised = Network(plant, designed, fused)
     return repeated(realised) if error.period > 1 else realised
 
@@ -86,7 +86,7 @@ def repeated(network: Network) -> Network:
     return covered
 
 
-def _checked(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
+def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
     """Powers by transmitter, of all steps."""
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
     given = table("powers of a network", powers, "powers")
@@ -106,11 +106,11 @@ def with_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     return Node(node.sensor, channel, filters, invalid=node.limits.invalid)
 
 
-def _of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
+def _select_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
     start = f"{name}."
     return {key.removeprefix(start): float(power[k]) for key, power in powers.items() if key.startswith(start)}
 
 
-def _over_time(steps: Sequence[T]) -> T | OverTime:
+def _make_over_time(steps: Sequence[T]) -> T | OverTime:
     """A single object for ever, or an object for each step."""
     return steps[0] if len(steps) == 1 else over_time(steps)

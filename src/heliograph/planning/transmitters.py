@@ -92,15 +92,15 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
         case Series():
             visited, position = _visit_chain(inside, visit, position)
         case Stack():
-            visited = [_visit(affine, visit, at)[0] for affine, at in _numbered(inside, position, "part")]
+            visited = [_visit(affine, visit, at)[0] for affine, at in _number_maps(inside, position, "part")]
         case Superposed():
-            places = _numbered(inside, position, "link")
+            places = _number_maps(inside, position, "link")
             parts = zip(places, channel.places, strict=True)
             visited = [_visit(affine, visit, _taking(at, chosen))[0] for (affine, at), chosen in parts]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
             several = isinstance(channel, Mixture) and sum(not is_silent(affine) for affine in inside) > 1
-            choices = _numbered(inside, position, "choice") if several else [(affine, position) for affine in inside]
+            choices = _number_maps(inside, position, "choice") if several else [(affine, position) for affine in inside]
             pairs = [_visit(affine, visit, at) for affine, at in choices]
             visited = [affine for affine, _ in pairs]
             position = position if several else max((at for _, at in pairs), key=lambda at: at.hops)
@@ -119,7 +119,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
     return with_inner_maps(channel, visited), position
 
 
-def _numbered(
+def _number_maps(
     maps: Sequence[AbstractRandomAffine], position: Position, word: str
 ) -> list[tuple[AbstractRandomAffine, Position]]:
     """Maps side by side, each with its position: names begin with the word and the map's number."""
@@ -259,10 +259,10 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
         for name, power in powers.items():
             total[name] += weight * power
             occurs[name] += weight
-    return {name: _over(total[name], occurs[name]) for name in total}
+    return {name: _divide_by_probability(total[name], occurs[name]) for name in total}
 
 
-def _over(total: Scalar, probability: Scalar) -> Scalar:
+def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:
     """Conditional mean; zero where the condition never holds."""
     if is_traced(probability):
         quotient: Scalar = total / library(probability).where(probability == 0, 1.0, probability)

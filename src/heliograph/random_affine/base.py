@@ -38,7 +38,7 @@ class AbstractRandomAffine(Module):
         """Let a map's `moments` return the matrix alone."""
         super().__init_subclass__(**options)
         if (written := cls.__dict__.get("moments")) is not None:
-            type.__setattr__(cls, "moments", _with_sizes(written))
+            type.__setattr__(cls, "moments", _check_sizes(written))
 
     @property
     def outputs(self) -> int:
@@ -138,7 +138,7 @@ class AbstractRandomAffine(Module):
         return generator.normal(size=self.inputs)
 
 
-def _with_sizes(written: Callable[[Any, int], object]) -> Callable[[Any, int], Moments]:
+def _check_sizes(written: Callable[[Any, int], object]) -> Callable[[Any, int], Moments]:
     """Return a map's `moments` that gives a matrix its sizes, and refuses one of another shape."""
 
     @wraps(written)

@@ -209,7 +209,7 @@ class Series(AbstractCombination):
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and multiply."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
-        then = _after if self.erases else jnp.matmul
+        then = _compose_draws if self.erases else jnp.matmul
         return state, reduce(lambda h, matrix: then(matrix, h), drawn)
 
     @cached
@@ -235,7 +235,7 @@ def maps_in_series(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     return [m for affine in channel.maps for m in maps_in_series(affine)] if isinstance(channel, Series) else [channel]
 
 
-def _after(second: jax.Array, first: jax.Array) -> jax.Array:
+def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
     """The product of two drawn maps, where NaN rows of the first are lost: what has no gain on them is not."""
     lost = jnp.isnan(first).any(axis=1)
     reached = jnp.any((second != 0) & lost, axis=1) | jnp.isnan(second).any(axis=1)

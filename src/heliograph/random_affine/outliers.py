@@ -193,7 +193,7 @@ def branches(noise: AbstractNoise) -> Branches:
     """Branches of each component: those of the law, 25 of Student's, one of any other law, with its two moments."""
     match noise:
         case Independent():
-            return _stacked([branches(component) for component in noise.parts])
+            return _stack_branches([branches(component) for component in noise.parts])
         case Contaminated():
             xp, n = library(noise.shares), noise.dimension
             shares = xp.broadcast_to(_log(noise.shares), (n, len(noise.shares)))
@@ -305,7 +305,7 @@ def _log(value: Vector) -> Vector:
     return logarithm
 
 
-def _stacked(parts: list[Branches]) -> Branches:
+def _stack_branches(parts: list[Branches]) -> Branches:
     """Components of several laws one above the other, as many branches each as the one with most has."""
     xp, most = library(parts), max(law.mean.shape[1] for law in parts)
     fills = (-np.inf, 0.0, 1.0)

@@ -128,14 +128,14 @@ class Superposed(AbstractCombination):
         """E[z^a | y] by halves."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix[None] for m in self.maps]
-        return Moments(self._added(parts, order)[0], self.outputs, self.inputs, order)
+        return Moments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
 
     @cached
     def corner_moments(self, order: int) -> Corners:
         """The same with every combination of the maps' corners."""
-        return self._added([m.corner_moments(order) for m in self.maps], order)
+        return self._add_moments([m.corner_moments(order) for m in self.maps], order)
 
-    def _added(self, parts: Sequence[Corners], order: int) -> Corners:
+    def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
         """E[Sym^order] of the sum from those of the parts, each (corners, rows, columns)."""
         columns = count(self.inputs + 1, order)
         refuse_if_too_large(count(self.outputs + 1, order), columns, f"moments of order {order}")
@@ -165,14 +165,14 @@ def _terms(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers
     where = [ordered.index(i) for i in places] + [len(places)]  # of each variable of the map, and of 1
     by_degree = [ones]
     for degree in range(1, order + 1):
-        rows, columns = _of_degree(outputs, degree, order), times_one(len(places) + 1, degree, order)
+        rows, columns = _find_degree(outputs, degree, order), times_one(len(places) + 1, degree, order)
         target = np.argsort(place(np.array(where)[factors(len(places) + 1, degree)], len(places) + 1))
         by_degree.append(matrix[:, rows[:, None], columns[target]])
     return _Powers(ordered, by_degree)
 
 
 @cached_arrays
-def _of_degree(outputs: int, degree: int, order: int) -> np.ndarray:
+def _find_degree(outputs: int, degree: int, order: int) -> np.ndarray:
     """Positions at `order` of the monomials of z alone of this degree, times powers of 1."""
     alone = factors(outputs, degree)
     return place(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
@@ -233,7 +233,7 @@ def _whole(powers: _Powers, outputs: int, inputs: int, order: int) -> Corners:
     xp = library(powers.by_degree)
     matrix: Corners = xp.zeros((corners, count(outputs + 1, order), count(inputs + 1, order)))
     for degree, polynomials in enumerate(powers.by_degree):
-        rows = _of_degree(outputs, degree, order)
+        rows = _find_degree(outputs, degree, order)
         chosen = np.pad(names[factors(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
         columns = place(chosen, inputs + 1)
         if xp is np:

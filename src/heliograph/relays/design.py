@@ -142,7 +142,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     steps = network.steps(len(design.moments) - 1)
     rows, constants = expected_maps(steps)
     # Moments of (eta+ before correction, innovation): predicted and innovation covariances.
-    n, before = len(network.states), np.asarray(_before_correction(steps, design.moments[:-1]))
+    n, before = len(network.states), np.asarray(_predict_covariances(steps, design.moments[:-1]))
     d = design.moments.shape[-1]
     ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
     schedules = {}
@@ -174,7 +174,7 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
 
 
 @compiled
-def _before_correction(steps: Steps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
+def _predict_covariances(steps: Steps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
     """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
     return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
 

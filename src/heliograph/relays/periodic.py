@@ -325,7 +325,7 @@ def _units(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Flo
     )
 
 
-def _penalised(
+def _penalise(
     traces: Float[jax.Array, "slots"],
     sound: Bool[jax.Array, ""],
     power: Float[jax.Array, "slots"],
@@ -348,7 +348,7 @@ def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         def inner(x: jax.Array) -> tuple[jax.Array, jax.Array]:
             trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
-            return _penalised(trace, sound, power, limit, multipliers), power
+            return _penalise(trace, sound, power, limit, multipliers), power
 
         (cost, power), gradient = jax.value_and_grad(inner, has_aux=True)(x)
         return cost, gradient, power

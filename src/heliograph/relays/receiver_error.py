@@ -103,9 +103,9 @@ def best_within(
     for barrier in BARRIERS / len(local_gains):
         gains = results[-1]
         units = np.asarray(_units(problem, gains, barrier))
-        function = partial(_descended, problem, gains, units, barrier)
+        function = partial(_evaluate_barrier, problem, gains, units, barrier)
         x = bfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION, MEMORY)
-        results.append(np.asarray(_moved(gains, units, x.reshape(units.shape[:2]), problem.steps)))
+        results.append(np.asarray(_change_gains(gains, units, x.reshape(units.shape[:2]), problem.steps)))
     judged = [_judge(problem, gains) for gains in results]
     costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
     best = int(np.argmin(costs))
@@ -142,7 +142,7 @@ def _judge(problem: Limited, gains: Float[Array, "time Fn R"]) -> tuple[Float[Ar
 
 
 @compiled
-def _moved(
+def _change_gains(
     gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: Steps
 ) -> Float[Array, "time Fn R"]:
     """Gains changed by x in given units."""
@@ -157,7 +157,7 @@ def _barrier(
     """Cost and barrier at gains moved by x, infinite outside, and its gradient."""
 
     def value(x: jax.Array) -> jax.Array:
-        cost, slack = _judge(problem, _moved(gains, units, x, problem.steps))
+        cost, slack = _judge(problem, _change_gains(gains, units, x, problem.steps))
         inside = jnp.all(slack > 0)
         logarithms = jnp.log(jnp.where(inside, slack, 1.0))
         return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
@@ -166,7 +166,7 @@ def _barrier(
     return value_and_slope
 
 
-def _descended(
+def _evaluate_barrier(
     problem: Limited, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
     """`_barrier` of all variables in one vector."""

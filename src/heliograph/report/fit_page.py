@@ -141,7 +141,7 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
             Section("At a glance", _glance(learned)),
             Section("What was learned", _table(learned, drawings)),
             Section("What to keep in mind", _words(learned)),
-            *_before_and_after(learned, drawings),
+            *_compare_fits(learned, drawings),
             *_losses(learned),
             *_delays(learned),
             Section("Use it", [Code("heliograph run DIR/fitted_network.py --measurements data.csv --report report"),
@@ -217,7 +217,7 @@ def _words(learned: Learned) -> list[Points | Text]:
     return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]
 
 
-def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
+def _compare_fits(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
     if not learned.changes:
         return []
     # One row for each filter: gain of the log-likelihood, size and correlation of its innovations.

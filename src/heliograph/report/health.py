@@ -97,7 +97,7 @@ class Health:
 
     def _doubts(self, health: FilterHealth) -> Iterator[str]:
         """Say which claims innovations contradict: the size of each output's, of all together, and their memory."""
-        yield from self._left_out(health)
+        yield from self._describe_left_out(health)
         if health.test is None:
             return
         test, name = health.test, f"{health.node}/{health.filter}"
@@ -124,7 +124,7 @@ class Health:
                 "large the errors are"
             )
 
-    def _left_out(self, health: FilterHealth) -> Iterator[str]:
+    def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
         """Say of which outputs a filter that weighs left out more than half: of outliers it would be less."""
         for output in self.outputs:
             summary, mine = output.judged.summary, (output.node, output.filter) == (health.node, health.filter)
@@ -148,13 +148,13 @@ def _departure(size: float, error: float, level: float) -> int:
     return int(np.sign(np.log(size))) if abs(np.log(size)) > sure else 0
 
 
-def _of(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
+def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
     """Name the outputs, or none where all are meant, and their sizes."""
     return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
 
 
 def _too_sure(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    of, times = _of(outputs, sizes)
+    of, times = _name_outputs(outputs, sizes)
     return (
         f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
         "something out"
@@ -163,7 +163,7 @@ def _too_sure(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
 
 def _too_large(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
     """A filter that follows a slow error of its sensor has small innovations and large errors."""
-    of, times = _of(outputs, sizes)
+    of, times = _name_outputs(outputs, sizes)
     return (
         f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
         "Either noises are stated too large, or the sensor's error changes slowly and the filter follows it: then its "
@@ -212,7 +212,7 @@ def arrivals_of(network: Network, times: np.ndarray, received: Mapping[str, np.n
     links = []
     for node, z in received.items():
         receiver = network.nodes[node]
-        declared, may_be_lost, shares = None, not receiver.complete, _stated_shares(receiver)
+        declared, may_be_lost, shares = None, not receiver.complete, _state_shares(receiver)
         if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
             declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
         for i, name in enumerate(receiver.received_names):
@@ -242,7 +242,7 @@ def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     return memory_of(came, lags, claimed=True)
 
 
-def _stated_shares(receiver: Node | ReceivingNode) -> Float[np.ndarray, " received"] | None:
+def _state_shares(receiver: Node | ReceivingNode) -> Float[np.ndarray, " received"] | None:
     """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
     sends_always = isinstance(receiver, Node) and (receiver.trigger is None or isinstance(receiver.trigger, Periodic))
     if not isinstance(receiver, Node) or not sends_always or isinstance(receiver.channel, OverTime):

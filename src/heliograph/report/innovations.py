@@ -25,7 +25,7 @@ LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "con
 
 def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
     """Return the filters in each figure of innovations: one of all, or one of each node where there are many."""
-    tested = _fused_first(filter for filter in health.filters if filter.white is not None)
+    tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
         return {"innovations": tested} if tested else {}
     nodes: dict[str, list[FilterHealth]] = {}
@@ -95,7 +95,7 @@ def _tests_table(health: Health) -> Table:
     """Return size, correlation and p-value of each filter's innovations, a row each, the fused ones first."""
     # One row for each filter.
     rows = []
-    for judged in _fused_first(health.filters):
+    for judged in _sort_fused_first(health.filters):
         numbers = ["–", "–", "–"]
         if (test := judged.test) is not None:
             numbers = [
@@ -114,7 +114,7 @@ def _tests_table(health: Health) -> Table:
     return Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
 
 
-def _fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
+def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
     return sorted(filters, key=lambda judged: judged.node != FUSED)
 
 

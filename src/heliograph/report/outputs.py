@@ -125,7 +125,7 @@ class Listener(NamedTuple):
 
 def listeners(network: Network, record: Record) -> Iterator[Listener]:
     """Yield every filter with its measurements: those of the nodes, then central ones."""
-    received, relied_on = record.measurements, _relied_on(network)
+    received, relied_on = record.measurements, _find_relied_on(network)
     for node, z in received.items():
         filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
@@ -138,7 +138,7 @@ def listeners(network: Network, record: Record) -> Iterator[Listener]:
             yield Listener(FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
 
 
-def _relied_on(network: Network) -> dict[str, set[str]]:
+def _find_relied_on(network: Network) -> dict[str, set[str]]:
     """Return the filters that the network relies on, by node: fused ones, else the first of the strongest claim.
 
     Others, such as one that takes the mean of a random gain for it, are there to be compared with.

@@ -66,7 +66,9 @@ def _overview(examined: Mapping[str, Health], network: str, folders: Mapping[str
         rows.append([visible(plant) or "(no name)", f"{len(examined[plant].record.time):,}", said or "nothing"])
     wrong = sum(map(bool, doubts.values()))
     title = (
-        f"{_counted(len(examined), 'plant')}, {wrong} with doubts" if wrong else f"{len(examined)} plants, no doubts"
+        f"{_count_in_words(len(examined), 'plant')}, {wrong} with doubts"
+        if wrong
+        else f"{len(examined)} plants, no doubts"
     )
     links = [f"{quote(folders[plant])}/report.html" for plant in worst]
     lead = f"The filters of `{visible(network)}` ran over each plant by itself. The most doubted come first."
@@ -78,10 +80,10 @@ def run_figures(health: Health) -> dict[str, Figure]:
     """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links."""
     drawn: dict[str, Figure] = {}
     if coordinates_of(health.record.states) is not None:
-        for kind, record in _estimated(health):
+        for kind, record in _collect_estimates(health):
             node = _nodes(record)[0]
             drawn[_map_of(kind)] = map_figure(record, node, list(record.estimates[node])[: len(COLOURS)])
-    for kind, record in _estimated(health):
+    for kind, record in _collect_estimates(health):
         drawn |= {f"{kind}_{i}": _estimates(health, record, node) for i, node in enumerate(_nodes(record))}
     drawn |= {name: innovations_figure(health, tested) for name, tested in tested_by_figure(health).items()}
     if health.links:
@@ -94,7 +96,7 @@ def _map_of(kind: str) -> str:
     return "map" if kind == "estimates" else f"map_{kind}"
 
 
-def _estimated(health: Health) -> list[tuple[str, Record]]:
+def _collect_estimates(health: Health) -> list[tuple[str, Record]]:
     """Return the filtered estimates, and the smoothed ones if there are any, by kind."""
     later = health.record.smoothed
     return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
@@ -102,10 +104,10 @@ def _estimated(health: Health) -> list[tuple[str, Record]]:
 
 def _nodes(record: Record) -> list[str]:
     """Return the nodes that are drawn, the fused estimate first."""
-    return _ordered(record)[:MOST]
+    return _sort_nodes(record)[:MOST]
 
 
-def _ordered(record: Record) -> list[str]:
+def _sort_nodes(record: Record) -> list[str]:
     return sorted((node for node, filters in record.estimates.items() if filters), key=lambda node: node != FUSED)
 
 
@@ -145,7 +147,9 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     # Three numbers to remember.
     keys = [
         KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
-        KeyFigure("arrived", arrived, f"of what {_counted(len(record.measurements), 'node')} should receive", GREEN),
+        KeyFigure(
+            "arrived", arrived, f"of what {_count_in_words(len(record.measurements), 'node')} should receive", GREEN
+        ),
         KeyFigure("doubts", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
     # The result is the title; doubts follow it.
@@ -155,7 +159,10 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_span(record.time)}. "
         + _agreement(health, doubts),
         sections=[
-            Section("At a glance", [KeyFigures(keys), *_warned(doubts), *_compared(health), *_believed(health)]),
+            Section(
+                "At a glance",
+                [KeyFigures(keys), *_show_doubts(doubts), *_show_compared(health), *_show_premises(health)],
+            ),
             Section("Estimates", [*errors_table(record), *_pictures(health, drawings)]),
             innovations_section(health, drawings),
             Section("Links", _health(health, drawings)),
@@ -196,7 +203,7 @@ def _finding(health: Health) -> str:
 def _pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | Choice | Text]:
     """Return the map of a position if there is one, the estimates by node, then the smoothed ones if there are any."""
     pictures: list[Picture | Choice | Text] = []
-    for kind, record in _estimated(health):
+    for kind, record in _collect_estimates(health):
         added = ", given later data too" if kind == "smoothed" else ""
         if (name := _map_of(kind)) in drawings:
             text = f"The path that {visible(_nodes(record)[0])} estimates{added}"
@@ -209,7 +216,7 @@ def _pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | C
         })  # fmt: skip
         absent = [node for i, node in enumerate(_nodes(record)) if f"{kind}_{i}" not in drawings]
         pictures += not_drawn(absent, f"Their figures are files beside this page ({kind}_0.svg and on).")
-        pictures += not_drawn(_ordered(record)[MOST:], "Their estimates are in the record.")
+        pictures += not_drawn(_sort_nodes(record)[MOST:], "Their estimates are in the record.")
     return pictures
 
 
@@ -229,25 +236,25 @@ def errors_table(record: Record) -> list[Table]:
     headers = [
         "filter",
         "claim",
-        *(visible(f"RMSE of {_headed(state, record.units)}") for state in record.states),
+        *(visible(f"RMSE of {_make_header(state, record.units)}") for state in record.states),
         "NEES",
     ]
     return [Table(headers, rows, caption)] if rows else []
 
 
-def _headed(state: str, units: Mapping[str, str]) -> str:
+def _make_header(state: str, units: Mapping[str, str]) -> str:
     return f"{state} ({units[state]})" if state in units else state
 
 
 def _agreement(health: Health, doubts: list[str]) -> str:
     if doubts:
-        return f"There {'is' if len(doubts) == 1 else 'are'} {_counted(len(doubts), 'doubt')} about the network."
+        return f"There {'is' if len(doubts) == 1 else 'are'} {_count_in_words(len(doubts), 'doubt')} about the network."
     tested = any(tested_filter.test is not None for tested_filter in health.filters)
     tests = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
     return f"Nothing is lost that the network says cannot be lost, and {tests}."
 
 
-def _counted(count: int, what: str) -> str:
+def _count_in_words(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
@@ -257,22 +264,22 @@ def _span(time: np.ndarray) -> str:
     return f"from {time[0]:g} to {time[-1]:g}"
 
 
-def _warned(doubts: list[str]) -> list[Points | Text]:
+def _show_doubts(doubts: list[str]) -> list[Points | Text]:
     """Return the doubts that matter most, and where the others are."""
     if not doubts:
         return [Text(["No doubts."])]
-    more = f"{_counted(len(doubts) - DOUBTS, 'further doubt')} of less weight: `warnings` in `summary.json`."
+    more = f"{_count_in_words(len(doubts) - DOUBTS, 'further doubt')} of less weight: `warnings` in `summary.json`."
     return [Points([visible(line) for line in doubts[:DOUBTS]]), *([Text([more])] if len(doubts) > DOUBTS else [])]
 
 
-def _compared(health: Health) -> list[Text | Points]:
+def _show_compared(health: Health) -> list[Text | Points]:
     """Return what the recording says of filters that are there to be compared with; it is no doubt of the network."""
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []
 
 
-def _believed(health: Health) -> list[Text | Points]:
+def _show_premises(health: Health) -> list[Text | Points]:
     """Return the filters that were made for another world than that of their node."""
     text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []

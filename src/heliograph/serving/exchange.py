@@ -40,30 +40,30 @@ class Exchange:
         """Return the messages that the events taken since the last finalisation make due, after their steps."""
         if self._node is None:
             return []
-        return [output for plant in plants for row in self._due(plant) for output in self._sent(plant, row)]
+        return [output for plant in plants for row in self._due(plant) for output in self._send_row(plant, row)]
 
     def _due(self, plant: Plant) -> list[HeldRow]:
         """Return rows that are whole now and were not before: measured, or with a row after them."""
         assert self._node is not None
         before: dict[int, bool] = {}  # of each row with changes whether it was measured; of new ones none
         for row, old in plant.changes:
-            before.setdefault(id(row), old is not None and self._measured(old[1]))
+            before.setdefault(id(row), old is not None and self._has_measurement(old[1]))
         new = {id(row) for row, old in plant.changes if old is None}
         held, due = plant.rows.held, []
         for i, row in enumerate(held[1:], 1):
             after = held[i + 1] if i + 1 < len(held) else None
             followed = after is not None and id(after) not in new and id(row) not in new
-            sent = followed or before.get(id(row), self._measured(row.events))
-            if (self._measured(row.events) or after is not None) and not sent:
+            sent = followed or before.get(id(row), self._has_measurement(row.events))
+            if (self._has_measurement(row.events) or after is not None) and not sent:
                 due.append(row)
         return due
 
-    def _measured(self, events: Iterable[tuple[int, int, float]]) -> bool:
+    def _has_measurement(self, events: Iterable[tuple[int, int, float]]) -> bool:
         """Test whether a row has the node's measurement, or anything where the node has no sensor."""
         assert self._node is not None
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
-    def _sent(self, plant: Plant, row: HeldRow) -> list[Output]:
+    def _send_row(self, plant: Plant, row: HeldRow) -> list[Output]:
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])

@@ -44,8 +44,8 @@ class Tallies(Collector):
         yield from _links(self.watch)
         yield from _nis(self.watch)
         yield from _outputs(self.watch)
-        yield from _by_plant(self.watch)
-        yield _fused(self.watch)
+        yield from _yield_plant_metrics(self.watch)
+        yield _count_doubted_fused(self.watch)
         yield _dead(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
         malformed = sum(service.malformed for service in self.watch.services)
@@ -61,7 +61,7 @@ class Tallies(Collector):
         return self._last
 
 
-def _by_plant(watch: Watch) -> Iterable[Metric]:
+def _yield_plant_metrics(watch: Watch) -> Iterable[Metric]:
     """Yield the tests of each plant where there are few, else of the worst, and how many plants are wrong."""
     worst, labels = watch.worst(), ["plant", "node", "filter"]
     wrong = GaugeMetricFamily("heliograph_plants_wrong", "Plants with something wrong.", labels=["what"])
@@ -104,7 +104,7 @@ def _dead(watch: Watch) -> Metric:
     return dead
 
 
-def _fused(watch: Watch) -> Metric:
+def _count_doubted_fused(watch: Watch) -> Metric:
     what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
     doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
     for row in watch.fused_rows(watch.nis):

@@ -154,7 +154,7 @@ class Service:
         # If another process has committed one of the plants, read it again and repeat.
         while True:
             try:
-                outputs, committed = self._taken(messages, payloads)
+                outputs, committed = self._take_messages(messages, payloads)
                 break
             except ConflictError:
                 self._load(names)
@@ -198,7 +198,9 @@ class Service:
         self.fleet.forget(finalised)
         return self._commit({}, entries, 0)
 
-    def _taken(self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
+    def _take_messages(
+        self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]
+    ) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
         entries, malformed, known = list[Entry](), 0, 0
         outcomes = self._using.use(messages, self._damage, datetime.now(UTC))
@@ -217,7 +219,7 @@ class Service:
             if isinstance(message, str) or verdict is None:
                 malformed += 1
                 said = why if isinstance(payload, str) else f"{why}: {shown(payload)}"
-                entries.append(_refused(None, {}, "malformed", said))
+                entries.append(_write_refusal(None, {}, "malformed", said))
                 continue
             # Used but for some of it, known already, or refused with the reason.
             if verdict != "used":
@@ -298,7 +300,7 @@ class Service:
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             parts = {"node": name, "sequence": sequence, "time": self._moment(plant, time)}
-            yield _refused(plant.name, parts, "future", LEAPT)
+            yield _write_refusal(plant.name, parts, "future", LEAPT)
 
     def _provisional(self, rows: Sequence[tuple[Plant, HeldRow]]) -> list[Output]:
         """Return the provisional estimates after these rows, and what the senders' silence means."""
@@ -326,9 +328,9 @@ class Service:
 def _refusal(message: AnyMessage, why: str, detail: str) -> Entry:
     moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
     parts = {"node": message.node, "sequence": message.sequence, "time": moment}
-    return _refused(message.plant, parts, why, detail)
+    return _write_refusal(message.plant, parts, why, detail)
 
 
-def _refused(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
+def _write_refusal(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
     results = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
     return Entry(plant or "", "refused", line(results | parts | {"reason": why, "detail": detail}))

@@ -116,10 +116,10 @@ class Using:
             return None, "implausible", why, ()
         given = message.arrival is not None
         if plant is None:
-            plant = self._begun(
+            plant = self._begin(
                 message.plant, at, origin, beginning(*((arrival, ARRIVAL) if given else (at, message.node)))
             )
-        plant = self._remembered(plant, at)
+        plant = self._remember(plant, at)
         # Inputs and measurement are used or refused independently.
         notes: list[str] = []
         if inputs is not None and spoilt is None:
@@ -136,7 +136,7 @@ class Using:
             notes.append(f"{beyond}; the rest is used")
         return plant, verdict, why, notes
 
-    def _remembered(self, plant: Plant, begun: float) -> Plant:
+    def _remember(self, plant: Plant, begun: float) -> Plant:
         """Return the plant, and store once in a batch what it was before; a new one joins the others."""
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
@@ -173,7 +173,7 @@ class Using:
                 return None
         return plant
 
-    def _begun(self, name: str, at: float, origin: datetime | None, leap: Leap) -> Plant:
+    def _begin(self, name: str, at: float, origin: datetime | None, leap: Leap) -> Plant:
         """Begin a plant, whose first moment is not sure yet; one that begins anew is withdrawn."""
         plant, old = self.fleet.begin(name, at, origin), self.plants.pop(name, None)
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)

@@ -163,7 +163,7 @@ class Watch:
             self.committed.observe(last.committed)
             self.lag.observe(last.lag)
         plants = {output.plant for output in outputs}
-        for name, plant in self._named(plants):
+        for name, plant in self._iterate_plants(plants):
             self.totals.add(name, plant.links)
         for name in plants:
             self._overview.touch(name)
@@ -207,7 +207,7 @@ class Watch:
         for service in self.services:
             yield from service.plants.items()
 
-    def _named(self, names: Collection[str]) -> Iterator[tuple[str, Plant]]:
+    def _iterate_plants(self, names: Collection[str]) -> Iterator[tuple[str, Plant]]:
         """Yield the plants of these names."""
         for service in self.services:
             yield from ((name, service.plants[name]) for name in names if name in service.plants)
@@ -217,15 +217,15 @@ class Watch:
 
         Also of plants that have left the memory.
         """
-        return self._as_counted(self.totals.as_table())
+        return self._hide_uncounted(self.totals.as_table())
 
-    def _as_counted(self, links: Mapping[str, dict[str, int]]) -> dict[str, dict[str, int | None]]:
+    def _hide_uncounted(self, links: Mapping[str, dict[str, int]]) -> dict[str, dict[str, int | None]]:
         return {node: tally | ({"lost": None} if node in self.uncounted else {}) for node, tally in links.items()}
 
     def worst(self) -> list[Wrong]:
         """Return the plants with something wrong, the worst first."""
         refused = dict[str, str]()
-        for name, plant in self._named(self._overview.touched):
+        for name, plant in self._iterate_plants(self._overview.touched):
             refused[name] = "; ".join(f"{node}: {count:,} {verdict}" for node, link in plant.links.items()
                                       for verdict in REFUSED if (count := getattr(link, verdict)))  # fmt: skip
         return self._overview.worst(self._tests, self._dead, refused)
@@ -268,7 +268,7 @@ class Watch:
                 "since": since,
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
-                "links": self._as_counted(_added(results)),
+                "links": self._hide_uncounted(_add_counts(results)),
                 "senders": senders,
                 "tests": [_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
                 "outputs": [output_row(output) for output in health],
@@ -304,7 +304,7 @@ class Watch:
             if sender["dead"]:
                 chance = f"by chance once in {1 / sender['chance']:,.0f}" if sender["chance"] else "never by chance"
                 yield f"{node}: its sender is dead: {sender['missed']} heartbeats did not come, {chance}"
-        links = _added(plants)
+        links = _add_counts(plants)
         for name, words in COUNTED.items():
             of = sorted(node for node in links if links[node][name])
             # A line for each node, or one for many.
@@ -362,7 +362,7 @@ def _root(variance: float | None) -> float | None:
     return None if variance is None else math.sqrt(max(variance, 0.0))
 
 
-def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int]]:
+def _add_counts(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int]]:
     """Sum the counts of several plants, by node."""
     results: dict[str, dict[str, int]] = {}
     for plant in plants:

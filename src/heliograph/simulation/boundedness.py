@@ -94,15 +94,15 @@ def certify_boundedness(network: Network) -> Boundedness:
     # Rows of known gain on all of x, or on the modes that do not decay.
     growing = _unstable(a)
     for space in (np.eye(len(a)), growing):
-        known = _known_losses(a, q, links, space)
+        known = _group_losses(a, q, links, space)
         gains = find_gains(known.system)
         radius = certified_radius(known.system, gains)
         if radius < BELOW_ONE:
             bound = known.system.bound(gains).sum(axis=0) if known.exact else None
-            return Boundedness("certified", _certified(a, radius), radius, 0.0, known.gains(gains), bound)
+            return Boundedness("certified", _describe_certificate(a, radius), radius, 0.0, known.gains(gains), bound)
     # Not certified: is there an unstable mode that losses hide?
     unseen = fastest_unseen(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
-    verdict, reason = _refused(network, links, growing, known, unseen, radius)
+    verdict, reason = _judge_unseen(network, links, growing, known, unseen, radius)
     return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
 
 
@@ -166,7 +166,7 @@ class KnownLosses(NamedTuple):
         return {kind: k @ outcome.combine for kind, k, outcome in zip(self.kinds, gains, self.parts, strict=True)}
 
 
-def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> KnownLosses:
+def _group_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> KnownLosses:
     """Group the outcomes by set of losses, each with the sums of what arrives whose gain on a subspace of x is known.
 
     Modes that look the same to the receiver are one kind: a gain that differs between them is unknown.
@@ -237,13 +237,13 @@ def _certain(alike: Sequence[Outcome], links: Links, space: Float[np.ndarray, "n
     return Certain(combine, combine @ rows, mean, whole and same, random)
 
 
-def _certified(a: Float[np.ndarray, "n n"], radius: float) -> str:
+def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
     if spectral_radius(a) < BELOW_ONE:
         return f"the plant is stable, and fixed gains leave the error a spectral radius of {radius:.6g}"
     return f"fixed gains leave the mean square of the error a spectral radius of {radius:.6g}"
 
 
-def _refused(
+def _judge_unseen(
     network: Network, links: Links, growing: np.ndarray, channel: KnownLosses, unseen: Unseen, radius: float
 ) -> tuple[Verdict, str]:
     """Return "impossible" if an unobserved eigenvector grows and noise keeps exciting it, else "undecided"."""
@@ -251,7 +251,7 @@ def _refused(
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
     reason = _why(links, channel.system, unseen)
-    if not _excited(network, growing, channel, unseen):
+    if not _is_excited(network, growing, channel, unseen):
         return "undecided", f"{reason}; but noise does not reach all that grows, so that it may stay zero"
     return "impossible", reason
 
@@ -268,7 +268,7 @@ def _why(links: Links, system: KnownLossSystem, unseen: Unseen) -> str:
     return f"{mode} is not seen at all"
 
 
-def _excited(network: Network, growing: np.ndarray, channel: KnownLosses, unseen: Unseen) -> bool:
+def _is_excited(network: Network, growing: np.ndarray, channel: KnownLosses, unseen: Unseen) -> bool:
     """Test whether P stays above eps v v': noise enters along v at once, or reaches it and every measurement has noise.
 
     The noise of random gains grows only where noise reaches all that is unstable.

@@ -76,7 +76,7 @@ def nodes_standing(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     for name, node in network.nodes.items():
         if node.filters:
             own = premise_at(network, name)
-            results[name] = _with_filters(node, {f: standing_in(own, filter) for f, filter in node.filters.items()})
+            results[name] = _replace_filters(node, {f: standing_in(own, filter) for f, filter in node.filters.items()})
     return results
 
 
@@ -84,7 +84,7 @@ def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | R
     """Return the nodes with filters whose arrays are as large as those of the others."""
     every = [filter for node in nodes.values() for filter in node.filters.values()]
     return {
-        name: _with_filters(node, {f: filter.as_large_as(every) for f, filter in node.filters.items()})
+        name: _replace_filters(node, {f: filter.as_large_as(every) for f, filter in node.filters.items()})
         for name, node in nodes.items()
     }
 
@@ -100,7 +100,7 @@ def fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
 def nominal_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     """Return the nodes with filters that claim "nominal" at most."""
     return {
-        name: _with_filters(node, {label: nominal(filter) for label, filter in node.filters.items()})
+        name: _replace_filters(node, {label: nominal(filter) for label, filter in node.filters.items()})
         for name, node in network.nodes.items()
     }
 
@@ -110,7 +110,7 @@ def nominal_fused(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
     return {name: nominal(f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
 
 
-def _with_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
+def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
     """Return the node with other filters of the same names; itself where they are its own."""
     if all(filters[name] is node.filters[name] for name in filters):
         return node
@@ -159,13 +159,13 @@ def beliefs(network: HasNodes) -> Iterator[Belief]:
     """
     for name in network.names:
         if filters := network.nodes[name].filters:
-            yield from _of_place(name, premise_at(network, name), filters)
+            yield from _collect_beliefs(name, premise_at(network, name), filters)
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     if central:
-        yield from _of_place(FUSED, premise_of_all(network), central)
+        yield from _collect_beliefs(FUSED, premise_of_all(network), central)
 
 
-def _of_place(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[Belief]:
+def _collect_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[Belief]:
     for label, filter in filters.items():
         says = filter.premise is not None or filter.kept.lowered
         if filter.claim != "none" and says and (parts := parts_apart(own, filter)):

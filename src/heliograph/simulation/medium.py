@@ -319,7 +319,7 @@ def medium_of(network: Network) -> AbstractMedium:
             continue
         # Sensor, channel, and where their draws and memories stand.
         sensors = [without_output_names(nodes[name].sensor) for name in names]
-        channels = [_unnamed(nodes[name].channel, memories[name]) for name in names]
+        channels = [_drop_names(nodes[name].channel, memories[name]) for name in names]
         stacked = stack(list(zip(sensors, channels, strict=True)))
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         memory_rows = np.stack([memories[name] for name in names])
@@ -337,5 +337,5 @@ def medium_of(network: Network) -> AbstractMedium:
     return SeparateChannels(tuple(groups))
 
 
-def _unnamed(channel: Channel, places: np.ndarray) -> Channel:
+def _drop_names(channel: Channel, places: np.ndarray) -> Channel:
     return without_names(channel) if len(places) else channel

@@ -136,13 +136,13 @@ class Network(Module):
         self.nodes = nodes_alike(nodes_standing(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
-        self.groups = _grouped(
+        self.groups = _group_by_structure(
             (name, without_output_names((_world(n), n.filters, meshes[name]))) for name, n in self.nodes.items()
         )
         self.kinds = tuple(
             Kind(g, alike)
             for g, names in enumerate(self.groups)
-            for alike in _grouped(self.nodes[names[0]].filters.items())
+            for alike in _group_by_structure(self.nodes[names[0]].filters.items())
         )
         self.mesh_kinds = tuple(
             Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
@@ -179,7 +179,7 @@ class Network(Module):
         for name, fusion in self.fused.items():
             if isinstance(fusion, Fusion):
                 fusion.check(self.nodes_with(fusion.filter), len(self.states))
-                self._fused_claim(fusion)
+                self._claim_of_fusion(fusion)
             else:
                 check_type(f"fused {name!r}", fusion, AbstractFilter)
                 check_received(f"fused {name!r}", fusion, sum(node.received for node in self.nodes.values()))
@@ -323,7 +323,7 @@ class Network(Module):
             claims[FUSED] = {
                 name: lowered_claim(claim) if isinstance(fusion, Fusion) and (by_data or self.single) else claim
                 for name, fusion in self.fused.items()
-                for claim in (self._fused_claim(fusion),)
+                for claim in (self._claim_of_fusion(fusion),)
             }
         return claims
 
@@ -334,7 +334,7 @@ class Network(Module):
             object.__setattr__(lowered, field, value)
         return lowered
 
-    def _fused_claim(self, fusion: Fusion | AbstractFilter) -> Claim:
+    def _claim_of_fusion(self, fusion: Fusion | AbstractFilter) -> Claim:
         if isinstance(fusion, AbstractFilter):
             return fusion.claim
         names = self.nodes_with(fusion.filter)
@@ -389,7 +389,7 @@ def _places_of(groups: Sequence[Sequence[str]], kinds: Sequence[Kind]) -> dict[t
     }
 
 
-def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
+def _group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
     """Group names by the structure of their items, in order of first appearance."""
     results: dict[object, list[str]] = {}
     for name, described in items:

@@ -318,12 +318,12 @@ def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
         return
     # Angles among all that arrives, in the order of the nodes.
     names = [f"{node}.{part}" for node in network.names for part in network.nodes[node].received_names]
-    expected, got = ([names[i] for i in places] for places in (_received_angles(network), used.received))
+    expected, got = ([names[i] for i in places] for places in (_find_received_angles(network), used.received))
     if expected != got:
         raise fail(name, f"a filter that receives the nodes' angles, {expected}", got)
 
 
-def _received_angles(network: HasNodes) -> Angles:
+def _find_received_angles(network: HasNodes) -> Angles:
     if network.common is not None:
         return received_angles(network.plant, network.common.sensor, network.common.channel)
     places, start = [], 0

@@ -120,7 +120,7 @@ def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> tuple[dict[
 
 
 def _reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
-    return {k: said for k in _flagged(votes, "reason") if (said := why_values(votes[k]))}
+    return {k: said for k in _find_flagged(votes, "reason") if (said := why_values(votes[k]))}
 
 
 def doubts(
@@ -151,7 +151,7 @@ def doubts(
     # Inputs, judged by all filters.
     if network.inputs:
         votes = Judges(network).of_all(outputs)
-        rows = [k for k in _flagged(votes, "input") if why_inputs(votes[k])]
+        rows = [k for k in _find_flagged(votes, "input") if why_inputs(votes[k])]
         lines += [f"inputs: {_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines
 
@@ -180,7 +180,7 @@ class _Faults:
         return f"; {fault}" if fault else ""
 
 
-def _flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
+def _find_flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
     """Return the rows that some filter flags."""
     if not votes.size:
         return []

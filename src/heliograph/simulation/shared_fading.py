@@ -100,13 +100,13 @@ def deliver(
     now, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
     if now.past:
         line = jnp.concatenate([y, state.line])
-        after, h = _drawn(now, state.channel, key, k, link_key, shared)
+        after, h = _advance_memory(now, state.channel, key, k, link_key, shared)
         return Late(after, line[: -len(y)]), apply(h, line)
-    state, h = _drawn(now, state, key, k, link_key, shared)
+    state, h = _advance_memory(now, state, key, k, link_key, shared)
     return state, apply(h, y)
 
 
-def _drawn(
+def _advance_memory(
     now: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: Places
 ) -> tuple[PyTree, jax.Array]:
     if not len(shared):

@@ -128,12 +128,12 @@ def over_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree
     A single one is not vectorised: its function takes half as long to trace as the same over one axis more.
     """
     if size == 1:
-        return partial(_of_one, function)
+        return partial(_apply_to_one, function)
     over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
     return over
 
 
-def _of_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
+def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
     def only(leaf: PyTree) -> PyTree:
         return jax.lax.squeeze(leaf, (0,)) if eqx.is_array(leaf) else leaf
 

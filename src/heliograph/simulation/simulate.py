@@ -108,19 +108,19 @@ def monte_carlo(
         with out_of_memory(runs, horizon):
             by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing)
         if by_native_code is not None:
-            return _warned(by_native_code, network)
+            return _warn_of_nan(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
     job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), reducer, single)
     if one_processor():
-        check_memory(_needed(job, runs, chunk), runs, horizon)
+        check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with out_of_memory(runs, horizon):
-        recorded = _recorded(job, first_run, runs, chunk, progress)
-    return _warned(finished(reducer, recorded, network, smoothing), network)
+        recorded = _run_chunks(job, first_run, runs, chunk, progress)
+    return _warn_of_nan(finished(reducer, recorded, network, smoothing), network)
 
 
-def _warned(result: Result, network: Network) -> Result:
+def _warn_of_nan(result: Result, network: Network) -> Result:
     """Return a result, with a warning where a record holds what is no number."""
     if isinstance(result, Record):
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
@@ -163,7 +163,7 @@ class _Job(Module):
     single: bool = eqx.field(static=True)
 
 
-def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
+def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
     """Sums over all runs, and what is collected of them, chunk by chunk."""
     with jax.enable_x64(True):
         lanes = Lanes(
@@ -238,7 +238,7 @@ def _outputs(job: _Job, runs: jax.Array) -> PyTree:
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)
 
 
-def _needed(job: _Job, runs: int, chunk: int) -> Needed:
+def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
     """Memory of a simulation by XLA on a processor, from its shapes.
 
     Sums stand once in each lane; a lane in flight also has those after its block, and rows of batches from which they
@@ -273,7 +273,7 @@ def _single(leaf: PyTree) -> PyTree:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
-def _simulated(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
+def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
     return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
@@ -284,7 +284,7 @@ def _each_reduced(reducer: AbstractReducer[Any], later: Smoother | None, outputs
 
 
 # Traced once, for their shapes and for the program alike: tracing is half of what a first call takes.
-_trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulated, inline=True)  # type: ignore[call-overload]
+_trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulate_world, inline=True)  # type: ignore[call-overload]
 _reduced: Callable[..., OfStep] = eqx.filter_jit(_each_reduced, inline=True)  # type: ignore[call-overload]
 
 

@@ -55,7 +55,7 @@ class Smoother(Module):
         estimates = tuple(sweep(steps) for steps in steps_by_kind)
         fused = {name: self.smoothing.sweep(steps) for name, steps in outputs["central_steps"].items()}
         for fusion in self.fusions:
-            fused |= _combined(fusion, estimates)
+            fused |= _fuse_at_each_time(fusion, estimates)
         # As of the steps that are smoothed.
         length = len(jax.tree.leaves((estimates, fused))[0])
         smoothed = {
@@ -87,7 +87,7 @@ class Smoother(Module):
         return {"estimates": estimates, "fused": {name: near(e, every) for name, e in known["fused"].items()}}
 
 
-def _combined(fusion: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
+def _fuse_at_each_time(fusion: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
     """Fuse estimates (time, filter, node, ...) at each time."""
     fused: dict[str, Estimate] = jax.vmap(lambda parts: fusion.step((), parts, jnp.asarray(0))[1])(estimates)
     return fused
@@ -139,17 +139,19 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
         raise fail("smoothing", "a filter at a node or the centre", "a network without filters")
     # Claims of smoothed estimates and of their fusions.
     claims: Claims = {
-        name: {f: _smoothed_claim(filter) for f, filter in node.filters.items()}
+        name: {f: _claim_of_smoother(filter) for f, filter in node.filters.items()}
         for name, node in smoothed.nodes.items()
     }
     if smoothed.fused:
-        claims[FUSED] = {name: _fused_claim(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()}
+        claims[FUSED] = {
+            name: _claim_of_fusion(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()
+        }
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
     return Part(smoothed, smoothing, kinds, groups, claims)
 
 
-def _smoothed_claim(filter: AbstractFilter) -> Claim:
+def _claim_of_smoother(filter: AbstractFilter) -> Claim:
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
@@ -158,9 +160,9 @@ def _smoothed_claim(filter: AbstractFilter) -> Claim:
     return claim
 
 
-def _fused_claim(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
+def _claim_of_fusion(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
     if isinstance(fusion, AbstractFilter):
-        return _smoothed_claim(fusion)
+        return _claim_of_smoother(fusion)
     if isinstance(fusion.rule, AbstractInformedFusion):
         got = f"{type(fusion.rule).__name__}, which knows errors as they are before later data"
         raise fail(f"smoothing of {FUSED}/{name}", "a rule that needs no joint covariance", got)

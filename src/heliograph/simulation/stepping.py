@@ -106,9 +106,16 @@ class AllFilters(Module):
         reporting: dict[str, PyTree] = {name: link.init() for name, link in self.reporting.items()}
         reporting |= {name: mesh.init() for name, mesh in self.meshes.items()}
         tested = {name: test.start for name, test in self.tests.items()}
-        return states, central, sent, tuple(self._started(centre, states) for centre in self.centres), reporting, tested
+        return (
+            states,
+            central,
+            sent,
+            tuple(self._init_centre(centre, states) for centre in self.centres),
+            reporting,
+            tested,
+        )
 
-    def _started(
+    def _init_centre(
         self, centre: Centre | LinearisedCentre, states: Sequence[PyTree]
     ) -> CentreState | dict[str, Followed]:
         means = [states[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
@@ -164,7 +171,7 @@ class AllFilters(Module):
         }
         # Fusions of the nodes' estimates.
         estimates = tuple(single.estimate for _, single in stepped)
-        following, outputs = self._fused(
+        following, outputs = self._step_fusions(
             (filter_states, quantizer_states, centre_states, reporting), z, estimates, u, k, drawn or {}
         )
         fused = outputs["fused"] = {name: single.estimate for name, (_, single) in received.items()} | outputs["fused"]
@@ -189,7 +196,7 @@ class AllFilters(Module):
         steps = [("steps", "smoother_steps", "central_steps")]
         return steps * self.smooths + judged * self.judges
 
-    def _fused(
+    def _step_fusions(
         self,
         states: tuple[PyTree, ...],
         z: Sequence[jax.Array],
@@ -213,7 +220,7 @@ class AllFilters(Module):
             uplinks |= traffic
         # Informed centres, which propagate the joint moments of the errors.
         for centre, state in zip(self.centres, centre_states, strict=True):
-            following, outcome = self._centred(centre, state, filter_states, z, estimates, u, k)
+            following, outcome = self._step_centre(centre, state, filter_states, z, estimates, u, k)
             learned.append(following)
             fused |= outcome
         # Centres with reports over uplinks.
@@ -230,7 +237,7 @@ class AllFilters(Module):
         outputs = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
         return (tuple(after), tuple(learned), published), outputs
 
-    def _centred(
+    def _step_centre(
         self,
         centre: Centre | LinearisedCentre,
         state: PyTree,
@@ -257,36 +264,35 @@ def initial_states(filters: AllFilters) -> PyTree:
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """Precompute what does not depend on data, where all data arrive."""
     central = filters.central if all(filters.complete) else {}
-    planned = [_planned(a, u) if filters.complete[a.group] else a for a in filters.alike]
+    planned = [_plan_alike(a, u) if filters.complete[a.group] else a for a in filters.alike]
     central = {
-        name: computed(_planned_filter, _planned_by_xla, (filter, u, filters.smooths))
-        for name, filter in central.items()
+        name: computed(_plan_filter, _planned_by_xla, (filter, u, filters.smooths)) for name, filter in central.items()
     }
     changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(planned), filters.central | central))
     return cast(AllFilters, to_numpy(changed))
 
 
-def _planned(alike: StackedFilters, u: Array) -> StackedFilters:
+def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
     """Plan filters that differ in numbers alone by one program, by native code where it supports the filter."""
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):
-        choice = chosen(_planned_filter, arguments, (True, False, False))
+        choice = chosen(_plan_filter, arguments, (True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
     planned = of_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
     return replace(alike, filters=planned)
 
 
-def _planned_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
+def _plan_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
     return planned_with_past(filter, u) if smooths else filter.planned(u)
 
 
-_planned_by_xla = quickly_compiled(_planned_filter)
+_planned_by_xla = quickly_compiled(_plan_filter)
 
 
 @quickly_compiled
 def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
-    return over_all(lambda filter: _planned_filter(filter, u, smooths), count)(filters)
+    return over_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
 
 
 def plans(filters: AllFilters) -> bool:
@@ -337,7 +343,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     names = network.nodes_with(fusion.filter)
     alone = Network(
         network.plant,
-        {single: _with_only(network.nodes[single], fusion.filter) for single in network.names},
+        {single: _keep_one_filter(network.nodes[single], fusion.filter) for single in network.names},
         {"all": Fusion(fusion.filter, AllReports())},
         network.relays,
         network.common,
@@ -355,7 +361,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     )
 
 
-def _with_only(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
+def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
     """Return a node with one of its filters."""
     filters = {single: filter for single, filter in node.filters.items() if single == name}
     if isinstance(node, Node):

@@ -46,10 +46,10 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     if not len(y):
         raise fail("signal", "at least one step", "none")
     check_horizon(len(y), steps_covered(channel))
-    return np.asarray(computed(_transmitted, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
+    return np.asarray(computed(_transmit, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
 
 
-def _transmitted(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
+def _transmit(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
@@ -64,7 +64,7 @@ def _transmitted(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> j
     return received
 
 
-_by_xla = quickly_compiled(_transmitted)
+_by_xla = quickly_compiled(_transmit)
 
 
 def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
@@ -90,7 +90,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     # Node by node; a value of step k - delay arrives at step k.
     for name, z in record.measurements.items():
         values = z if z.ndim == 2 else z[check_count("run", run, 0)]
-        values, late = _timed(name, network.nodes[name], values)
+        values, late = _separate_delays(name, network.nodes[name], values)
         there = ~np.isnan(values).all(axis=1) & ~np.isnan(late)
         for k in np.flatnonzero(there):
             sent = int(k - late[k])
@@ -99,7 +99,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     return sorted(results, key=lambda event: event[-1])
 
 
-def _timed(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _separate_delays(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values (steps, m), and the delay of each (steps,)."""
     channel = node.channel if isinstance(node, Node) else None
     link = at(channel, 0) if isinstance(channel, OverTime) else channel

@@ -106,7 +106,7 @@ def planned_smoother(
     instance("smoothing", smoothing, AbstractSmoothing, "one such as FixedInterval()")
     smoothing.check(check_horizon(horizon))
     u = array("inputs", np.zeros((horizon, 0)) if inputs is None else inputs, (horizon, len(filter.inputs)))
-    planned = _planned(filter, u)
+    planned = _plan(filter, u)
     if planned is None:
         raise fail("filter", "one whose gains depend on no data", type(filter).__name__)
     return PlannedSmoother(planned, smoothing, u, _estimate(filter, smoothing, u))
@@ -119,7 +119,7 @@ def _means(planned: PlannedSmoother, z: Array) -> jax.Array:
 
 
 @compiled
-def _planned(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
+def _plan(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
     planned = planned_with_past(filter, u)
     return None if planned is filter else planned
 

@@ -37,7 +37,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         AssertionError: a moment that differs from the samples by more than chance, shapes that disagree.
     """
     generator = np.random.default_rng(seed)
-    first, second = _drawn(channel, seed, samples)
+    first, second = _draw_twice(channel, seed, samples)
     points = [channel.example_input(generator), channel.example_input(generator)]
     # With modes: two successive draws, compared jointly.
     if channel.remembers:
@@ -83,7 +83,7 @@ def _compare_modes(
     return worst
 
 
-def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return first and second draws of H, after testing the contract of `init`, `draw` and `sample`."""
 
     def two_steps(words: jax.Array) -> PyTree:

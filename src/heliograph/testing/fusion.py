@@ -38,13 +38,13 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
         root = generator.normal(size=(count * n, count * n))
         joint = (root @ root.T).reshape(count, n, count, n)
         bounds = np.stack([joint[i, :, i] for i in range(count)])
-        alike = _fused(rule, np.ones((count, n)), np.broadcast_to(bounds[0], bounds.shape))
+        alike = _fuse_bounds(rule, np.ones((count, n)), np.broadcast_to(bounds[0], bounds.shape))
         _close("identical estimates", alike.mean, np.ones(n))
         _close("identical bounds", alike.covariance, bounds[0])
         # The mean is linear in the means, so unit means give the gain of each input.
         units = np.moveaxis(np.eye(count * n).reshape(count * n, count, n), 1, 0)
-        together = _fused(rule, units, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
-        _close("fusing inside vmap", together.mean[0], _fused(rule, units[:, 0], bounds).mean)
+        together = _fuse_bounds(rule, units, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
+        _close("fusing inside vmap", together.mean[0], _fuse_bounds(rule, units[:, 0], bounds).mean)
         gains = np.asarray(together.mean).T
         if rule.claim(["upper"] * count) == "upper":
             claimed = np.asarray(together.covariance[0])
@@ -75,7 +75,7 @@ def _worst_excess(gains: np.ndarray, bounds: np.ndarray, claimed: np.ndarray, ge
     return worst
 
 
-def _fused(rule: AbstractFusion, means: np.ndarray, bounds: np.ndarray) -> Estimate:
+def _fuse_bounds(rule: AbstractFusion, means: np.ndarray, bounds: np.ndarray) -> Estimate:
     return fuse(rule, [Estimate(m, b, "upper") for m, b in zip(means, bounds, strict=True)])
 
 

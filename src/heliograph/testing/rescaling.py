@@ -89,14 +89,14 @@ def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
             return PolynomialFilter(inner, filter.degree, filter.endless, _centre(filter.centre, units))
         case ModalFilter() | UncertainModalFilter():
             plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
-            return replace(filter, plant=plant, sensor=sensor, channel=_by_mode(filter.channel, units))
+            return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
         case SideInformationFilter(flagged=False) | MultipleModelFilter():
             plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
-            return replace(filter, plant=plant, sensor=sensor, channel=_by_mode(filter.channel, units))
+            return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
         case PredictionFilter():
             return PredictionFilter(_gaussian(rescaled(filter.base, units)))
         case SequentialFilter():
-            return replace(filter, filters=tuple(_gaussian(f) for f in _in_turn(filter, units)))
+            return replace(filter, filters=tuple(_gaussian(f) for f in _rescale_in_turn(filter, units)))
         case _:
             raise fail("filter to rescale", "one of the package's that computes covariances", type(filter).__name__)
 
@@ -106,7 +106,7 @@ def _gaussian(filter: AbstractFilter) -> GaussianFilter:
     return filter
 
 
-def _in_turn(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
+def _rescale_in_turn(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
     """Split into parts, each with its own outputs and measurements, which follow one another in `units`."""
     parts, received, said = [], 0, 0
     for single in filter.filters:
@@ -162,7 +162,7 @@ def _channel(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | Ove
 
 def rescaled_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the description of z = Q G R^-1 y + Q n."""
-    q, (_, factor) = units.received, _of_channel(units)
+    q, (_, factor) = units.received, _scale_channel(units)
 
     def scaled(quadratic: QuadraticMap) -> QuadraticMap:
         return QuadraticMap(factor * quadratic.center, factor * quadratic.radius)
@@ -173,16 +173,16 @@ def rescaled_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     return described_by(mean, spread, shift, power, nominal, channel.uncertain)
 
 
-def _of_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
+def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
     """Return factors of (G, n) and of a tensor of second moments."""
     q, r = units.received, np.append(units.outputs, 1.0)
     return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
 
 
-def _by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
+def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
     """Return the description of z = Q G R^-1 y + Q n for each mode."""
     values: Modes = channel.values if isinstance(channel, OverTime) else channel
-    of_mean, of_spread = _of_channel(units)
+    of_mean, of_spread = _scale_channel(units)
     noise = Columns(units.received[:, None] * values.noise.matrix, values.noise.weights)
     gains = of_spread * values.gain_spread
     scaled: Modes = replace(values, mean=of_mean * values.mean, gain_spread=gains, noise=noise)

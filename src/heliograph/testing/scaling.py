@@ -58,7 +58,7 @@ def check_scaling(
     """
     check_count("steps", steps)
     random = np.random.default_rng(seed)
-    world = monte_carlo(_unreceived(network), steps, 1, seed, inputs=inputs)
+    world = monte_carlo(_drop_filters(network), steps, 1, seed, inputs=inputs)
     z = {name: np.array(rows[0]) for name, rows in world.measurements.items()}
     for name, rows in z.items():
         rows[random.random(rows.shape) < MISSING] = np.nan
@@ -68,7 +68,7 @@ def check_scaling(
     plain, worst = run(network, z, u).estimates, 0.0
     for _ in range(trials):
         for common in (False, True):
-            worst = max(worst, _compared(network, z, u, plain, _drawn(network, random, common), common))
+            worst = max(worst, _compare_runs(network, z, u, plain, _draw_units(network, random, common), common))
     return worst
 
 
@@ -80,14 +80,14 @@ def _nodes(network: Network) -> dict[str, Node]:
     return results
 
 
-def _unreceived(network: Network) -> Network:
+def _drop_filters(network: Network) -> Network:
     """Return the network without its filters, except where a filter feeds back to its sensor."""
     published = {name: node.informed_by is not None for name, node in _nodes(network).items()}
     nodes = {n: node if published[n] else Node(node.sensor, node.channel, {}) for n, node in _nodes(network).items()}
     return Network(network.plant, nodes)
 
 
-def _drawn(network: Network, random: np.random.Generator, common: bool) -> dict[str, Units]:
+def _draw_units(network: Network, random: np.random.Generator, common: bool) -> dict[str, Units]:
     """Draw units of each node, and of all nodes together under the name of fusion."""
 
     def factors(count: int) -> np.ndarray:
@@ -103,7 +103,7 @@ def _drawn(network: Network, random: np.random.Generator, common: bool) -> dict[
     return units | {FUSED: Units(states, outputs, received, inputs)}
 
 
-def _compared(
+def _compare_runs(
     network: Network,
     z: dict[str, np.ndarray],
     u: np.ndarray,
@@ -112,7 +112,7 @@ def _compared(
     common: bool,
 ) -> float:
     nodes = {name: _node(name, node, units[name]) for name, node in _nodes(network).items()}
-    fused = {name: _fused(name, fusion, units[FUSED]) for name, fusion in network.fused.items()}
+    fused = {name: _rescale_fusion(name, fusion, units[FUSED]) for name, fusion in network.fused.items()}
     scaled = Network(rescaled_plant(network.plant, units[FUSED]), nodes, fused)
     shared = units[FUSED].inputs
     estimates = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
@@ -122,11 +122,13 @@ def _compared(
             searches = _searches(network, node, name)
             if common or not searches:
                 difference = _difference(estimate, estimates[node][name], units[node].states) / DIGITS
-                worst = max(worst, _judged(f"{node}/{name}", difference * (DIGITS / SEARCHED if searches else 1.0)))
+                worst = max(
+                    worst, _report_largest(f"{node}/{name}", difference * (DIGITS / SEARCHED if searches else 1.0))
+                )
     return worst
 
 
-def _judged(name: str, differences: np.ndarray) -> float:
+def _report_largest(name: str, differences: np.ndarray) -> float:
     largest = float(np.max(differences, initial=0.0))
     assert largest <= 1, f"{name}: expected the same estimate in other units, off at step {int(np.argmax(differences))}"
     return largest
@@ -153,20 +155,20 @@ def _node(name: str, node: Node, units: Units) -> Node:
     channel = first(node.channel)
     for affine in [] if channel.remembers else [outcome.map for outcome in outcomes(channel)]:
         turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
-        off = _apart(rescaled_channel(second_order(affine), units), second_order(turned))
+        off = _measure_difference(rescaled_channel(second_order(affine), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
     filters = {f: rescaled(filter, units) for f, filter in node.filters.items()}
-    return Node(rescaled_sensor(node.sensor, units), _between(node.channel, units), filters)
+    return Node(rescaled_sensor(node.sensor, units), _change_units(node.channel, units), filters)
 
 
-def _between(channel: Channel, units: Units) -> Channel:
+def _change_units(channel: Channel, units: Units) -> Channel:
     """Return the channel that maps R y to Q z, where this one maps y to z."""
     if isinstance(channel, OverTime):
-        return over_time([_between(step, units) for step in unstack(channel)])
+        return over_time([_change_units(step, units) for step in unstack(channel)])
     return Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
 
 
-def _apart(a: SecondOrder, b: SecondOrder) -> float:
+def _measure_difference(a: SecondOrder, b: SecondOrder) -> float:
     """Return the largest difference of two descriptions, relative to each entry's scale."""
     items: list[Callable[[SecondOrder], np.ndarray]] = [
         lambda d: _ends(d.spread), lambda d: _ends(d.shift), lambda d: _ends(d.power), lambda d: _ends(d.nominal)
@@ -182,7 +184,7 @@ def _ends(quadratic: QuadraticMap) -> np.ndarray:
     return np.asarray(quadratic.center + quadratic.radius)
 
 
-def _fused(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
+def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
     if isinstance(fusion, AbstractFilter):
         return rescaled(fusion, units)
     if fusion.quantizer is not None:

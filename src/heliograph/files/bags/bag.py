@@ -76,7 +76,9 @@ def read_bag(
             raise fail(str(path), "a bag with messages", "one that was cut off before its first part was whole")
         used = [topic for topic in counts if sources.of(topic)]
         if not used:
-            raise fail(f"{path}", f"a topic of the sources, {_listed(sources.topics)}", f"only {_listed(counts)}")
+            raise fail(
+                f"{path}", f"a topic of the sources, {_join_names(sources.topics)}", f"only {_join_names(counts)}"
+            )
         _check_types(path, reader, sources)
         # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
@@ -94,10 +96,10 @@ def read_bag(
     # Say which topics of either side were left out.
     rest = {topic: count for topic, count in counts.items() if topic not in used}
     if rest:
-        events.notes.append(f"{path}: not among the sources: {_counted(rest)}")
+        events.notes.append(f"{path}: not among the sources: {_join_counts(rest)}")
     missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in counts]
     if missing:
-        events.notes.append(f"{path}: not in the bag: {_listed(missing)}")
+        events.notes.append(f"{path}: not in the bag: {_join_names(missing)}")
 
 
 @contextmanager
@@ -247,7 +249,7 @@ def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
                 raise fail(
                     f"{path}, {connection.topic}",
                     f"a field {path_!r} in {connection.msgtype}",
-                    f"only {_listed(list(fields), 24)}",
+                    f"only {_join_names(list(fields), 24)}",
                 )
 
 
@@ -263,13 +265,13 @@ def _reason(error: Exception) -> str:
     return " ".join(shown_error(error).split()).rstrip(".")
 
 
-def _listed(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
+def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _counted(counts: dict[str, int]) -> str:
-    return _listed([f"{topic} ({count})" for topic, count in counts.items()])
+def _join_counts(counts: dict[str, int]) -> str:
+    return _join_names([f"{topic} ({count})" for topic, count in counts.items()])
 
 
 def is_cut(path: Path) -> bool:

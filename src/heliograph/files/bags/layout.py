@@ -79,14 +79,14 @@ class Layout:
         if node == "NAME":
             return self._message(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":
-            begin = _aligned(begin, 4)
+            begin = _align(begin, 4)
             return begin + 4 + self._length(begin)
         if node == "BASE":
             return self._numbers(begin, of[0], 1, path, [path])
         # Lists, of numbers or of anything else.
         (inner_node, inner), count = of
         if node == "SEQUENCE":
-            begin = _aligned(begin, 4)
+            begin = _align(begin, 4)
             count, begin = self._length(begin), begin + 4
         if inner_node.name == "BASE" and inner[0] in NUMBERS:
             near = any(name.startswith(f"{path}.") for name in self._paths)
@@ -99,7 +99,7 @@ class Layout:
         size = NUMBERS.get(kind)
         if size is None:
             raise LayoutError
-        begin = _aligned(begin, size) if count else begin
+        begin = _align(begin, size) if count else begin
         for i, name in enumerate(names):
             if name in self._paths:
                 self.fields[name] = begin + i * size, kind
@@ -156,14 +156,14 @@ class Decoder:
             raise LayoutError
         for (topic, _), numbers in groups.items():
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
-            for rows, columns in self._by_layout(batch[numbers[0]].connection, table):
+            for rows, columns in self._iterate_layouts(batch[numbers[0]].connection, table):
                 for source, _, places in self._sources.of(topic):
                     ((node, at),) = places.items()
                     read = _reading(np.array(numbers)[rows], columns, source, at, len(self._sources.names[node]))
                     results[node].append(read)
         return results
 
-    def _by_layout(
+    def _iterate_layouts(
         self, connection: "Connection", table: np.ndarray
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Yield the rows of messages of one topic and size that have one layout, and the wanted fields of these."""
@@ -233,6 +233,6 @@ def _column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
     return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]
 
 
-def _aligned(begin: int, size: int) -> int:
+def _align(begin: int, size: int) -> int:
     """Return the next byte from this one on that a number of a size may have."""
     return 4 + -(-(begin - 4) // size) * size

@@ -40,10 +40,10 @@ def messages_of(reader: "AnyReader", connections: "Sequence[Connection]") -> Ite
     for file in files:
         channels = {c.id: known[c.topic, c.msgtype] for c in file.connections if (c.topic, c.msgtype) in known}
         chunks = [chunk for chunk in file.chunks if any(chunk.channel_count.get(c) for c in channels)]
-        yield from _in_order(file, sorted(chunks, key=attrgetter("chunk_start_offset")), channels)
+        yield from _merge_chunks(file, sorted(chunks, key=attrgetter("chunk_start_offset")), channels)
 
 
-def _in_order(
+def _merge_chunks(
     storage: "McapReader", chunks: "Sequence[ChunkInfo]", channels: "Mapping[int, Connection]"
 ) -> Iterator[RawMessage]:
     """Yield the messages of chunks, which may overlap in time: what a later one may precede waits for it.

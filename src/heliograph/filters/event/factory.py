@@ -74,7 +74,7 @@ def event_filter(
     # Law of what arrives, for each step.
     known, lost = check_count("known", known), check_count("lost", lost, 0)
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
-    described, initial = _described(channel)
+    described, initial = _describe_channel(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
     loses = any(_loses(step) for step in steps)
@@ -101,7 +101,7 @@ def event_filter(
     return believing(filter, premise)
 
 
-def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:
+def _describe_channel(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:
     """The channel by mode and by what arrives, and the law of the modes at the first use."""
     drifting = [memory for memory in memories(first(channel)).values() if not isinstance(memory, MarkovChain)]
     if drifting:
@@ -113,7 +113,7 @@ def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray
 
 def _claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
     """ "exact" where one Gaussian is the posterior, or behind a schedule has its first two moments."""
-    steps = unstack(_described(channel)[0])
+    steps = unstack(_describe_channel(channel)[0])
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_is_known(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):

@@ -216,7 +216,7 @@ class EventFilter(AbstractSizedFilter):
         """Condition the sum on silence: nothing was sent, or it was sent and lost."""
         n, m, sender = len(self.states), self.outputs, self.senders[s]
         as_it_was, label = np.r_[0 : n + m], wide.label[:, s]
-        waiting, due = self._by_age(label, begun)
+        waiting, due = self._label_sending(label, begun)
         loss = self._loss(channel, s)[:, None, None]
         dropped, forced = (_relabel_sent(which * loss, True) for which in (waiting, due))
         if self.trigger.losses == "known":
@@ -237,7 +237,7 @@ class EventFilter(AbstractSizedFilter):
         slots, others = self._cut_to_region(unsent.some(0, self.known), unsent.some(self.known), sender)
         # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
         outside = join(self._cut_to_outside(wide.labelled(s, dropped), sender, 1.0), self._outside)
-        fresh = together([outside, join(wide.labelled(s, forced))]).keep(self._renewed(sender))
+        fresh = together([outside, join(wide.labelled(s, forced))]).keep(self._find_new_reference(sender))
         few = reduced(together([others.keep(as_it_was), fresh]), self.lost, slice(n + sender.start, n + sender.stop))
         return self._or_nothing(together([slots.keep(as_it_was), few]), wide)
 
@@ -275,14 +275,14 @@ class EventFilter(AbstractSizedFilter):
             received = arriving(sent.gaussian, link, sender, self.outputs)
             signals.append(Parts(sent.log_weight, received, jnp.zeros((1, 1))))
         # One sum again, with a new reference.
-        whole = join(together(by_mode[:count]).keep(self._renewed(sender)))
+        whole = join(together(by_mode[:count]).keep(self._find_new_reference(sender)))
         whole = whole.labelled(s, _relabel_sent(whole.label[:, s], False))
         signal = join(together(signals)).gaussian
         return self._pad_sum(whole), signal.mean[0], signal.covariance[0]
 
     def _select_sent(self, used: Parts, s: int, begun: jax.Array) -> Parts:
         """Select where the sender had to send, all Gaussians time after time: outside, or anywhere if it was due."""
-        waiting, due = self._by_age(used.label[:, s], begun)
+        waiting, due = self._label_sending(used.label[:, s], begun)
         event = used.labelled(s, waiting)
         outside = self._cut_to_outside(event, self.senders[s], 1 - RIM)
         mass = jnp.max(outside.log_weight.reshape(self._outside, -1), axis=0)
@@ -290,7 +290,7 @@ class EventFilter(AbstractSizedFilter):
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
         return together([outside, floor, used.labelled(s, due)])
 
-    def _by_age(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _label_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """A sender's label (K, M, A, C) where it sends on an event alone, and where it sends in any case."""
         heartbeat = self.trigger.heartbeat
         oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
@@ -303,7 +303,7 @@ class EventFilter(AbstractSizedFilter):
         lost = ~jnp.any(jnp.asarray(channel.present)[:, mine], axis=1)
         return jnp.asarray(channel.chance) @ lost.astype(float)
 
-    def _renewed(self, sender: slice) -> np.ndarray:
+    def _find_new_reference(self, sender: slice) -> np.ndarray:
         """Places of (x, r) with what the sender transmits as its new reference, in (x, r, y)."""
         n, m = len(self.states), self.outputs
         places: np.ndarray = np.r_[0 : n + m]

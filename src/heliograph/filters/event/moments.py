@@ -78,7 +78,7 @@ def updated(
     size = parts.gaussian.mean.shape[1]
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
-        expected, slopes, noise = _through_link(x, link.of_sender(sender, m), m)
+        expected, slopes, noise = _transform_by_link(x, link.of_sender(sender, m), m)
         after, innovations = observe(x, slopes, z - expected, noise, arrived)
         if delivers:  # y is z, to the last digit
             after = pinned(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
@@ -92,14 +92,14 @@ def arriving(x: Gaussian, link: Link, sender: slice, m: int) -> Gaussian:
     """Return the law of z = G y + n of each Gaussian of (x, r, y)."""
 
     def receive_one(x: Gaussian) -> Gaussian:
-        expected, slopes, noise = _through_link(x, link.of_sender(sender, m), m)
+        expected, slopes, noise = _transform_by_link(x, link.of_sender(sender, m), m)
         return of_columns(expected, joined(Columns(slopes, x.variances), noise))
 
     received: Gaussian = jax.vmap(receive_one)(x)
     return received
 
 
-def _through_link(x: Gaussian, link: Link, m: int) -> tuple[jax.Array, jax.Array, Columns]:
+def _transform_by_link(x: Gaussian, link: Link, m: int) -> tuple[jax.Array, jax.Array, Columns]:
     """Return E z, slopes and noise of z = G y + n, y the last m components."""
     centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
     second = Columns(rows, x.variances).covariance + outer(centre, centre)

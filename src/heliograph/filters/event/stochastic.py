@@ -123,7 +123,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         if isinstance(self.trigger, StochasticTrigger):
             # Given that it was sent, where no component of it is missing.
             link, is_complete = self._link(channel, state.law), ~jnp.any(jnp.isnan(value))
-            shift, change = self._given_sent(link, signal, state.reference, log_silent)
+            shift, change = self._change_by_sending(link, signal, state.reference, log_silent)
             complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
             log_sent = self._log_sent(link[0], signal, state.reference, *complete)
             log_came = log_came + jnp.where(is_complete, log_sent, 0.0)
@@ -161,7 +161,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         )
         return gain[:, :-1], spread
 
-    def _given_sent(
+    def _change_by_sending(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Change of the mean and covariance of a value by knowing that it was sent: larger ones are sent more often.

@@ -183,7 +183,7 @@ def _learn(
     # Variational Bayes: an update with R = b / a, then b from what is known of the noise's square.
     for _ in range(ITERATIONS):
         if law is not None:  # each branch's noise in units of the variance
-            weight, shift = branch_precision(before, e + center, variance, _scaled(law, noise / variance))
+            weight, shift = branch_precision(before, e + center, variance, _scale_law(law, noise / variance))
             residual = jnp.where(arrived, e + center - shift, 0.0)
             shown = weight
         elif rule is not None:
@@ -194,7 +194,7 @@ def _learn(
         last, noise = noise, jnp.where(received, learned / after_shape, noise)
     # The state with the last variances.
     if law is not None:
-        x = score_update(before, z, _scaled(law, last / variance)).state
+        x = score_update(before, z, _scale_law(law, last / variance)).state
     else:
         x = joint_update(before, e, received, used)
     a, b = jnp.where(received, after_shape, state[0]), jnp.where(received, noise * after_shape, state[1])
@@ -206,7 +206,7 @@ def _independent(variance: jax.Array) -> Columns:
     return Columns(np.eye(len(variance)), variance)
 
 
-def _scaled(law: Law, ratio: jax.Array) -> Law:
+def _scale_law(law: Law, ratio: jax.Array) -> Law:
     """The law with noise of other units: a variance `ratio` times as large."""
     ratio = ratio[:, None]
     return Law(law.log_share, law.mean * jnp.sqrt(ratio), law.variance * ratio, law.least * ratio)

@@ -68,7 +68,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars:
     (1 + b2) M R M'] + (1 + b1) ((1 + b1)(1 + b2) - 1) M H P H' M', positive terms; its gain is K / (1 + b1).
     """
     prior, present = signal.prior, z.present
-    slopes, of_state, of_noise = _received(signal, channel, present)
+    slopes, of_state, of_noise = _select_received(signal, channel, present)
     w = homogeneous(signal.second, signal.mean, 1.0)
     base, shift = channel.spread(w, present), channel.shift(w, present)
     # The scalars of least trace.
@@ -90,7 +90,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
     beta times what the received components explain of P, C Pyy^+ C', is added.
     """
     prior, present = signal.prior, z.present
-    slopes, of_state, _ = _received(signal, channel, present)
+    slopes, of_state, _ = _select_received(signal, channel, present)
     # E[y y'] divided: yhat yhat' is known, Cov y is not.
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
     unknown_part = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
@@ -111,7 +111,9 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
     return keep_unless(jnp.any(present), wider, after)
 
 
-def _received(signal: Signal, channel: SecondOrder, present: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _select_received(
+    signal: Signal, channel: SecondOrder, present: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return M H of what arrived, M H P H' M' and M R M'."""
     gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
     slopes = gain @ signal.slopes

@@ -65,7 +65,7 @@ def score_update(before: Expected, z: jax.Array, law: Law) -> Corrected:
         weights.append(jnp.where(present[i], score.weight / _score(jnp.zeros_like(e), v, *branches).weight, jnp.nan))
         density = density + jnp.where(present[i], score.log_density, 0.0)
         both = revise(both, jnp.where(present[i], row, 0.0), v * score.slope, score.left)
-    return Corrected(leading(both, n), _stacked(weights), density)
+    return Corrected(leading(both, n), _stack(weights), density)
 
 
 class _Score(NamedTuple):
@@ -153,5 +153,5 @@ def branch_precision(before: Expected, e: jax.Array, scale: jax.Array, law: Law)
     return whole / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / whole
 
 
-def _stacked(entries: list[jax.Array]) -> jax.Array:
+def _stack(entries: list[jax.Array]) -> jax.Array:
     return jnp.stack(entries) if entries else jnp.zeros(0)

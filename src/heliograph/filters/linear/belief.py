@@ -76,8 +76,8 @@ def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, ja
     Behind a known gain nothing depends on them.
     """
     largest = float(np.finfo(covariance.dtype).max) ** 0.5
-    return _clipped(mean, largest**0.5), _clipped(covariance, largest)
+    return _clip(mean, largest**0.5), _clip(covariance, largest)
 
 
-def _clipped(a: jax.Array, largest: float) -> jax.Array:
+def _clip(a: jax.Array, largest: float) -> jax.Array:
     return jnp.maximum(jnp.minimum(a, largest), -largest)

@@ -62,7 +62,7 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | 
     if not np.any(start) and not np.any(drifts):
         return None
     count = max(len(sensors), len(channels))
-    pairs = zip(_repeated(sensors, count), _repeated(channels, count), strict=False)
+    pairs = zip(_repeat(sensors, count), _repeat(channels, count), strict=False)
     received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix(s) for s, c in pairs]
     return Centre(start, _series([_matrix(p) for p in plants]), _series(drifts), _series(received))
 
@@ -83,7 +83,7 @@ def _matrix(model: AbstractPlant | AbstractSensor) -> np.ndarray:
     return np.asarray(model.matrix)
 
 
-def _repeated(items: list[T], count: int) -> list[T]:
+def _repeat(items: list[T], count: int) -> list[T]:
     return items * count if len(items) == 1 else items
 
 
@@ -150,22 +150,22 @@ class PolynomialFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: Centred, z: ArrayLike, k: Step = 0) -> tuple[Centred, Innovation]:
         """Lift z and correct the inner filter."""
-        z = _without_mean(self.centre, z, state.mean, k)
+        z = _subtract_mean(self.centre, z, state.mean, k)
         after, innovation = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
-        return Centred(after, state.mean), _of_degree_one(innovation, z, self.degree)
+        return Centred(after, state.mean), _select_degree_one(innovation, z, self.degree)
 
     @estimates
     def estimate(self, state: Centred) -> Estimate:
         """Estimate of the inner filter, plus the mean."""
-        return _moved(self.inner.estimate(state.inner), state.mean)
+        return _add_mean(self.inner.estimate(state.inner), state.mean)
 
     def after_step(self, state: Centred, k: Step) -> Estimate:
         """Estimate of the inner filter after step k, plus the mean."""
-        return _moved(self.inner.after_step(state.inner, k), state.mean)
+        return _add_mean(self.inner.after_step(state.inner, k), state.mean)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the lifted system, about the mean."""
-        z = monomials(_without_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
+        z = monomials(_subtract_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
         before, prior, after = (state.inner for state in step[:3])
         inner = step._replace(before=before, prior=prior, after=after, z=z)
         return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
@@ -192,16 +192,16 @@ def _mean_moved(centre: Centre | None, mean: Array, k: Step) -> Array:
     return moved
 
 
-def _without_mean(centre: Centre | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
+def _subtract_mean(centre: Centre | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
     """z - G C E[x]."""
     return jnp.asarray(z) if centre is None else jnp.asarray(z) - at(centre, k).received @ mean
 
 
-def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
+def _add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
     return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)
 
 
-def _of_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
+def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
     """Innovation of z itself, out of that of its monomials."""
     m, places = len(z), position(len(z) + 1, degree)
     values = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
@@ -236,14 +236,14 @@ def polynomial_filter(
 
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
-    centre, system = _lifted(plant, sensor, channel, degree, horizon)
+    centre, system = _lift(plant, sensor, channel, degree, horizon)
     claim = lmmse(system, claim_of(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
     filter = PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
     return believing(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
-def _lifted(
+def _lift(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
 ) -> tuple[Centre | None, LinearSystem]:
     """Lifted system of the model, about its mean where the gain is known."""
@@ -279,7 +279,7 @@ def scheduled_polynomial_filter(
 
     Source: as `polynomial_filter`.
     """
-    centre, system = _lifted(plant, sensor, channel, degree, horizon)
+    centre, system = _lift(plant, sensor, channel, degree, horizon)
     inner = ScheduledFilter(lmmse(system, claim_of(plant, sensor, channel, degree)), first(plant).states)
     return believing(PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree))
 
@@ -322,20 +322,20 @@ class MemoryFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
         """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other."""
-        z = _without_mean(self.centre, z, state.mean, k)
+        z = _subtract_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
         lifted = jnp.concatenate([monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
         products, innovation = self.products.correct(state.products, lifted, k)
-        return MemoryState(linear, products, state.mean), _of_degree_one(innovation, z, 2)
+        return MemoryState(linear, products, state.mean), _select_degree_one(innovation, z, 2)
 
     @estimates
     def estimate(self, state: MemoryState) -> Estimate:
         """Estimate of the filter of products, plus the mean."""
-        return _moved(self.products.estimate(state.products), state.mean)
+        return _add_mean(self.products.estimate(state.products), state.mean)
 
     def after_step(self, state: MemoryState, k: Step) -> Estimate:
         """Estimate of the filter of products after step k, plus the mean."""
-        return _moved(self.products.after_step(state.products, k), state.mean)
+        return _add_mean(self.products.after_step(state.products, k), state.mean)
 
 
 def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
@@ -357,7 +357,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     check_forgets("channel of a memory filter", as_maps("channel", [first(channel)])[0])
     claim = claim_of(plant, sensor, channel, 2)
     # The linear filter's gains are needed for the moments of its products with z.
-    centre, system = _lifted(plant, sensor, channel, 1, horizon)
+    centre, system = _lift(plant, sensor, channel, 1, horizon)
     linear = lmmse(system, claim)
     about = plant if centre is None else without_mean(plant)
     products = lmmse(memory_system(about, sensor, channel, linear), linear.claim)

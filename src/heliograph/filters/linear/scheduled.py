@@ -148,7 +148,7 @@ class LinearSystemFilter(AbstractSizedFilter):
 
     def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
         instance("system", system, LinearSystem, "a LinearSystem")
-        self.steps, self.noises = OverTime(system.steps), OverTime(_factored(system))
+        self.steps, self.noises = OverTime(system.steps), OverTime(_factor_noises(system))
         self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
         self.claim, self.inputs = claim, ()
         self.states = names("state names", states, len(system.projection), "x")
@@ -197,7 +197,7 @@ class SystemNoises(NamedTuple):
 
 
 @in_float64
-def _factored(system: LinearSystem) -> SystemNoises:
+def _factor_noises(system: LinearSystem) -> SystemNoises:
     """Factors of both noises at each step, with the rounding of numbers as large as the system makes them."""
     s = system.steps
     moved, sent = _sizes(system)

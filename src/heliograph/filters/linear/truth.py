@@ -97,13 +97,13 @@ def true_error(
     row = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
         rows = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
-        moments = _moved(moments, at(plant, k), at(planned.steps, k), u[k], rows)
-        moments = _corrected_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
+        moments = _propagate(moments, at(plant, k), at(planned.steps, k), u[k], rows)
+        moments = _correct_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
         true.append(row @ moments.sum(axis=0) @ row.T)
     return TrueError(start.states, np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2], np.array(true))
 
 
-def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _propagate(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Propagate moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
     n, given, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
     move, noise = np.zeros((2, size, size))
@@ -115,7 +115,7 @@ def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, r
     return np.asarray(moved(move, before, before[:, n, n, None, None] * noise))
 
 
-def _corrected_moments(moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, plan: Plan) -> np.ndarray:
+def _correct_moments(moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, plan: Plan) -> np.ndarray:
     """Propagate moments through s = s- + K (z - C s- - c), z = (G, n) of the mode times y~ = C~ x~ + v."""
     p, n = sensor.matrix.shape
     gain, mean, law = np.asarray(plan.gain), np.asarray(world.mean), moments[:, n, n, None, None]

@@ -66,8 +66,8 @@ def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
     """List all combinations of the atoms of a map's gains and noises."""
     return fold(channel, {
         GainAndNoise: _atoms_of_hop,
-        Series: _combined(_compose_maps),
-        Stack: _combined(_stack_maps),
+        Series: _reduce_parts(_compose_maps),
+        Stack: _reduce_parts(_stack_maps),
         Superposed: lambda channel, _: atoms_of(channel.as_stack),
         # One of several maps, drawn: p(i) times the atoms of map i.
         Mixture: lambda mixture, parts: [c._replace(weight=p * c.weight) for p, atoms in
@@ -81,7 +81,7 @@ def _atoms_of_hop(hop: GainAndNoise, _: object) -> list[Component]:
     return [Component(p * q, g * np.asarray(hop.matrix), c, r) for p, g in gains for q, c, r in noises]
 
 
-def _combined(join: Callable[[Component, Component], Component]) -> Callable[[object, Atoms], list[Component]]:
+def _reduce_parts(join: Callable[[Component, Component], Component]) -> Callable[[object, Atoms], list[Component]]:
     def pairs(a: list[Component], b: list[Component]) -> list[Component]:
         if len(a) * len(b) > COMPONENT_LIMIT:
             raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")

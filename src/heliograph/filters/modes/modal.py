@@ -165,7 +165,7 @@ class ModalFilter(AbstractModalFilter):
         mean = moved_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
         root, fresh = self._moves(state, u, k)
         after = of_columns(mean, joined(Columns(root, state.variances), fresh))
-        moments = jnp.einsum("ij,iab->jab", rows, _carried(state, move)) + law[:, None, None] * noise
+        moments = jnp.einsum("ij,iab->jab", rows, _propagate_moments(state, move)) + law[:, None, None] * noise
         return ModalBelief(*after, moments, centre, jnp.asarray(True))
 
     @corrects
@@ -187,7 +187,7 @@ class ModalFilter(AbstractModalFilter):
         """Return F L of zeta = E zeta + L xi, and the columns of Cov(zeta+ - F zeta)."""
         move, rows = moved_about(at(self.plant, k), u, state.centre)[0], self._rows(state, k)
         own = self.moved_noise(u, k, Columns(jnp.eye(len(rows)), state.law @ rows))
-        fresh = joined(spread_of_moves(_carried(state, move), rows), own)
+        fresh = joined(spread_of_moves(_propagate_moments(state, move), rows), own)
         return moved_by_mode(state.gaussian.root, move, rows), fresh
 
     def _output(self, state: ModalBelief, k: Step) -> Output:
@@ -208,7 +208,7 @@ class ModalFilter(AbstractModalFilter):
         return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
 
 
-def _carried(state: ModalBelief, move: jax.Array) -> jax.Array:
+def _propagate_moments(state: ModalBelief, move: jax.Array) -> jax.Array:
     """Carry the moments of each mode through the plant: A~ E_i A~' (M, n + 1, n + 1)."""
     carried: jax.Array = jax.vmap(lambda a: move @ a @ move.T)(state.moments)
     return carried

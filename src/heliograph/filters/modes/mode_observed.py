@@ -93,14 +93,14 @@ class ModeObservedFilter(AbstractSizedFilter):
         start, rule = start_of(self.plant), Polytope()
         if self.late:
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
-            then = _given(at(self.channel, last), certain)
+            then = _condition(at(self.channel, last), certain)
             redone, _ = corrected_linear(state.before, at(self.sensor, last), then, rule, state.z, start)
             redone = predicted(redone, state.move)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
             then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
             described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
         else:
-            prior, described = state.belief, _given(channel, certain)
+            prior, described = state.belief, _condition(channel, certain)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
         after, innovation = corrected_linear(prior, sensor, described, rule, z, start)
@@ -119,7 +119,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         return Estimate(state.belief.mean, state.belief.covariance, self.claim)
 
 
-def _given(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
+def _condition(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
     held = memories(channel).values()
     return _nominal(given(channel, [m.read(number) for m, number in zip(held, numbers, strict=True)]))
 

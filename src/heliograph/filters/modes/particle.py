@@ -111,7 +111,7 @@ class ParticleFilter(AbstractSizedFilter):
         after, weight, mixed = receive(signals, channel, state.mode, state.weight, z, self.observed_angles)
         after = after._replace(mean=together(plant, after.mean, weight))
         # Systematic resampling.
-        key = _folded(state.key, z)
+        key = _fold_in_bits(state.key, z)
         chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))
         poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
         which = jnp.where(poor, chosen, jnp.arange(self.particles))
@@ -136,7 +136,7 @@ def _systematic(weight: jax.Array, start: jax.Array) -> jax.Array:
     return _chosen(weight, (start + jnp.arange(len(weight))) / len(weight))
 
 
-def _folded(key: jax.Array, z: jax.Array) -> jax.Array:
+def _fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
     """Key made of another one and of the bits of a measurement."""
     bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
     for word in bits.ravel():

@@ -116,7 +116,7 @@ class SideInformationFilter(AbstractSizedFilter):
             jnp.stack([jnp.concatenate([e, x]) for e in errors]), outer(law, jnp.append(prior.variances, 1.0))
         )
         mean = jnp.kron(law, unit[:, 0])
-        return _of_factors(mean, jax.vmap(triangular)(moments), jnp.asarray(start.initial_mean), jnp.asarray(False))
+        return _make_belief(mean, jax.vmap(triangular)(moments), jnp.asarray(start.initial_mean), jnp.asarray(False))
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
@@ -143,7 +143,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
         moments = jax.vmap(into)(jnp.eye(modes), rows.T, law)
         mean = moved_by_mode(state.mean[:, None], move, rows)[:, 0]
-        return _of_factors(mean, moments, centre, jnp.asarray(True))
+        return _make_belief(mean, moments, centre, jnp.asarray(True))
 
     @corrects
     def correct(
@@ -167,7 +167,7 @@ class SideInformationFilter(AbstractSizedFilter):
             lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
         )
         after, innovations, innovation = _project(
-            prior, excess, _received(prior, sensor, size_of(sensor, start_of(self.plant)), *links), z
+            prior, excess, _describe_received(prior, sensor, size_of(sensor, start_of(self.plant)), *links), z
         )
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
         value = jnp.where(arrived, innovation.mean, jnp.nan)
@@ -209,7 +209,7 @@ def _parts(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Arra
     return root[:, :count], root[:, count:], jnp.asarray(state.variances)
 
 
-def _of_factors(mean: jax.Array, moments: Columns, centre: jax.Array, moved: jax.Array) -> SideInformationBelief:
+def _make_belief(mean: jax.Array, moments: Columns, centre: jax.Array, moved: jax.Array) -> SideInformationBelief:
     """Build the state from the triangular factors of each mode's moments (M, q, q)."""
     lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))
     return SideInformationBelief(mean, lower, jnp.asarray(moments.weights), centre, moved)
@@ -220,7 +220,7 @@ def _law(x: jax.Array, weights: jax.Array) -> jax.Array:
     return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
 
 
-def _received(
+def _describe_received(
     state: SideInformationBelief,
     sensor: LinearSensor,
     size: jax.Array,
@@ -280,7 +280,7 @@ def _project(
     # Factors of each mode.
     left = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
     moments = jax.vmap(triangular)(Columns(jnp.concatenate([left, x], axis=1), weights.reshape(modes, -1)))
-    return _of_factors(-values[m:], moments, state.centre, state.moved), innovations, expected
+    return _make_belief(-values[m:], moments, state.centre, state.moved), innovations, expected
 
 
 def _join_modes(*parts: jax.Array) -> jax.Array:

@@ -123,22 +123,22 @@ class ClockFilter(AbstractSizedFilter):
         # Observability of each clock through the components that arrived recently.
         silence = jnp.where(present, 0, state.silence)
         arrived_values = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
-        observed = self._observed(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
+        observed = self._test_observable(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
         # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
         gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
-        gain = gain * self._estimated_mask(observed)[:, None]
+        gain = gain * self._mask_estimated(observed)[:, None]
         after = _correct_by_gain(signal, channel, gain, jnp.where(present, z - expected, 0.0))
         belief = ClockBelief(*after, state.inputs, silence, observed)
         return belief, gaussian_innovation(z, expected, total)
 
-    def _estimated_mask(self, observed: jax.Array) -> jax.Array:
+    def _mask_estimated(self, observed: jax.Array) -> jax.Array:
         """Return 1 for the states that are estimated, 0 for offset and drift of clocks that are not."""
         values = jnp.ones(len(self.states))
         for i, offset in enumerate(self.offsets):
             values = values.at[offset : offset + 2].set(jnp.where(observed[i], 1.0, 0.0))
         return values
 
-    def _observed(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
+    def _test_observable(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
         """Test whether each clock is observable: dy/dt is significant, and its derivatives are linearly independent."""
         slope = jax.jacfwd(observe)
         rate, curve = slope(state.mean), jax.jacfwd(slope)(state.mean)
@@ -161,7 +161,7 @@ class ClockFilter(AbstractSizedFilter):
             return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
 
         _, squares = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
-        return jnp.stack([_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
+        return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
     @estimates
     def estimate(self, state: ClockBelief) -> Estimate:
@@ -169,7 +169,7 @@ class ClockFilter(AbstractSizedFilter):
         return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
 
 
-def _unexplained_share(square: jax.Array, column: int) -> jax.Array:
+def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:
     """Return 1 - r' R^+ r, what other columns of O, of correlations R, leave unexplained of one; O'O = `square`."""
     lengths = jnp.sqrt(jnp.diagonal(square))
     scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)

@@ -331,7 +331,7 @@ def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
     if isinstance(start, Delayed) and start.timestamped:
-        return _known_delays(plant, sensor, channel, make)
+        return _build_known_delay_filter(plant, sensor, channel, make)
     if isinstance(channel, Delayed) and channel.constant:
         return LateFilter(make(plant, sensor, channel.link), channel.past)
     if isinstance(start, Relayed):
@@ -346,7 +346,7 @@ def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: M
     return relayed_filter(plant, channel, make(larger, last, link), lines)
 
 
-def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
+def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
     if not isinstance(channel, Delayed):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
@@ -362,12 +362,12 @@ def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
 
 def as_current(channel: Channel) -> Channel:
     """Return the channel for a filter that takes late signals as current: all signals of its line are y_k."""
-    current: Channel = at_each_step(_at_once, channel)
+    current: Channel = at_each_step(_deliver_at_once, channel)
     return current
 
 
-def _at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     as_maps("channel", [channel])
     if isinstance(channel, Relayed):
-        return Series([_at_once(stage) for stage in channel.stages])
+        return Series([_deliver_at_once(stage) for stage in channel.stages])
     return Series([known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1))), on_delay_line(channel)])

@@ -93,7 +93,7 @@ class DiffusionWeights(_OfNeighbours):
         self.shares, self.given = None, None
         if shares is not None:
             rows = table("diffusion shares", shares, "shares by neighbour")
-            self.given = {name: _checked(name, row) for name, row in rows.items()}
+            self.given = {name: _check_shares(name, row) for name, row in rows.items()}
 
     @property
     def needs_joint(self) -> bool:
@@ -182,7 +182,7 @@ def _weights_of_row(
     return jax.lax.scan(body, None, arrived)[1]
 
 
-def _checked(name: str, row: object) -> dict[str, float]:
+def _check_shares(name: str, row: object) -> dict[str, float]:
     """Shares of one node: not negative, at most one in sum, and one where its own is among them."""
     what = f"diffusion shares of {name!r}"
     mine = {n: float(scalar(what, share, 0.0)) for n, share in table(what, row, "shares by neighbour").items()}

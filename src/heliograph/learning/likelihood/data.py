@@ -46,10 +46,10 @@ def gathered(network: Network, recording: object, inputs: Any, free: int, truth:
     longest = max(len(z) for z, _ in parts)
     true = [] if truth is False else _truths(network, several, truth, [len(z) for z, _ in parts])
     data = Data(
-        np.stack([_filled(z, longest, np.nan) for z, _ in parts]),
-        np.stack([_filled(u, longest, None) for _, u in parts]),
+        np.stack([_pad_rows(z, longest, np.nan) for z, _ in parts]),
+        np.stack([_pad_rows(u, longest, None) for _, u in parts]),
         tuple(len(z) for z, _ in parts),
-        np.stack([_filled(x, longest, np.nan) for x in true]) if true else None,
+        np.stack([_pad_rows(x, longest, np.nan) for x in true]) if true else None,
     )
     _check_enough(data, free)
     return data
@@ -121,7 +121,7 @@ def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
     return [values]
 
 
-def _filled(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
+def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
     """Array with rows added up to a length: of a filler, or copies of the last one."""
     more = length - len(values)
     end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)

@@ -143,7 +143,7 @@ def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: D
         impossible,
         np.zeros(lanes, dtype=bool),
     )
-    return _judged(state, moving, domains, close)
+    return _mark_arrived(state, moving, domains, close)
 
 
 def _is_sound(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ def _is_sound(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, 
     return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
 
 
-def _judged(state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
+def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
     """Mark lanes that have arrived, and those that are stuck because rounding hides what is left to gain."""
     counting = moving & ~at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, gain_of(state.gradient, state.information, counting) / 2)
@@ -190,7 +190,7 @@ def _step(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domain
     badly = going & ~(sound & ((gain > 0.25 * foretold) | (hidden & taken)))
     wider = np.where(well & far, WIDER * state.radius, state.radius)
     radius = np.where(badly, NARROWER * np.minimum(length, state.radius), wider)
-    model = _learned(state, domains, step, gradient, information, gain, sound, taken)
+    model = _model_hessian(state, domains, step, gradient, information, gain, sound, taken)
     pick = taken[:, None]
     after = _State(
         np.where(pick, tried, state.x),
@@ -203,7 +203,7 @@ def _step(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domain
         state.done,
         state.converged,
     )
-    return _judged(after, moving, domains, close)
+    return _mark_arrived(after, moving, domains, close)
 
 
 def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _State) -> Evaluated:
@@ -214,7 +214,7 @@ def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state:
     return values
 
 
-def _learned(
+def _model_hessian(
     state: _State,
     domains: Domains,
     step: np.ndarray,
@@ -265,20 +265,20 @@ def trust_region_step(
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
     g = np.nan_to_num(gradient) * unit
-    b = _scaled(model, unit)
+    b = _scale(model, unit)
     sane = np.all(np.abs(b) < LARGEST, axis=(1, 2))  # NaN is not
-    b = np.where(sane[:, None, None], b, _scaled(information, unit))
+    b = np.where(sane[:, None, None], b, _scale(information, unit))
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
     # s: none at first, or what makes the matrix positive
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
     shift = np.where(least > -ROUNDING, 0.0, -least * (1 + 1e-6))
     for _ in range(SECULAR_STEPS):
-        step = _solved(b, shift, d, g)
+        step = _solve_shifted(b, shift, d, g)
         length = np.linalg.norm(d * step, axis=1)
         beyond = length > 1.01 * radius
         if not beyond.any():
             break
-        slope = np.sum(d * d * step * _solved(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
+        slope = np.sum(d * d * step * _solve_shifted(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
         newton = length**2 / np.where(beyond, slope, 1.0) * (length - radius) / radius
         shift = np.where(beyond, shift + newton, shift)
     inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
@@ -287,7 +287,7 @@ def trust_region_step(
     return step * unit, length, foretold
 
 
-def _solved(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(B + s D^2)^-1 g of each lane; nothing along directions in which the matrix is singular."""
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
@@ -301,7 +301,7 @@ def gain_of(
 ) -> Float[np.ndarray, " lanes"]:
     """g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
     unit, _ = _units_and_flat(information, counting)
-    scaled = _scaled(information, unit)
+    scaled = _scale(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
     return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
@@ -312,12 +312,12 @@ def _units_and_flat(information: np.ndarray, moving: np.ndarray) -> tuple[np.nda
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     there = moving & (diagonal > LEAST) & np.isfinite(diagonal)
     unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 0.0)
-    scaled = _scaled(information, unit)
+    scaled = _scale(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * there[:, :, None]
 
 
-def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
+def _scale(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
     stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
     return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])

@@ -165,12 +165,12 @@ def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
     """
     if by_truth:
         sole_filter(network.start)
-        return [_shared(Objective(network, "truth"))]
-    return [_shared(Objective(network, form)) for form in forms_of(network.start)]
+        return [_share(Objective(network, "truth"))]
+    return [_share(Objective(network, form)) for form in forms_of(network.start)]
 
 
 @lru_cache
-def _shared(objective: Objective) -> Objective:
+def _share(objective: Objective) -> Objective:
     """Return the first one equal to this: to find its program again, it need not be compared."""
     return objective
 
@@ -245,7 +245,7 @@ def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Arr
 
     def step(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         k, *innovation = row
-        density, score, information = _scored(*innovation)
+        density, score, information = _score_innovation(*innovation)
         late = jnp.stack([k < len(z) // 2, k >= len(z) // 2])[:, None, None]
         return halves + jnp.where(late, information, 0.0), (density, score)
 
@@ -257,7 +257,7 @@ def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Arr
 _by_xla = quickly_compiled(one_recording)
 
 
-def _scored(
+def _score_innovation(
     e: jax.Array, s: jax.Array, de: jax.Array, ds: jax.Array, z: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Log-density, score and information of an innovation e (m,) and its covariance, with derivatives (p, ...).

@@ -59,7 +59,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
         case Nakagami():
             gains = np.sqrt(scipy.stats.gamma.ppf(points, float(law.shape)) * float(law.power) / float(law.shape))
         case _:
-            gains = np.quantile(_drawn(law), points)
+            gains = np.quantile(_draw_law(law), points)
     return Discrete(gains, weights)
 
 
@@ -85,7 +85,7 @@ def _normal(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @in_float64
-def _drawn(law: AbstractLaw) -> np.ndarray:
+def _draw_law(law: AbstractLaw) -> np.ndarray:
     samples: np.ndarray = np.asarray(jax.vmap(law.sample)(jax.random.split(jax.random.key(0), DRAWS)))
     return samples
 
@@ -219,21 +219,23 @@ def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tu
     total, pits, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
-        weight, error, root = _weighed(y, spread, z[:, start:stop], law)
+        weight, error, root = _weigh_combinations(y, spread, z[:, start:stop], law)
         for j in range(stop - start):
             now = np.exp(weight[..., j] - logsumexp(weight[..., j], axis=1, keepdims=True))
             pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(now * ndtr(error[..., j]), axis=1)))
         last = logsumexp(weight[..., -1], axis=1)
         total += last
         if i + 1 < len(parts):
-            y, spread = _corrected(
+            y, spread = _correct_signal(
                 y, spread, z[:, start:stop], law, np.exp(weight[..., -1] - last[:, None]), error, root
             )
         start = stop
     return total, np.stack(pits, axis=1)
 
 
-def _weighed(y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _weigh_combinations(
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log-weights of the combinations before each component and after the last (t, a, m + 1), L^-1 (z - E z), and L."""
     there = ~np.isnan(z)[:, None]
     both = there[..., None] & there[..., None, :]
@@ -250,7 +252,7 @@ def _weighed(y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part) -> tup
     return weight, error, root
 
 
-def _corrected(
+def _correct_signal(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part, weight: np.ndarray, error: np.ndarray, root: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moments of the signal given these components too: those of the mixture over its combinations, weight (t, a)."""

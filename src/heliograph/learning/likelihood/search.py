@@ -80,17 +80,17 @@ class Search:
         """
         none = np.zeros(starts.shape[1])
         climbed = self._climb(starts, none)
-        top = self._proved(climbed)
+        top = self._prove_maximum(climbed)
         self.best, ends = top._replace(converged=False, reason=""), climbed.total
         if len(starts) > 1:
             climbed = self._climb(self._around(top, len(starts) - 1, seed), none)
             ends = np.concatenate([ends, climbed.total])
             if climbed.total.max() > top.total + SAME:
-                top = self._proved(climbed)
+                top = self._prove_maximum(climbed)
         self.best, self.ends = top, -np.sort(-np.nan_to_num(ends, nan=-np.inf))
         return top
 
-    def _proved(self, climbed: Maximum) -> Top:
+    def _prove_maximum(self, climbed: Maximum) -> Top:
         """Put numbers at the ends of their domains and climb again until the best end is a maximum.
 
         A maximum: g' H^-1 g is nothing with the Hessian H of -l, which is not indefinite, among the numbers inside
@@ -99,7 +99,7 @@ class Search:
         none = np.zeros(climbed.x.shape[1])
         top = _top(climbed, none)
         for _ in range(ROUNDS):
-            top = self._at_limits(top)
+            top = self._move_to_limits(top)
             again, reason = self._elsewhere(top) if top.converged else (None, self._why_not(top))
             if again is None:
                 return top._replace(converged=not reason, reason=reason)
@@ -133,7 +133,7 @@ class Search:
         moving = np.repeat((ends == 0)[None], len(starts), axis=0)
         return maximise(self.surface.evaluate, starts, moving, seen, self.surface.domains)
 
-    def _at_limits(self, top: Top) -> Top:
+    def _move_to_limits(self, top: Top) -> Top:
         """Put numbers that the data hardly see at the end of their domains, where the likelihood is the same."""
         domains, x, total, ends = self.surface.domains, top.x.copy(), top.total, top.ends.copy()
         information = np.diag(self.surface.evaluations(x[None]).information[0])

@@ -30,7 +30,7 @@ def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float
             np.where(np.eye(len(value)), np.log(np.abs(factor) + (factor == 0)), factor)[np.tril_indices(len(value))]
         )
     if np.any(value <= domain.low) or np.any(value >= domain.high):
-        raise fail(f"start of {name}", f"a start {_between(domain)}", value.tolist())
+        raise fail(f"start of {name}", f"a start {_describe_domain(domain)}", value.tolist())
     return np.asarray(link(domain, value)).reshape(-1)
 
 
@@ -110,7 +110,7 @@ def _factor(name: str, value: np.ndarray) -> np.ndarray:
         raise fail(f"start of {name}", "a positive definite matrix", value.tolist()) from None
 
 
-def _between(domain: Domain) -> str:
+def _describe_domain(domain: Domain) -> str:
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return f"between {domain.low:g} and {domain.high:g}"
     return f"above {domain.low:g}" if np.isfinite(domain.low) else f"below {domain.high:g}"

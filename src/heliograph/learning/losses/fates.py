@@ -227,13 +227,13 @@ def as_fates(value: object) -> Fates:
                 "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
             )
     chosen = [getattr(x, "chosen", False) for x in (items if several else [value])]
-    fates = CheckedFates(_with_ends(f) if c else f for f, c in zip(parts, chosen, strict=True) if len(f))
+    fates = CheckedFates(_mark_ends(f) if c else f for f, c in zip(parts, chosen, strict=True) if len(f))
     if not any(np.any(is_trial(fate)) for fate in fates):
         raise fail("fates", "at least one packet of which the fate is known and that is no end of its stretch", "none")
     return fates
 
 
-def _with_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+def _mark_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
     ends = np.zeros(len(fate), dtype=bool)
     ends[[0, -1]] = True
     return np.where(ends, CHOSEN, fate)

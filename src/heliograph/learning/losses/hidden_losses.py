@@ -142,7 +142,7 @@ def _matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _scaled(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _scale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scale matrices by their largest real part; return them and the logarithm of the scale."""
     size = np.max(matrix.real, axis=(-2, -1))
     size = np.where(size > 0, size, 1.0)
@@ -153,15 +153,15 @@ def _powers(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.nda
     """Scaled matrix^length for each length, and the logarithms of the scales: by the binary digits of the lengths."""
     shape = (len(matrix), len(lengths))
     power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
-    scale, (square, square_scale) = np.zeros(shape), _scaled(matrix)
+    scale, (square, square_scale) = np.zeros(shape), _scale(matrix)
     left = lengths.copy()
     while np.any(left):
         odd = (left & 1).astype(bool)
         power = np.where(odd[:, None, None], square[:, None] @ power, power)
-        power, more = _scaled(power)
+        power, more = _scale(power)
         scale = scale + more + np.where(odd, square_scale[:, None], 0.0)
         left = left >> 1
-        square, more = _scaled(square @ square)
+        square, more = _scale(square @ square)
         square_scale = 2 * square_scale + more
     return power, scale
 
@@ -172,6 +172,6 @@ def _product(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     while parts.shape[1] > 1:
         if parts.shape[1] % 2:
             parts = np.concatenate([parts, np.broadcast_to(np.eye(2), (len(parts), 1, 2, 2))], axis=1)
-        parts, more = _scaled(parts[:, 1::2] @ parts[:, ::2])
+        parts, more = _scale(parts[:, 1::2] @ parts[:, ::2])
         scale = scale + more.sum(axis=1)
     return parts[:, 0], scale

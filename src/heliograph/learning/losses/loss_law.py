@@ -139,7 +139,7 @@ class MarkovLosses(AbstractLossLaw):
             full = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
             np.add.at(counts, (past[full], as_history(stretch)[full].astype(int)), 1.0)
         spans = _spans(parts)
-        return _given_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
+        return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 
     @property
     def order(self) -> int:
@@ -196,7 +196,7 @@ def _spans(parts: Fates) -> np.ndarray:
     return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
 
 
-def _given_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
+def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
     """The law of counts whose shares are the most likely fail a and recover b of chains that are known to end arrived.
 
     l = sum n log p - sum_spans log P_m, P_m = (b + a (1 - a - b)^m) / (a + b) the probability to arrive again after m

@@ -102,13 +102,13 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
         raise fail("held-out share", "less than 1: something must be fitted", share)
     known = is_trial(np.concatenate(parts))
     cut = int(np.floor(known.sum() * (1 - share)))
-    held_out_scores = _held_out_scores(parts, known, cut) if 0 < cut < known.sum() else {}
+    held_out_scores = _score_held_out(parts, known, cut) if 0 < cut < known.sum() else {}
     best = max(held_out_scores, key=lambda name: held_out_scores[name].log_likelihood) if held_out_scores else HIDDEN
     lost = int(np.sum(np.concatenate(parts) == 1))
-    return Losses(int(known.sum()), lost, _fitted(parts, True), loss_memory(parts), held_out_scores, best)
+    return Losses(int(known.sum()), lost, _fit_laws(parts, True), loss_memory(parts), held_out_scores, best)
 
 
-def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
+def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
         "markov": MarkovLosses.fit(parts, intervals=intervals),
@@ -118,13 +118,13 @@ def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     }
 
 
-def _held_out_scores(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
+def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
     """Fit to the first `cut` known packets, judge on the others, each given all before it."""
     everything = np.concatenate(parts)
     late = known & (np.cumsum(known) > cut)
     early = np.where(late, np.nan, everything)
     ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
-    laws = _fitted(CheckedFates(np.split(early, ends)), False)
+    laws = _fit_laws(CheckedFates(np.split(early, ends)), False)
     said = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
     scores = {}
     for name, logs in said.items():

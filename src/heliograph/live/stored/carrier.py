@@ -138,7 +138,7 @@ class Carrier:
 
     def carried(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
         """Return plants, by name, as this network stores them."""
-        plants = {name: plant_from(name, self._translated(body), self.fleet) for name, body in bodies.items()}
+        plants = {name: plant_from(name, self._translate(body), self.fleet) for name, body in bodies.items()}
         # All rows after the base are stepped with what the network is now.
         for plant in plants.values():
             plant.dirty = 1 if len(plant.rows.held) > 1 else None
@@ -148,7 +148,7 @@ class Carrier:
             self.fleet.end(plant)
         return results
 
-    def _translated(self, body: bytes) -> bytes:
+    def _translate(self, body: bytes) -> bytes:
         """Return a plant's bytes with the columns, places of nodes and counts of this network; rows not stepped."""
         old = self._old
         names, names_here = list(old["nodes"]), list(self.fleet.network.names)
@@ -238,7 +238,7 @@ def changes(mine: Identity, other: Identity) -> list[str]:
                 for path in {**there[name], **here[name]}
                 if not path.endswith(".factor")  # of a covariance, which is there too
                 and (same or path in there[name].keys() & here[name].keys())
-                for line in _changed(there[name].get(path), here[name].get(path))
+                for line in _describe_changes(there[name].get(path), here[name].get(path))
             ]
             if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):
                 lines.append(f"{name}: numbers of a long array")
@@ -247,7 +247,7 @@ def changes(mine: Identity, other: Identity) -> list[str]:
     return lines
 
 
-def _changed(before: object, after: object) -> list[str]:
+def _describe_changes(before: object, after: object) -> list[str]:
     """Describe the change of a number or an array, entry by entry where the shape is the same."""
     if before == after:
         return []

@@ -29,7 +29,7 @@ def parts_of(state: PyTree) -> dict[str, np.ndarray]:
 def fits(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`: all shapes are there, or covariances."""
     shapes = {path: list(shape) for path, shape in old.items()}
-    for stem in _factored(old, new):
+    for stem in _find_factored(old, new):
         *lead, n, _ = shapes.pop(stem + COVARIANCE)
         shapes |= {stem + LOWER: [*lead, n * (n - 1) // 2], stem + VARIANCES: [*lead, n]}
     return shapes == {path: list(shape) for path, shape in new.items()}
@@ -38,7 +38,7 @@ def fits(old: Shapes, new: Shapes) -> bool:
 def moved(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
     """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
     results, new = dict(parts), list(new)
-    for stem in _factored(parts, new):
+    for stem in _find_factored(parts, new):
         results[stem + LOWER], results[stem + VARIANCES] = factors(results.pop(stem + COVARIANCE))
     return {path: results[path] for path in new}
 
@@ -105,7 +105,7 @@ def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return lower[..., *np.tril_indices(n, -1)], variances
 
 
-def _factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
+def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
     """Paths, without their last names, of covariances in `old` that are factors in `new` alone."""
     before, now = set(old), set(new)
     stems = [path.removesuffix(COVARIANCE) for path in old if path.endswith(COVARIANCE) and path not in now]

@@ -44,21 +44,21 @@ class _Writer:
     def lines(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return the lines of a program, its variables numbered in their order."""
         numbers: dict[Var, int] = {}
-        head = [f"{self._defined(numbers, jaxpr.constvars)} = {[self._value(value) for value in consts]}"]
-        head += [self._defined(numbers, jaxpr.invars)]
+        head = [f"{self._write_definitions(numbers, jaxpr.constvars)} = {[self._value(value) for value in consts]}"]
+        head += [self._write_definitions(numbers, jaxpr.invars)]
         body = [self._line(numbers, equation) for equation in jaxpr.eqns]
-        return "\n".join([*head, *body, self._used(numbers, jaxpr.outvars)])
+        return "\n".join([*head, *body, self._write_uses(numbers, jaxpr.outvars)])
 
     def _line(self, numbers: dict[Var, int], equation: JaxprEqn) -> str:
-        used, how = self._used(numbers, equation.invars), self._value(equation.params)
-        return f"{self._defined(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
+        used, how = self._write_uses(numbers, equation.invars), self._value(equation.params)
+        return f"{self._write_definitions(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
 
-    def _defined(self, numbers: dict[Var, int], variables: Sequence[Var]) -> str:
+    def _write_definitions(self, numbers: dict[Var, int], variables: Sequence[Var]) -> str:
         for variable in variables:
             numbers[variable] = len(numbers)
         return " ".join(str(variable.aval) for variable in variables)
 
-    def _used(self, numbers: Mapping[Var, int], atoms: Sequence[Var | Literal]) -> str:
+    def _write_uses(self, numbers: Mapping[Var, int], atoms: Sequence[Var | Literal]) -> str:
         return " ".join(self._value(x.val) if isinstance(x, Literal) else str(numbers[x]) for x in atoms)
 
     def _value(self, value: Any) -> str:

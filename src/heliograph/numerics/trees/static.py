@@ -27,10 +27,10 @@ class Static(NamedTuple):
 
 def cast(whole: object) -> tuple[list[jax.Array], Static]:
     """Split an object into arrays, on the device, and its structure. To be called in the float64 scope."""
-    leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, whole))
+    leaves, tree = jax.tree.flatten(jax.tree.map(_convert_leaf, whole))
     numbers = [jax.device_put(leaf) for leaf in leaves if eqx.is_array(leaf)]  # no program for each shape
     return numbers, Static(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))
 
 
-def _as_array(leaf: object) -> object:
+def _convert_leaf(leaf: object) -> object:
     return np.asarray(leaf) if isinstance(leaf, int | float) else leaf

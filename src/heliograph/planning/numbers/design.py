@@ -40,7 +40,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     # What cannot be is refused before any descent.
     before = problem.at(problem.numbers.start)
     problem.check_ends()
-    limits = _limits(_allowed(problem, task.budget), target)
+    limits = _limits(_limit_powers(problem, task.budget), target)
     draws = np.random.default_rng(seed)
     begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
     descent = problem.for_descent()
@@ -65,7 +65,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     )
 
 
-def _allowed(problem: NumberProblem, budget: object) -> PowerLimits:
+def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return unlimited(steps, hops)

@@ -70,7 +70,7 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
         expected = "one that converges (what is received informs too little of an unstable plant)"
         raise fail("steady error", expected, "growth")
     weights = criterion.smooth(parts.sum(axis=1))[1]
-    return ModeSolution(parts, gains, _closed(m, gains).adjoint(weights, m.start is None))
+    return ModeSolution(parts, gains, _close_loop(m, gains).adjoint(weights, m.start is None))
 
 
 def _periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
@@ -85,7 +85,7 @@ def _periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
             break
     # Policy iteration: X of these gains by a linear equation around the period, then the best gains for X.
     for _ in range(POLICIES):
-        before, parts = parts, _closed(m, gains).steady()
+        before, parts = parts, _close_loop(m, gains).steady()
         if np.abs(parts - before).max() <= CONVERGED * np.abs(parts).max():
             break
         gains = np.array([_update(m, k, parts[k - 1])[0] for k in range(len(parts))])
@@ -113,7 +113,7 @@ def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[n
     return gains, (after + after.swapaxes(1, 2)) / 2
 
 
-def _closed(m: ModeSystem, gains: Numbers) -> JumpSystem:
+def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
     """Recursion of X under given gains: F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K']."""
     close = np.eye(gains.shape[2]) - gains @ m.output
     added = moved(close, m.process[:, None], moved(gains, m.noise, 0.0))
@@ -126,5 +126,5 @@ def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
     earlier = jnp.roll(parts, 1, axis=0)
     if m.start is not None:  # the first step's chain forgets the mode before: any will do
         earlier = jnp.zeros_like(parts).at[0, 0].set(m.start).at[1:].set(parts[:-1])
-    jumps = _closed(m, gains)
+    jumps = _close_loop(m, gains)
     return jnp.sum(ahead * moved(jumps.maps, mixed(m.chain, earlier), jumps.added))

@@ -137,10 +137,10 @@ def function_of_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
             raise fail(f"free number {mark.name!r}", "one between two limits", f"a {mark.domain.kind}")
         ends = (np.full(mark.start.shape, end) for end in (mark.domain.low, mark.domain.high))
         marks[mark.name] = Number(np.asarray(mark.start), *ends)
-    return partial(_with_marks, description), Numbers(marks)
+    return partial(_mark_powers, description), Numbers(marks)
 
 
-def _with_marks(description: Description, **values: object) -> Network:
+def _mark_powers(description: Description, **values: object) -> Network:
     return description.at(values)
 
 

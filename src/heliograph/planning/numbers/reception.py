@@ -127,7 +127,7 @@ def mode_system(network: Network, error: Error, young: Array | None = None) -> M
     count = prod(node.law.shape[1] for node in nodes)
     if count > MOST_MODES:
         raise fail("modes of a design", f"at most {MOST_MODES} together", count)
-    output, noise = _stacked(nodes)
+    output, noise = _stack_nodes(nodes)
     scale = jnp.ones((steps, 1, 1)) * (1.0 if b is None else 1 + b[:, None, None])
     return ModeSystem(
         transition=jnp.sqrt(scale) * a,
@@ -141,7 +141,7 @@ def mode_system(network: Network, error: Error, young: Array | None = None) -> M
     )
 
 
-def _stacked(nodes: list[Received]) -> tuple[Array, Array]:
+def _stack_nodes(nodes: list[Received]) -> tuple[Array, Array]:
     """H and N of all nodes in each choice of a mode for each."""
     outputs, noises = [], []
     for modes in product(*(range(node.law.shape[1]) for node in nodes)):
@@ -163,7 +163,7 @@ def received(
     steps, varies = len(states), isinstance(source.sensor, OverTime) or isinstance(source.channel, OverTime)
     spans = [range(k, k + 1) for k in range(steps)] if varies else [range(steps)]
     channels = [at(source.channel, span[0]) for span in spans]
-    modes = [_observed_modes(name, channel) for channel in channels]
+    modes = [_observe_modes(name, channel) for channel in channels]
     # The chain and its law at each step.
     onward = jnp.concatenate([jnp.tile(m.onward, (len(span), 1, 1)) for m, span in zip(modes, spans, strict=True)])
     if modes[0].forgets:
@@ -184,21 +184,21 @@ def received(
 
 def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
     """Decide whether no uncertain probability moves a mean gain, so that no scalar of Young's is needed."""
-    return all(has_known_mean(second_order(mode_map)) for mode_map in _observed_modes(name, channel).maps)
+    return all(has_known_mean(second_order(mode_map)) for mode_map in _observe_modes(name, channel).maps)
 
 
-def _observed_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
+def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
     if not memories(channel):
         cases = outcomes(channel)
         law = jnp.stack([jnp.asarray(case.probability) for case in cases])
         maps, arrived = [case.map for case in cases], [case.arrived for case in cases]
         return _Modes(jnp.tile(law, (len(cases), 1)), law, maps, arrived, forgets=True)
-    joint = _flagged(name, channel)
+    joint = _flag_modes(name, channel)
     everything = np.ones(joint.maps[0].outputs, dtype=bool)
     return _Modes(joint.transition, joint.initial, list(joint.maps), [everything] * len(joint.maps), forgets=False)
 
 
-def _flagged(name: str, channel: AbstractRandomAffine) -> JointModes:
+def _flag_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     """Modes of a channel all of whose modes are observed, with the map in each."""
     parts = channel.maps if isinstance(channel, Stack) else ()
     rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]

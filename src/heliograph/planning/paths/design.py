@@ -241,14 +241,14 @@ def _reach(problem: PathProblem, starts: list[Powers], target: float) -> Powers 
     nothing = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(nothing))[0] <= target:
         return nothing
-    raised = [start for start in (_raised(problem, start, target) for start in starts) if start is not None]
+    raised = [start for start in (_raise_powers(problem, start, target) for start in starts) if start is not None]
     if not raised:
         return None
     scale = max(float(raised[0].mean(axis=0).sum()), np.finfo(float).tiny)
     return problem._replace(scale=scale).solve(raised, target)
 
 
-def _raised(problem: PathProblem, start: Powers, target: float) -> Powers | None:
+def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
     """Start times the least factor that reaches the target, as far as peaks and means allow."""
 
     def reaches(factor: float) -> bool:

@@ -176,8 +176,12 @@ def independent_paths(
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
     r = at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
-    fading = at_least(1.0, "kappa of paths", array("kappa of paths", _by_hop(kappa, len(c), hops), (len(c), hops)))
-    costs = at_least(0.0, "alpha of paths", array("alpha of paths", _by_hop(alpha, len(c), hops), (len(c), hops)))
+    fading = at_least(
+        1.0, "kappa of paths", array("kappa of paths", _broadcast_to_hops(kappa, len(c), hops), (len(c), hops))
+    )
+    costs = at_least(
+        0.0, "alpha of paths", array("alpha of paths", _broadcast_to_hops(alpha, len(c), hops), (len(c), hops))
+    )
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
     start = None
     if error.horizon is not None:
@@ -207,7 +211,7 @@ def at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[n
     return value
 
 
-def _by_hop(value: ArrayLike, sensors: int, hops: int) -> Float[np.ndarray, "..."]:
+def _broadcast_to_hops(value: ArrayLike, sensors: int, hops: int) -> Float[np.ndarray, "..."]:
     """Numbers (M, H), from (M,) for one hop, or from one number for all."""
     numbers = np.asarray(value)
     if numbers.ndim == 0:

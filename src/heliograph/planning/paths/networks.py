@@ -63,7 +63,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         check_horizon(steps, covered)
         seconds, start = moments_over(plant, steps), np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's moves.
-    described = [_at_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
+    described = [_build_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     rows, second, signal, kappa, alpha, powers = (np.array(values) for values in list(zip(*described, strict=True))[:6])
     moves = [at(plant, k) for k in range(steps)]
     plants = Plants(np.array([p.matrix for p in moves]), np.array([p.noise.covariance for p in moves]), start)
@@ -165,7 +165,7 @@ class _Step(NamedTuple):
     path: list[int]
 
 
-def _at_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
+def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
     step = _Step([], [], [], [], [], [], [], [])
     for name, node in nodes.items():
         if node.informed_by is not None:

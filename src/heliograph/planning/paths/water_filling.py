@@ -45,7 +45,7 @@ def water_filling(
             smallest, best = gap, p
         if gap <= CLOSED * abs(here[0]) or idle > PATIENCE:
             break
-        p, here = _along(sensitivity, p, here, _filled(limits, here[1], a, b) - p)
+        p, here = _along(sensitivity, p, here, _fill_to_limits(limits, here[1], a, b) - p)
     return best
 
 
@@ -65,7 +65,7 @@ def _along(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead
     return p + ahead / 2, sensitivity(p + ahead / 2)
 
 
-def _filled(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
+def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
     """Powers at the level that the limits set, under fixed weights."""
     rise, dry = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
     steps = len(dry)
@@ -75,10 +75,10 @@ def _filled(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Power
         _level(rise[:, i], dry[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps) for i in range(dry.shape[1])
     ], dry.shape)  # fmt: skip
     level = _level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
-    return limits.clip(_at_level(np.minimum(level, highest), rise, dry, limits.peak))
+    return limits.clip(_fill_to_level(np.minimum(level, highest), rise, dry, limits.peak))
 
 
-def _at_level(
+def _fill_to_level(
     level: Float[np.ndarray, "*k"],
     rise: Float[np.ndarray, "*k"],
     dry: Float[np.ndarray, "*k"],
@@ -105,7 +105,7 @@ def _level(
     # The sum is piecewise linear in the level, with a turn where a power begins, or ends to grow.
     turns = np.concatenate([dry / rise, (dry + peak) / rise, highest])
     turns = np.unique(turns[np.isfinite(turns)])
-    sums = _at_level(np.minimum(turns[:, None], highest), rise, dry, peak).sum(axis=1)
+    sums = _fill_to_level(np.minimum(turns[:, None], highest), rise, dry, peak).sum(axis=1)
     if total < sums[-1]:
         return float(np.interp(total, sums, turns))
     growing = (highest > turns[-1]) & (rise * turns[-1] - dry < peak)

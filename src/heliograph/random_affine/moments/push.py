@@ -41,13 +41,13 @@ def push(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
 
     Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
     """
-    return channel.moments(order).expect(_checked(channel, order, moments))
+    return channel.moments(order).expect(_check_moments(channel, order, moments))
 
 
 @push.register
 def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
     """(A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
-    known = push_known(homogeneous(channel.matrix), order, _checked(channel, order, moments))
+    known = push_known(homogeneous(channel.matrix), order, _check_moments(channel, order, moments))
     scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
     row, column, noise, weight = sum_plan(channel.outputs, order)
     terms = weight * noise_vector(channel.noise, order)[noise] * scaled[column]
@@ -125,7 +125,7 @@ def second_moments(moments: Array1, variables: int, degree: int) -> Array2:
     return moments[product_table(variables, degree, degree)]
 
 
-def _checked(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     check_forgets("channel of a lift", channel)
     expected = count(channel.inputs + 1, order)
     if np.shape(moments) != (expected,):

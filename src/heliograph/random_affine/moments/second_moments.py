@@ -173,7 +173,7 @@ def _bounds(channel: AbstractRandomAffine) -> Bounds:
     corners = listed_corners(channel)
     listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
     if isinstance(channel, Superposed) and (corners == 1 or not listed):
-        return _from_sum(channel, [_bounds(affine) for affine in channel.maps])
+        return _bound_sum(channel, [_bounds(affine) for affine in channel.maps])
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
     # Known law: the moments themselves.
@@ -182,7 +182,7 @@ def _bounds(channel: AbstractRandomAffine) -> Bounds:
         return Bounds(mean, spread, shift, power, spread)
     # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
     if isinstance(channel, Stack):
-        parts = _from_stack(channel)
+        parts = _bound_stack(channel)
     elif listed:
         laws = (
             Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
@@ -190,7 +190,7 @@ def _bounds(channel: AbstractRandomAffine) -> Bounds:
         stacks = zip(*(_tensors(corner, mean) for corner in laws), strict=True)
         parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
     else:
-        parts = _from_intervals(channel, nominal, mean)
+        parts = _bound_from_intervals(channel, nominal, mean)
     spread, shift, power = parts
     return Bounds(mean, spread, shift, power, nominal_spread(channel))
 
@@ -224,10 +224,10 @@ def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
     raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
     law_mean = moments.mean[:-1]
     spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
-    return spread, symmetric_product(law_mean - mean, law_mean - mean), _of_signal(raw)
+    return spread, symmetric_product(law_mean - mean, law_mean - mean), _drop_constant(raw)
 
 
-def _of_signal(tensor: Tensor) -> Tensor:
+def _drop_constant(tensor: Tensor) -> Tensor:
     """The tensor without its last row and column, those of the constant 1."""
     signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
     signal_part: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
@@ -280,7 +280,7 @@ def _still(value: Matrix) -> Matrix:
     return jax.lax.stop_gradient(value) if is_traced(value) else value
 
 
-def _from_stack(channel: Stack) -> list[QuadraticMap]:
+def _bound_stack(channel: Stack) -> list[QuadraticMap]:
     """Diagonal blocks from each part; off the diagonal, independent parts meet through their means only.
 
     E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D| at most the reach of each mean.
@@ -295,7 +295,7 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
         low, high = moment_interval(affine, 1)
         xp = library(low, high, mean)
         reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
-        blocks.append([_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
+        blocks.append([_place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
     label = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
     apart = (label[:, None] != label[None, :])[:, :, None, None]
@@ -303,8 +303,8 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     far, size = xp.concatenate(reach), xp.abs(mean)
     # Off-diagonal blocks: bounds of |D_i Y Y' D_j'| by the product of reaches.
     cross = symmetric_product(far, far)
-    power_cross = _of_signal(symmetric_product(size, far) + symmetric_product(far, size) + cross)
-    centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
+    power_cross = _drop_constant(symmetric_product(size, far) + symmetric_product(far, size) + cross)
+    centers = (0.0, 0.0, _drop_constant(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
         QuadraticMap(sum(q.center for q in maps) + apart * center, sum(q.radius for q in maps) + apart * radius)
@@ -312,7 +312,7 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     ]
 
 
-def _from_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
+def _bound_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
     """Spreads of independent maps add up, and their means meet in every pair.
 
     With D_i the shift of a mean, (sum D_i) Y (sum D_i)' <= sum_i D_i Y D_i' / w_i for weights w of sum 1, which are as
@@ -322,25 +322,25 @@ def _from_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
     mean = channel.in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
     noise = _certain(channel.noise.covariance[..., None, None] * _corner(channel.inputs + 1))
-    of_mean = _certain(_of_signal(symmetric_product(mean, mean)))
-    own = _plus(_summed(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
+    of_mean = _certain(_drop_constant(symmetric_product(mean, mean)))
+    own = _plus(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
     sizes = [_size(bounds.shift) for bounds in parts]
     total = sum(sizes)
     if is_zero(total):
-        return Bounds(mean, own, _scaled(noise, 0.0), _plus(_signal(own), of_mean), own)
+        return Bounds(mean, own, _scale(noise, 0.0), _plus(_signal(own), of_mean), own)
     inverse = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
-    shift = _summed(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
-    cross = _summed(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
+    shift = _sum_maps(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
+    cross = _sum_maps(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
     # Power of the mean, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
     sure = _size(of_mean)
     ratio = total / library(sure).where(sure > 0, sure, 1.0)
-    power = _plus(_signal(own), _scaled(of_mean, 1 + ratio), _scaled(_signal(shift), 1 + 1 / ratio))
-    nominal = _plus(_summed(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
+    power = _plus(_signal(own), _scale(of_mean, 1 + ratio), _scale(_signal(shift), 1 + 1 / ratio))
+    nominal = _plus(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
     return Bounds(mean, _plus(own, cross), shift, power, nominal)
 
 
 def _signal(bound: QuadraticMap) -> QuadraticMap:
-    return QuadraticMap(_of_signal(bound.center), _of_signal(bound.radius))
+    return QuadraticMap(_drop_constant(bound.center), _drop_constant(bound.radius))
 
 
 def _size(shift: QuadraticMap) -> Any:
@@ -349,9 +349,9 @@ def _size(shift: QuadraticMap) -> Any:
     return library(tensor).sqrt(library(tensor).einsum("iiaa->", tensor))
 
 
-def _summed(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
+def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
     """Weighted sum of the maps of parts, each at the places of what its part takes."""
-    parts = {i: _scaled(part, weight) for i, (part, weight) in weighted.items()}
+    parts = {i: _scale(part, weight) for i, (part, weight) in weighted.items()}
     center = channel.in_places({i: part.center for i, part in parts.items()}, 2)
     return QuadraticMap(center, channel.in_places({i: part.radius for i, part in parts.items()}, 2))
 
@@ -360,7 +360,7 @@ def _plus(*maps: QuadraticMap) -> QuadraticMap:
     return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
 
 
-def _scaled(part: QuadraticMap, factor: Any) -> QuadraticMap:
+def _scale(part: QuadraticMap, factor: Any) -> QuadraticMap:
     return QuadraticMap(factor * part.center, factor * part.radius)
 
 
@@ -369,14 +369,14 @@ def _corner(size: int) -> np.ndarray:
     return np.outer(np.eye(size)[-1], np.eye(size)[-1])
 
 
-def _on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
+def _place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
     """The map of outputs start, start + 1, ... among all of them, zero elsewhere."""
     margin = (start, outputs - start - block.center.shape[0])
     widths = [margin, margin, (0, 0), (0, 0)]
     return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))
 
 
-def _from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
+def _bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
     """Bound spread, shift and power from the interval of each moment: raw - H0 m' - m H0' + H0 H0'."""
     low, high = moment_interval(channel, 2)
     xp = library(low, high, mean)
@@ -394,5 +394,5 @@ def _from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matri
     return [
         QuadraticMap(spread, spread_radius),
         QuadraticMap(np.zeros(spread.shape), symmetric_product(reach, reach)),
-        QuadraticMap(power, _of_signal(raw_radius)),
+        QuadraticMap(power, _drop_constant(raw_radius)),
     ]

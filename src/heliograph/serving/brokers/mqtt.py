@@ -105,7 +105,7 @@ class _Reader(_Connection):
         self._prefix, self._translator = f"{address.topic}/in/", translator
         self._held: deque[tuple[int, MQTTMessage, datetime]] = deque()
         self._connection = 0
-        self.client.on_message = self._on_message
+        self.client.on_message = self._hold_message
         self.start()
 
     async def receive(self) -> Batch:
@@ -138,7 +138,7 @@ class _Reader(_Connection):
         if connection == self._connection:  # else the number may by now be another message's; it comes again
             self.client.ack(message.mid, message.qos)
 
-    def _on_message(self, client: Client, data: object, message: MQTTMessage) -> None:
+    def _hold_message(self, client: Client, data: object, message: MQTTMessage) -> None:
         """Hold a message; while too many are held, block the client's thread so that no more are read."""
         with self.room:
             self.room.wait_for(lambda: len(self._held) < HELD or not self.open)

@@ -78,7 +78,7 @@ class Pipe:
     async def publish(self, outputs: Sequence[Output]) -> None:
         rest = memoryview(b"".join([output.body + b"\n" for output in outputs]))
         loop = asyncio.get_running_loop()
-        with _without_waiting(self.target) as (target, at_once):
+        with _set_nonblocking(self.target) as (target, at_once):
             while rest:
                 await _ready(target, loop.add_writer, loop.remove_writer)
                 with naming("standard output"), suppress(BlockingIOError):
@@ -89,7 +89,7 @@ class Pipe:
 
 
 @contextmanager
-def _without_waiting(file: int) -> Iterator[tuple[int, int | None]]:
+def _set_nonblocking(file: int) -> Iterator[tuple[int, int | None]]:
     """Yield a descriptor to write to, and the number of bytes that it takes without waiting; None for any number.
 
     A pipe is opened again, since whether it waits is a property that all who opened it share.

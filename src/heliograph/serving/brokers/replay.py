@@ -105,7 +105,7 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
         lost[event.node] = now
         copies = 0 if now else 1 + (chance.random() < twice)
         arriving += [_arriving(event, chance.exponential(link.delay)) for _ in range(copies)]
-    return _in_order(arriving)
+    return _sort_events(arriving)
 
 
 def along(events: Sequence[Event], trace: Path) -> list[Event]:
@@ -131,7 +131,7 @@ def along(events: Sequence[Event], trace: Path) -> list[Event]:
     received = [event for event in events if event.node != INPUTS]
     known = zip(received, np.resize(delays, len(received)).tolist(), strict=True)
     results = [_arriving(event, delay) for event, delay in known if not np.isnan(delay)]
-    return _in_order(results + [_arriving(event, 0.0) for event in events if event.node == INPUTS])
+    return _sort_events(results + [_arriving(event, 0.0) for event in events if event.node == INPUTS])
 
 
 def lines(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
@@ -161,7 +161,7 @@ def _arriving(event: Event, delay: float) -> Event:
     return event._replace(arrival=began + float(delay))
 
 
-def _in_order(events: list[Event]) -> list[Event]:
+def _sort_events(events: list[Event]) -> list[Event]:
     return sorted(events, key=lambda event: event.time if event.arrival is None else event.arrival)
 
 

@@ -108,7 +108,7 @@ class Translator:
             if not self.sources.of(topic):  # whatever it is
                 self.sources.unknown[topic] += 1
                 return []
-            for reading in self.sources.read(topic, _decoded(payload, topic), topic):
+            for reading in self.sources.read(topic, _decode(payload, topic), topic):
                 if stored and reading.time is None:
                     self._stored += 1
                     continue
@@ -173,7 +173,7 @@ def moment(nanoseconds: int) -> datetime:
         raise fail("time", "a date of these thousand years", nanoseconds) from None
 
 
-def _decoded(payload: bytes, topic: str) -> object:
+def _decode(payload: bytes, topic: str) -> object:
     if len(payload) > LONGEST:
         raise fail(topic, f"at most {LONGEST} bytes", len(payload))
     return decoded(payload, topic)

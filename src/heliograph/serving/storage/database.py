@@ -23,7 +23,7 @@ def engine_at(location: str) -> Engine:
     engine = create_engine(url_of(location))
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _durably)
-        event.listen(engine, "begin", _at_once)
+        event.listen(engine, "begin", _begin_immediate)
     return engine
 
 
@@ -66,6 +66,6 @@ def _durably(connection: Any, _: object) -> None:
         connection.execute(f"PRAGMA {pragma}")
 
 
-def _at_once(connection: Connection) -> None:
+def _begin_immediate(connection: Connection) -> None:
     """Begin a transaction with the write lock, so that it never has to upgrade a read lock."""
     connection.exec_driver_sql("BEGIN IMMEDIATE")

@@ -76,7 +76,7 @@ def _file(path: str, process: str) -> Iterator[None]:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                raise _taken(path, os.read(file, 200).decode(errors="replace").strip()) from None
+                raise _refuse_taken(path, os.read(file, 200).decode(errors="replace").strip()) from None
         os.ftruncate(file, 0)
         os.write(file, f"{name_of_process()}\n".encode())
         yield
@@ -94,10 +94,10 @@ def _session(engine: Engine, process: str) -> Iterator[None]:
         if not locked.scalar():
             row = connection.execute(WHOSE, {"space": SPACE, "key": key}).first()
             whose = "" if row is None else f"{row[0].removeprefix('heliograph ')} at {row[1]}"
-            raise _taken(engine.url.render_as_string(hide_password=True), whose)
+            raise _refuse_taken(engine.url.render_as_string(hide_password=True), whose)
         connection.commit()
         yield
 
 
-def _taken(where: str, whose: str) -> InputError:
+def _refuse_taken(where: str, whose: str) -> InputError:
     return fail(f"store {where}", "one that no other service has", f"that of {whose or 'another'}; {MEND}")

@@ -75,12 +75,12 @@ class Store:
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         try:
             with self._saying("a database that can be written"):
-                self.identity = self._stored_identity(mine)
+                self.identity = self._read_identity(mine)
                 self._check_layout(carrier is not None or mine is None)
                 # The network must be the same, unless its plants are carried over or any will do.
                 if carrier is None and mine is not None:
                     self._check_network(mine)
-                self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
+                self.damaged: dict[str, Damage] = self._find_damaged() if opened is None else opened.damaged
                 if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
                     self.carry(carrier, f"store {self.name}", self.identity)
         except AwayError:
@@ -94,7 +94,7 @@ class Store:
 
     def _check_network(self, mine: Identity) -> None:
         """Refuse the state of another network, naming what differs."""
-        if _compared(mine) == _compared(self.identity):
+        if _strip_description(mine) == _strip_description(self.identity):
             return
         try:
             differs = changes(mine, self.identity)
@@ -104,7 +104,7 @@ class Store:
             more = f" and {len(differs) - LISTED} more" if len(differs) > LISTED else ""
             got = f"one that differs: {'; '.join(differs[:LISTED])}{more}"
             raise fail(f"store {self.name}", "the state of what is here", got)
-        check_same(f"store {self.name}", _compared(mine), _compared(self.identity))
+        check_same(f"store {self.name}", _strip_description(mine), _strip_description(self.identity))
 
     @contextmanager
     def _saying(self, expected: str) -> Iterator[None]:
@@ -119,7 +119,7 @@ class Store:
                 raise AwayError(str(fail(f"store {self.name}", "a server that answers", str(said)))) from None
             raise fail(f"store {self.name}", expected, str(said)) from None
 
-    def _stored_identity(self, mine: Identity | None) -> Identity:
+    def _read_identity(self, mine: Identity | None) -> Identity:
         """Return the identity that the store was made with; a new store takes `mine`."""
         # All tables are there, or none: a store with some missing is damaged.
         there = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
@@ -153,7 +153,7 @@ class Store:
         raise fail(f"store {self.name}", f"layout {LAYOUT}, of heliograph {versions()['heliograph']}",
                    f"layout {layout}, of heliograph {release}{why}")  # fmt: skip
 
-    def _damaged(self) -> dict[str, Damage]:
+    def _find_damaged(self) -> dict[str, Damage]:
         """Return the plants with damaged rows, by name."""
         results: dict[str, Damage] = {}
         with self._engine.connect() as connection:
@@ -180,7 +180,7 @@ class Store:
         """Load the stored plants of these names; of some only damage may be left."""
         names = list(names)
         with self._saying("a database that can be read"), self._engine.connect() as connection:
-            rows = _of(connection, list(PLANTS.c), names)
+            rows = _select_plants(connection, list(PLANTS.c), names)
         results = {}
         for name, version, body, written in rows:
             whole = is_whole(written, name, version, body)
@@ -216,15 +216,15 @@ class Store:
             ConflictError: another process has committed one of the plants.
         """
         with self._saying("a database that takes a commit"):
-            return self._committed(plants, entries, malformed, published)
+            return self._commit(plants, entries, malformed, published)
 
-    def _committed(
+    def _commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
         with self._engine.begin() as connection:
             # The count locks the store for the other processes, which then see the new versions.
             newest = self._count(connection, NEWEST, len(entries))
-            versions = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
+            versions = dict(_select_plants(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
             if any(versions.get(name, 0) != plant.version for name, plant in plants.items()):
                 raise ConflictError
             outputs = Entry.numbered(entries, newest - len(entries) + 1)
@@ -272,14 +272,14 @@ class Store:
         """Return a stored count."""
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
-        return 0 if row is None else self._counted(*row)
+        return 0 if row is None else self._count_written(*row)
 
     def words(self) -> dict[str, int]:
         """Return the last words of devices that are kept, as numbers by topic."""
         mine = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             rows = connection.execute(mine).all()
-        return {name.removeprefix(WORD): self._counted(name, value, written) for name, value, written in rows}
+        return {name.removeprefix(WORD): self._count_written(name, value, written) for name, value, written in rows}
 
     def keep_words(self, words: Mapping[str, int]) -> None:
         """Keep the last words of devices, by topic; a topic that is longer than a name may be is left out."""
@@ -288,7 +288,7 @@ class Store:
             with self._saying("a database that can be written"), self._engine.begin() as connection:
                 self._put(connection, NUMBERS, rows)
 
-    def _counted(self, name: str, value: int, written: int) -> int:
+    def _count_written(self, name: str, value: int, written: int) -> int:
         if not is_whole(written, name, value):
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
         return value
@@ -300,7 +300,7 @@ class Store:
         with self._engine.begin() as connection:
             names = [name for (name,) in connection.execute(select(PLANTS.c.name)) if name not in self.damaged]
             for i in range(0, len(names), AT_ONCE):
-                rows = {row[0]: row[1:3] for row in _of(connection, list(PLANTS.c), names[i : i + AT_ONCE])}
+                rows = {row[0]: row[1:3] for row in _select_plants(connection, list(PLANTS.c), names[i : i + AT_ONCE])}
                 bodies = carrier.carried({name: body for name, (_, body) in rows.items()})
                 after = [with_checksum(PLANTS, name, rows[name][0] + 1, body) for name, body in bodies.items()]
                 self._put(connection, PLANTS, after)
@@ -342,7 +342,7 @@ class Store:
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
         if written != checksum(name, value):  # it was there, with the checksum of what it was
-            value = self._counted(name, value - more, written) + more
+            value = self._count_written(name, value - more, written) + more
             this = NUMBERS.c.name == name
             connection.execute(update(NUMBERS).where(this).values(checksum=checksum(name, value)))
         return int(value)
@@ -354,7 +354,7 @@ class Store:
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_=others), rows)
 
 
-def _of(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
+def _select_plants(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
     """Select columns of the plants of these names."""
     results: list[Any] = []
     for i in range(0, len(names), AT_ONCE):
@@ -367,6 +367,6 @@ def _output(line: str) -> Output:
     return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())
 
 
-def _compared(identity: Identity) -> Identity:
+def _strip_description(identity: Identity) -> Identity:
     """Return an identity without the description, of which the other parts are hashes."""
     return {name: value for name, value in identity.items() if name != DESCRIPTION}

@@ -131,7 +131,7 @@ def cross_covariances(
     instance("network", network, Network, "a Network")
     fusion = Fusion(filter, MatrixWeights())
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
-    filters, u = _prepared(alone, horizon, inputs)
+    filters, u = _plan_filters(alone, horizon, inputs)
     with jax.enable_x64(True):
         factors: Factors = to_numpy(_factors(filters, u))
     parts = factors.mean, factors.state, factors.bias, factors.shared, factors.independent
@@ -152,13 +152,13 @@ def fused_covariances(
         ValueError: a network without an informed fusion.
     """
     instance("network", network, Network, "a Network")
-    filters, u = _prepared(network, horizon, inputs)
+    filters, u = _plan_filters(network, horizon, inputs)
     with jax.enable_x64(True):
-        results: dict[str, np.ndarray] = to_numpy(_fused(filters, u))
+        results: dict[str, np.ndarray] = to_numpy(_compute_fused(filters, u))
     return results
 
 
-def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
+def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
     """Plan the filters for the inputs."""
     network.check_horizon(check_horizon(horizon))
     u = inputs_of(network, inputs, horizon)
@@ -186,7 +186,7 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
 
 
 @quickly_compiled
-def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
+def _compute_fused(filters: AllFilters, u: np.ndarray) -> PyTree:
     def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         (states, known), (k, u_k) = carry, row
         published: dict[str, jax.Array] = {}

@@ -149,8 +149,8 @@ def check_edge(what: str, link: Channel) -> None:
         late = late_part(step)
         if late is not None and not (late.constant or late.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
-        inside = _opened(step, Erasure | Delayed)[1]
-        for mode in (_opened(m)[1] for m in (inside.maps if isinstance(inside, Modes) else [inside])):
+        inside = _open_link(step, Erasure | Delayed)[1]
+        for mode in (_open_link(m)[1] for m in (inside.maps if isinstance(inside, Modes) else [inside])):
             if mode.remembers or mode.past or not _is_perfect(mode):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
                 raise fail(what, expected, type(first(link)).__name__)
@@ -158,11 +158,11 @@ def check_edge(what: str, link: Channel) -> None:
 
 def late_part(channel: AbstractRandomAffine) -> Delayed | None:
     """Return the delay of a link, whose messages may also be lost; None of one without."""
-    inside = _opened(channel)[1]
+    inside = _open_link(channel)[1]
     return inside if isinstance(inside, Delayed) else None
 
 
-def _opened(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[Scalar, AbstractRandomAffine]:
+def _open_link(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[Scalar, AbstractRandomAffine]:
     """Return the link for messages that are not lost, inside all maps of these kinds, and how probable they are."""
     arrival: Scalar = 1.0
     while isinstance(channel, kinds):
@@ -175,7 +175,7 @@ def arrival_chance(channel: Channel | None) -> float | None:
     """Probability that a message arrives; None where it is not the same at every step whatever was before."""
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
-    chance, inside = _opened(channel)
+    chance, inside = _open_link(channel)
     return None if inside.erases else float(chance)
 
 
@@ -186,7 +186,7 @@ def loss_rate(channel: Channel | None) -> float | None:
     """
     if channel is None or isinstance(channel, OverTime):
         return 0.0 if channel is None else None
-    arrival, inside = _opened(channel, Erasure | Delayed)
+    arrival, inside = _open_link(channel, Erasure | Delayed)
     if not isinstance(inside, Modes):
         return None if inside.erases else 1 - float(arrival)
     chances = [arrival_chance(mode) for mode in inside.maps]

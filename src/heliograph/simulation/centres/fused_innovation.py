@@ -72,13 +72,13 @@ class FusedInnovation(Module):
             # Prediction from the fused estimate, by the first node's model of the plant.
             if carry is None:
                 head, state = jax.tree.map(lambda a: a[0], (numbers, beliefs))
-                start = eqx.combine(head, static).predict(_with(state, before), u, k)
+                start = eqx.combine(head, static).predict(_replace_estimate(state, before), u, k)
                 carry = _gaussian(start), jnp.zeros(()), jnp.zeros(())
 
             def correct(carry: PyTree, row: PyTree, static: PyTree = static) -> tuple[PyTree, None]:
                 x, distance, arrived = carry
                 numbers, prior, z_i = row
-                after, innovation = eqx.combine(numbers, static).correct(_with(prior, x), z_i, k)
+                after, innovation = eqx.combine(numbers, static).correct(_replace_estimate(prior, x), z_i, k)
                 more, count = innovation_distance(innovation)
                 return (_gaussian(after), distance + more, arrived + count), None
 
@@ -91,7 +91,7 @@ class FusedInnovation(Module):
         return FusedDistance(jnp.where(arrived > 0, distance, jnp.nan), arrived)
 
 
-def _with(state: PyTree, x: Gaussian) -> PyTree:
+def _replace_estimate(state: PyTree, x: Gaussian) -> PyTree:
     return state._replace(**x._asdict())
 
 

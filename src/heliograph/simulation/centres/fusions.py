@@ -58,8 +58,8 @@ class Fused(Module):
     ) -> tuple[PyTree, dict[str, Estimate], dict[str, PyTree]]:
         """Fuse the filters' estimates, (filter, node, ...) of each kind: estimates and uplinks by fusion."""
         # Means and covariances in the order of each fusion's nodes.
-        means = self._gathered([e.mean for e in estimates])
-        covariances = self._gathered([e.covariance for e in estimates])
+        means = self._gather([e.mean for e in estimates])
+        covariances = self._gather([e.covariance for e in estimates])
         uplinks: dict[str, PyTree] = {}
         # Quantized means, and covariances widened by the quantizers' errors.
         if self.quantizers is not None:
@@ -77,7 +77,7 @@ class Fused(Module):
         items = enumerate(zip(self.names, self.claims, strict=True))
         return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
 
-    def _gathered(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
+    def _gather(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Gather the sources' values as (fusion, node, ...)."""
         joined = [jnp.concatenate([parts[k][f] for k, f in source]) for source in self.sources]
         if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
@@ -121,10 +121,10 @@ def fusions_of(network: Network) -> tuple[Fused, ...]:
             nodes = network.nodes_with(fusion.filter)
             alike.setdefault(structure((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes))), []).append(name)
     places, claims = network.places, network.claims().get(FUSED, {})
-    return tuple(_fused(network, names, places, [claims[name] for name in names]) for names in alike.values())
+    return tuple(_stack_fusions(network, names, places, [claims[name] for name in names]) for names in alike.values())
 
 
-def _fused(
+def _stack_fusions(
     network: Network, names: Sequence[str], places: Mapping[tuple[str, str], tuple[int, int, int]], claims: list[Claim]
 ) -> Fused:
     """Stack fusions of one structure, with the places of the estimates that they fuse."""

@@ -74,7 +74,7 @@ class LinearisedCentre(Module):
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors; the rule weights the reports by them.
-            step = _shared_step(matrix, keep, linear.gain)
+            step = _make_shared_step(matrix, keep, linear.gain)
             after = advance(before.errors, step, motion, linear.noise)
             errors = before.errors._replace(bias=after.bias, joint=after.joint)  # the plant's moments are not known
             if isinstance(rule, AllReports):
@@ -84,7 +84,7 @@ class LinearisedCentre(Module):
         return following, results
 
 
-def _shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorStep:
+def _make_shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorStep:
     """e+ = F_i (A e + w) - K_i nu: errors of mean zero keep it."""
     nothing = jnp.zeros_like(keep)
     return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)

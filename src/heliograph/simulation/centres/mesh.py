@@ -144,8 +144,8 @@ class Mesh(Module):
         # All rounds but the last only intersect.
         mean = state.mean
         for weights in parts.exchanges:
-            mean = mean + self._pulled(weights.front, weights.parts, mean, mean[self.senders])
-        sent = self._sent(mean, state, jnp.asarray(arrived[:, -1]), messages)
+            mean = mean + self._pull_to_neighbours(weights.front, weights.parts, mean, mean[self.senders])
+        sent = self._send_estimates(mean, state, jnp.asarray(arrived[:, -1]), messages)
         mean = mean[self.senders[:, 0]]  # of the nodes that are stepped
         # Innovations about one common prediction, so that no digits of the means themselves are lost.
         predicted = mean @ motion.matrix.T + motion.shift
@@ -153,20 +153,20 @@ class Mesh(Module):
         observation = parts.data.observation
         off = jnp.where(present, there - observation.offset - observation.gain @ common, 0.0)
         weighted = jnp.einsum("inm,im->in", parts.data.weighted, off)
-        sums = self._collected(weighted, arrived)
+        sums = self._collect_sums(weighted, arrived)
         # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
         innovation = sums - jnp.einsum("iab,ib->ia", parts.information, predicted - common)
-        pulled = self._pulled(gains.front, gains.parts, mean, sent)
+        pulled = self._pull_to_neighbours(gains.front, gains.parts, mean, sent)
         mean = predicted + pulled + jnp.einsum("iab,ib->ia", gains.gain, innovation)
         # Covariance of all errors where the rule needs it; it is then what is claimed.
-        joint = None if state.joint is None else self._moved(state.joint, parts, jnp.asarray(arrived[:, -1]))
+        joint = None if state.joint is None else self._propagate_joint(state.joint, parts, jnp.asarray(arrived[:, -1]))
         claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
         held = None if state.sent is None else sent @ motion.matrix.T + motion.shift
         after = MeshState(mean, gains.covariance, joint, parts.plant, held, None)
         if messages is not None and state.way is not None:
             on = one_step_on(messages, state.way, motion, common, weighted, parts.data.information)
             after = after._replace(way=on)
-        return after, self._by_group(mean, claimed)
+        return after, self._split_by_group(mean, claimed)
 
     def _messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:
         """Messages that are no estimates of now as they are; None where all are."""
@@ -175,7 +175,7 @@ class Mesh(Module):
         ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)
         return messages_of(state.mean, state.covariance, state.way, self.quantizer, self.senders, ages)
 
-    def _sent(
+    def _send_estimates(
         self, mean: jax.Array, state: MeshState, arrives: jax.Array, messages: Messages | None
     ) -> Float[jax.Array, "node degree n"]:
         """Estimates that the nodes have of their neighbours: those of now, or what they received last or late."""
@@ -202,11 +202,11 @@ class Mesh(Module):
         after = moved_state(jnp.asarray(moments[0]), jnp.asarray(moments[1]), motion)
         exchanges = []
         for number in range(self.edges.rounds - 1):
-            exchanges.append(self._over_nodes(_weights, covariance, None, arrived[:, number]))
+            exchanges.append(self._map_nodes(_weights, covariance, None, arrived[:, number]))
             covariance = jnp.asarray(exchanges[-1].covariance)
         # What each node learns of the measurements, and its gains.
         data = self._data(self.observation_model.observe(*after, jnp.asarray(k)), there)
-        information = self._collected(data.information, arrived)
+        information = self._collect_sums(data.information, arrived)
         complete = self.sum_of(data.complete, jnp.asarray(self.edges.present))
         arrives, senders = arrived[:, -1], None
         if messages is not None:
@@ -218,7 +218,7 @@ class Mesh(Module):
         """Measurements of a group, filled with NaN up to the longest."""
         return jnp.pad(z, ((0, 0), (0, self.observation_model.size - z.shape[1])), constant_values=jnp.nan)
 
-    def _pulled(
+    def _pull_to_neighbours(
         self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n *n"],
         mean: jax.Array, sent: Float[jax.Array, "node degree n"],
     ) -> Float[jax.Array, "node n"]:  # fmt: skip
@@ -235,7 +235,7 @@ class Mesh(Module):
         complete = jax.vmap(information_of)(gain, noise, real)[1]
         return Data(observation, weighted, information, complete)
 
-    def _over_nodes(
+    def _map_nodes(
         self,
         function: Callable[..., PyTree],
         covariance: jax.Array,
@@ -261,10 +261,10 @@ class Mesh(Module):
         if len(by_bucket) == 1:
             return by_bucket[0]
         # Rows of one length again, in the order of the nodes.
-        padded = [r._replace(parts=_padded(r.parts, self.senders.shape[1])) for r in by_bucket]
+        padded = [r._replace(parts=_pad_to_degree(r.parts, self.senders.shape[1])) for r in by_bucket]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
-    def _collected(self, values: jax.Array, arrived: Arrived) -> jax.Array:
+    def _collect_sums(self, values: jax.Array, arrived: Arrived) -> jax.Array:
         """Sums of the nodes' messages that each node has after all rounds, each counted once."""
         if self.edges.rounds == 1:
             return self.sum_of(values, jnp.asarray(arrived[:, 0]))
@@ -296,7 +296,7 @@ class Mesh(Module):
                 return gains_of(Weights(jnp.eye(len(motion.shift)), *known), step)
             return rule.neighbour_gains(belief, step)
 
-        gains: Gains = self._over_nodes(single, covariance, blocks, present, information, complete,
+        gains: Gains = self._map_nodes(single, covariance, blocks, present, information, complete,
                                          ahead=ahead, senders=senders)  # fmt: skip
         return gains
 
@@ -306,7 +306,7 @@ class Mesh(Module):
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
 
-    def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
+    def _propagate_joint(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
         """Joint covariance after a step."""
         gains, motion, size = parts.gains, parts.motion, joint.shape[0] * joint.shape[1]
         measured = used(gains.gain, present)
@@ -315,7 +315,7 @@ class Mesh(Module):
         after = joint_after(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
         return jnp.asarray(after).reshape(joint.shape)
 
-    def _by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
+    def _split_by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
         """Estimates (1, node, ...) of the mesh's nodes in each of the network's groups."""
         return tuple(
             Estimate(mean[jnp.array(rows)][None], covariance[jnp.array(rows)][None], self.claim) for rows in self.places
@@ -327,7 +327,7 @@ def _weights(rule: AbstractFusion, belief: Believed, *_: PyTree) -> Weights:
     return rule.neighbour_weights(belief)
 
 
-def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
+def _pad_to_degree(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
     """Pad rows with zeros up to the longest."""
     return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), *[(0, 0)] * (parts.ndim - 2)))
 

@@ -146,7 +146,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: HasNodes) -> None
     for i, sensor in enumerate(sensors):
         if isinstance(sensor, Node):
             h, noise = _model(sensor)
-            squares[i] = _scaled(h).T @ _scaled(h)
+            squares[i] = _scale_rows(h).T @ _scale_rows(h)
             _check_regular(f"{what}: node {nodes[i]!r}", noise)
     # Modes of the plant, unstable and decaying, that nobody upstream of a node observes.
     unseen: dict[bool, list[str]] = {True: [], False: []}
@@ -205,7 +205,7 @@ def _sees(node: object, vector: np.ndarray) -> bool:
     """Test whether a node's own measurement shows a mode."""
     if not isinstance(node, Node):
         return False
-    return bool(np.any(np.abs(_scaled(_model(node)[0]) @ vector) > RANK))
+    return bool(np.any(np.abs(_scale_rows(_model(node)[0]) @ vector) > RANK))
 
 
 def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
@@ -219,7 +219,7 @@ def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
     return hidden
 
 
-def _scaled(h: np.ndarray) -> np.ndarray:
+def _scale_rows(h: np.ndarray) -> np.ndarray:
     """Rows of unit length, whatever the unit of a measurement."""
     lengths = np.linalg.norm(h, axis=1, keepdims=True)
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))

@@ -70,11 +70,11 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
     mesh = mesh_named(network, fusion)
     steps = check_count("horizon", horizon)
     with jax.enable_x64(True):
-        return np.asarray(_drawn(mesh.edges, key_of(key), np.arange(steps)))
+        return np.asarray(_draw_arrivals(mesh.edges, key_of(key), np.arange(steps)))
 
 
 @quickly_compiled
-def _drawn(edges: Edges, key: jax.Array, steps: np.ndarray) -> jax.Array:
+def _draw_arrivals(edges: Edges, key: jax.Array, steps: np.ndarray) -> jax.Array:
     """Draw what arrives by the edges alone, so that all rules share a program."""
 
     def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
@@ -211,7 +211,7 @@ def best_possible(
     information: list[np.ndarray] = []
     for k in reversed(range(len(u))):
         for number in reversed(range(mesh.edges.rounds)):
-            known = _reached(known, mesh, flags[k, :, number])
+            known = _extend_reach(known, mesh, flags[k, :, number])
         s = np.asarray(steps[k].data.information)
         information.append((known @ s.reshape(count, -1)).reshape(s.shape))
     # Riccati recursions of all nodes side by side, oldest measurement first.
@@ -234,7 +234,7 @@ def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k
     return mesh.parts(covariance, blocks, moments, there, lossless, u, k)
 
 
-def _reached(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
+def _extend_reach(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     """Matrix of what is known through one exchange more, earlier: a one where some message carried it."""
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)

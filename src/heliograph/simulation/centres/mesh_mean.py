@@ -75,7 +75,7 @@ def mean_mesh_errors(
     names = mesh.nodes
     graph = graph_of(between.neighbours or {}, names)
     links = {} if between.link is None else edge_links(between.link, graph)
-    chances = [_known(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
+    chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
     rule = between.rule.placed(graph)
@@ -158,7 +158,7 @@ def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
     return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
 
 
-def _known(edge: str, link: Channel) -> float:
+def _get_known_probability(edge: str, link: Channel) -> float:
     """Probability that a message of this edge arrives, at every step the same and drawn anew."""
     chance = arrival_chance(link)
     if chance is None:

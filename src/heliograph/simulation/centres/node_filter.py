@@ -64,7 +64,7 @@ class NodeFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: NodeState, u: ArrayLike = (), k: Step = 0) -> NodeState:
         """Predict from the node's estimate alone, as if no message came."""
-        return self._after(state.now, jnp.full(self.received, jnp.nan), jnp.asarray(u), k)
+        return self._make_state(state.now, jnp.full(self.received, jnp.nan), jnp.asarray(u), k)
 
     @corrects
     def correct(self, state: NodeState, z: ArrayLike, k: Step = 0) -> tuple[NodeState, Innovation]:
@@ -74,13 +74,13 @@ class NodeFilter(AbstractSizedFilter):
         sensed, _ = self._parts(jnp.asarray(z), state.before)
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
-            return self._after(state.before, jnp.asarray(z), state.inputs, k), no_innovation()
+            return self._make_state(state.before, jnp.asarray(z), state.inputs, k), no_innovation()
         gain, offset = (jnp.concatenate([stacked[i, :size] for i, size in sensors])
                         for stacked in (observation.gain, observation.offset))  # fmt: skip
         noise = block_diag(*(observation.noise[i, :size, :size] for i, size in sensors))
         total = gain @ covariance @ gain.T + noise
         innovation = gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
-        return self._after(state.before, jnp.asarray(z), state.inputs, k), innovation
+        return self._make_state(state.before, jnp.asarray(z), state.inputs, k), innovation
 
     @estimates
     def estimate(self, state: NodeState) -> Estimate:
@@ -107,7 +107,7 @@ class NodeFilter(AbstractSizedFilter):
             covariances.append(jnp.where(arrives, symmetrize(rest.reshape(n, n)), covariances[0]))
         return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
-    def _after(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
+    def _make_state(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
         sensed, all_nodes = self._parts(z, before)
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
         now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))

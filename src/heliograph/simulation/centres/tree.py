@@ -114,9 +114,9 @@ def relay_tree(
         # Leaves in blocks, whole relays each: covariances, weights, and the relays as nodes.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
-        block_results = [to_numpy(_followed((plant, name, node, degree), block, u)) for block in blocks]
+        block_results = [to_numpy(_propagate_leaves((plant, name, node, degree), block, u)) for block in blocks]
         covariances, weights, level = (list(leaves) for leaves in zip(*block_results, strict=True))
-        level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _joined(level)
+        level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _join_levels(level)
         # Level by level up to the root.
         while True:
             level_covariances.append(np.asarray(_spread(shared)))
@@ -124,7 +124,7 @@ def relay_tree(
                 return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(level_covariances), tuple(used))
             groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(level_covariances[-1]), degree)]
             outputs = [to_numpy(_relay(group)) for group in groups]
-            used.append(np.stack([_padded(relay_weights, degree) for relay_weights, _ in outputs]))
+            used.append(np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs]))
             shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(relay for _, relay in outputs))
 
 
@@ -136,7 +136,7 @@ class Level(NamedTuple):
 
 
 @quickly_compiled
-def _followed(
+def _propagate_leaves(
     leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
 ) -> tuple[Array, Array, Level]:
     """Propagate the leaves of one block: covariances of their errors, weights of the relays above, and these."""
@@ -190,11 +190,11 @@ def _spread(level: Level) -> Array:
     return level.shared @ level.shared.swapaxes(-1, -2) + level.independent
 
 
-def _joined(levels: list[Level]) -> Level:
+def _join_levels(levels: list[Level]) -> Level:
     return Level(*(np.concatenate(leaves) for leaves in zip(*levels, strict=True)))
 
 
-def _padded(weights: np.ndarray, degree: int) -> np.ndarray:
+def _pad_to_degree(weights: np.ndarray, degree: int) -> np.ndarray:
     return np.pad(weights, ((0, 0), (0, degree - weights.shape[1]), (0, 0)))
 
 

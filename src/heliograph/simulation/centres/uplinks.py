@@ -131,12 +131,12 @@ class Uplinks(Module):
         for i, node in enumerate(nodes):
             sent, size = reports[node], self.received[i]
             if isinstance(sent, SentReports):
-                delay[:, i] = self._checked_delay(f"delays of node {node!r}", sent.delay, steps, i)
+                delay[:, i] = self._check_delay(f"delays of node {node!r}", sent.delay, steps, i)
                 sent = sent.values
             values[:, i, :size] = array(f"reports of node {node!r}", sent, (steps, size), missing=True)
         return Drawn(np.zeros((steps, count, m, self.n)), values, delay)
 
-    def _checked_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
+    def _check_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
         delays: np.ndarray = array(name, value, (steps,))
         possible = np.flatnonzero(self.delay[node] > 0)
         if not np.all(np.isin(delays, possible)):
@@ -193,7 +193,7 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     return Uplinks(
         groups=channel_groups(named) if random else (),
         quantizers=stack(quantizers) if quantizers else None,
-        links=_known([described(channel) for channel in channels], received, error),
+        links=_model_links([described(channel) for channel in channels], received, error),
         delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in mine]),
         every=np.array([link.every for link in mine], float),  # numbers of a program: other intervals share it
         received=received,
@@ -201,7 +201,9 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     )
 
 
-def _known(known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray) -> Links | OverTime:
+def _model_links(
+    known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
+) -> Links | OverTime:
     """Model of the uplinks for a centre, at each step if any varies."""
     varying = [link.steps for link in known if isinstance(link, OverTime)]
     if not varying:

@@ -47,7 +47,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     Args:
         network: the network.
     """
-    lines = [*_unobservable(network), *_unbounded(network), *_unheard(network)]
+    lines = [*_unobservable(network), *_doubt_boundedness(network), *_unheard(network)]
     lines += [*_forgotten(network), *_other_worlds(network)]
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in rounded_in_words(network)]
@@ -111,7 +111,7 @@ def observability(plant: AbstractPlant, sensors: list[AbstractSensor]) -> Float[
         return np.asarray(jax.jacfwd(outputs)(jnp.asarray(point)))
 
 
-def _unbounded(network: Network) -> Iterator[Doubt]:
+def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
     """Yield what the certificate of boundedness says of all nodes together, and of each alone."""
     # All nodes together, then each that has filters.
     yield from _bound(network, "the mean error of every filter", True)

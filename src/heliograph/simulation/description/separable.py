@@ -22,8 +22,8 @@ def separate_nodes(network: Network) -> list[list[str]]:
     linear = isinstance(network.plant, LinearPlant) and all(isinstance(s, LinearSensor) for s in nodes.values())
     if not linear or len(nodes) < len(network.nodes):
         return [list(network.nodes)]
-    measured = {name: _measured(sensor) for name, sensor in nodes.items()}
-    coupled = _coupled(network.plant)
+    measured = {name: _mask_measured(sensor) for name, sensor in nodes.items()}
+    coupled = _mask_coupled(network.plant)
     for states in measured.values():
         coupled |= states[:, None] & states
     _, parts = connected_components(coupled, directed=False)
@@ -33,12 +33,12 @@ def separate_nodes(network: Network) -> list[list[str]]:
     return list(by_part.values())
 
 
-def _measured(sensor: object) -> Bool[np.ndarray, " states"]:
+def _mask_measured(sensor: object) -> Bool[np.ndarray, " states"]:
     assert isinstance(sensor, LinearSensor)
     return np.asarray(np.any(np.asarray(sensor.matrix) != 0, axis=0))
 
 
-def _coupled(plant: object) -> Bool[np.ndarray, "states states"]:
+def _mask_coupled(plant: object) -> Bool[np.ndarray, "states states"]:
     assert isinstance(plant, LinearPlant)
     u = jnp.ones(len(plant.inputs))
     with jax.enable_x64(True):

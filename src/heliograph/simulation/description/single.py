@@ -48,10 +48,10 @@ def _models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
 def _arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
     yield from (x for x in jax.tree.leaves(model) if isinstance(x, jax.Array | np.ndarray) and not is_traced(x))
     for function, arguments in functions:
-        yield from _of(function, *arguments)
+        yield from _collect_arrays(function, *arguments)
 
 
-def _of(function: Callable[..., Any], *arguments: np.ndarray) -> list[Any]:
+def _collect_arrays(function: Callable[..., Any], *arguments: np.ndarray) -> list[Any]:
     """Return the arrays that a function of a model holds; none of one that cannot be traced by itself."""
     try:
         return [x for x in constants(function, *arguments)[0] if not is_traced(x)]

@@ -76,7 +76,7 @@ def nees(
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
-    return _squared(wrapped(x - m, angles_among(angles, x.shape[-1])), _of_each(covariance, x), x)
+    return _square_normalised(wrapped(x - m, angles_among(angles, x.shape[-1])), _broadcast_to_steps(covariance, x), x)
 
 
 def nis(
@@ -100,17 +100,19 @@ def nis(
     """
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
-    return _squared(wrapped(e, angles_at(angles, e.shape[-1])), _of_each(covariance, e), np.zeros_like(e))
+    return _square_normalised(
+        wrapped(e, angles_at(angles, e.shape[-1])), _broadcast_to_steps(covariance, e), np.zeros_like(e)
+    )
 
 
-def _of_each(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]) -> Float[np.ndarray, "*steps n n"]:
+def _broadcast_to_steps(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]) -> Float[np.ndarray, "*steps n n"]:
     """Covariance of each step; one matrix is that of all steps."""
     n = x.shape[-1]
     shape = (n, n) if rank("covariance", covariance) == 2 else (*x.shape, n)
     return np.broadcast_to(array("covariance", covariance, shape, missing=True), (*x.shape, n))
 
 
-def _squared(
+def _square_normalised(
     x: Float[np.ndarray, "*steps n"], covariance: Float[np.ndarray, "*steps n n"], size: Float[np.ndarray, "*steps n"]
 ) -> Float[np.ndarray, "*steps"]:
     """x' P^-1 x of each step, over the components that are not NaN; NaN where all are.

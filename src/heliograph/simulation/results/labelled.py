@@ -35,7 +35,7 @@ def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
         columns |= {(node, "", "measurement", f"z{i}", ""): z[..., i] for i in range(z.shape[-1])}
     for node, filters in fields["estimates"].items():
         for name, estimate in filters.items():
-            columns |= _of_estimate(node, name, estimate, fields["states"])
+            columns |= _label_estimate(node, name, estimate, fields["states"])
     for name, uplink in fields["uplinks"].items():
         for i, node in enumerate(uplink.nodes):
             for quantity in SENT:
@@ -102,7 +102,7 @@ def _labels(columns: Sequence[Column]) -> Any:
     return pd.MultiIndex([pd.Index(level, dtype=object) for level in levels], codes, names=LEVELS)
 
 
-def _of_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
+def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     results: dict[Column, np.ndarray] = {(node, name, "mean", s, ""): mean[..., i] for i, s in enumerate(states)}
     for i, state in enumerate(states):

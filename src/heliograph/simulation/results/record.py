@@ -209,7 +209,7 @@ class Record(Saved):
         # Variables, NaN where a node has no such filter or component.
         variables = {
             "measurement": ([*axes, TIME, "node", "received"], filled(lead, (len(nodes),), (most,), received)),
-            "length": (["node"], _per_node(nodes, {node: z.shape[-1] for node, z in self.measurements.items()})),
+            "length": (["node"], _list_by_node(nodes, {node: z.shape[-1] for node, z in self.measurements.items()})),
             "estimated": (["node"], np.array([node in self.estimates for node in nodes], dtype=bool)),
             "claim": (["node", "filter"], claims_of(sizes, results)),
             "mean": (
@@ -386,5 +386,5 @@ def _when(bad: np.ndarray) -> list[str]:
     return [f"from step {step} in {runs} of {len(by_time)} runs"]
 
 
-def _per_node(nodes: Sequence[str], values: Mapping[str, int]) -> np.ndarray:
+def _list_by_node(nodes: Sequence[str], values: Mapping[str, int]) -> np.ndarray:
     return np.array([values.get(node, -1) for node in nodes], dtype=np.int64)

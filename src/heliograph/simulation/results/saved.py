@@ -95,7 +95,7 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
     kind = _kind(path)
     import_module(kind)
     # Names as text that any file can hold; floats without a fill value.
-    plain = dataset.assign_coords({name: (c.dims, _mapped(in_file, c), c.attrs) for name, c in _texts(dataset)})
+    plain = dataset.assign_coords({name: (c.dims, _map_names(in_file, c), c.attrs) for name, c in _texts(dataset)})
     encoding: Any = {name: {"_FillValue": None} for name in plain.variables if plain[name].dtype.kind == "f"}
     if dataset["time"].dtype.kind == "M":
         encoding["time"] = {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
@@ -130,7 +130,7 @@ def opened(path: str | Path) -> "xr.Dataset":
             dataset = stored.load()
     except (OSError, ValueError, KeyError) as error:
         raise fail(str(path), "a file of results that can be read", f"{type(error).__name__}: {error}") from None
-    return dataset.assign_coords({name: (c.dims, _mapped(from_file, c), c.attrs) for name, c in _texts(dataset)})
+    return dataset.assign_coords({name: (c.dims, _map_names(from_file, c), c.attrs) for name, c in _texts(dataset)})
 
 
 def _kind(path: Path) -> str:
@@ -146,7 +146,7 @@ def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
     return [(name, c) for name, c in dataset.coords.items() if c.dtype.kind in "OUT"]
 
 
-def _mapped(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
+def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
     changed = [change(str(name)) for name in names.values]
     if change is in_file:
         return np.array(changed, dtype="U")

@@ -154,7 +154,7 @@ class ErrorStatistics:
         chosen = ~held_out & (self.count > 0)
         actual, claimed = outer[chosen].sum(axis=0), covariance[chosen].sum(axis=0)
         # Step and direction of the largest ratio in the other half of the batches.
-        values, directions = _generalised_eigen(actual, claimed)
+        values, directions = _solve_generalised_eigen(actual, claimed)
         step = int(np.argmax(values[:, -1]))
         d = directions[step, :, -1]
         judged = held_out & (self.count > 0)
@@ -249,7 +249,7 @@ def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
     return root, error / (2 * root) if root else 0.0
 
 
-def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _solve_generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
 
     Each component is in units of its B_ii, and where that is zero of its A_ii.

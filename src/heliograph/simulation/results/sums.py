@@ -209,8 +209,8 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     estimate = record.estimates[node][name]
     # The sums of a simulation, in which this is the only estimate; runs are dealt to batches.
     arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
-    step: OfStep = over_runs(_of_run, *arrays)
-    sums, ever = jax.tree.map(_by_batch, (step.sums, step.ever))
+    step: OfStep = over_runs(_reduce_run, *arrays)
+    sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))
     count = np.bincount(np.arange(len(record.truth)) % BATCHES, minlength=BATCHES).astype(float)
     common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
     count, (parts,) = _split(Statistics().summed(OfStep(sums, ever), common, count), [])
@@ -219,12 +219,12 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     return replace(_statistics(count, parts, estimate.claim), uplink=uplink)
 
 
-def _of_run(truth: Array, mean: Array, covariance: Array) -> OfStep:
+def _reduce_run(truth: Array, mean: Array, covariance: Array) -> OfStep:
     """Reduce one run of a record."""
     steps = {"truth": truth, "estimates": (), "fused": {"": Estimate(mean, covariance, "none")}, "uplinks": {}}
     return of_rows(Statistics(), steps)
 
 
-def _by_batch(values: np.ndarray) -> np.ndarray:
+def _sum_batches(values: np.ndarray) -> np.ndarray:
     """Sum values (run, ...) over the runs of each batch, (..., batch)."""
     return np.stack([values[batch::BATCHES].sum(axis=0, dtype=float) for batch in range(BATCHES)], axis=-1)

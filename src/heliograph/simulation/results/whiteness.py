@@ -72,7 +72,7 @@ def memory_test(
     Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
     """
     check_count("lags", lags)
-    white = _standardised(data) if filter is None else whitened_innovations(data, filter, inputs)
+    white = _standardise(data) if filter is None else whitened_innovations(data, filter, inputs)
     return memory_of(white, lags, claimed=filter is not None)
 
 
@@ -91,8 +91,8 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
     # Correlations and their standard errors by lag: the same in any unit, so in one whose squares are numbers.
     unit = 2.0 ** (int(np.frexp(np.nanmax(np.abs(white)))[1]) - 1)
     white = white / unit
-    size, size_error = correlated_mean(_by_step(white**2))
-    parts = [correlated_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
+    size, size_error = correlated_mean(_average_components(white**2))
+    parts = [correlated_mean(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
     # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
     p_value = (
@@ -103,7 +103,7 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
     return MemoryTest(correlation, error, p_value, share, *power)
 
 
-def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
+def _standardise(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     """Innovations of unknown covariance, each component in units of its deviation."""
     values = array("innovations", data, (None,) * max(rank("innovations", data), 1), missing=True)
     value = values[:, None] if values.ndim == 1 else values
@@ -137,7 +137,7 @@ def whitened_innovations(
     return np.asarray(innovations_of(filter, *data_of(filter, data, inputs))[1])
 
 
-def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
+def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
     """Mean over the components that are not NaN; NaN where none is."""
     there = np.sum(~np.isnan(parts), axis=1)
     return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))

@@ -59,7 +59,7 @@ def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
     mean = by_name(network, numbered, lambda estimate: np.asarray(estimate.mean), -3)
     covariance = by_name(network, numbered, lambda estimate: np.asarray(estimate.covariance), -4)
-    judged, weighed = _judged(network, numbered), _weighed(network, numbered)
+    judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
     tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
         FilterColumns(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
@@ -69,7 +69,7 @@ def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
     )  # fmt: skip
 
 
-def _weighed(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
+def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
     """Return the columns of what each filter that weighs made of its components, by node and filter."""
     parts = {
         name: [np.asarray(field)[f, i] for field in outcome["weighed"][kind]]
@@ -82,7 +82,7 @@ def _weighed(network: Network, outcome: PyTree) -> dict[tuple[str, str], Weighed
     }
 
 
-def _judged(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
+def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
     """Return the columns of each part of a judgement, by node and filter."""
     judged = {"estimates": outcome["judged"], "fused": {}}
     parts = [by_name(network, judged, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]

@@ -98,13 +98,13 @@ class RowStep:
         self._like = tuple(_like(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)
         self._layout = Layout(static, self.state, received, inputs)
-        self.outputs = flat_like(_traced(self._layout, self._like).out_info[1])
+        self.outputs = flat_like(_trace_step(self._layout, self._like).out_info[1])
         self.columns = columns_of(network, self.outputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
         # Native code with the network's numbers filled in, where it takes the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
-        self._choice = chosen(_in_rows(self._layout), (self._numbers, row), (False, True))
+        self._choice = chosen(_make_row_function(self._layout), (self._numbers, row), (False, True))
         code = self._choice.code
         self._code = None if code is None else code.with_first(*self._numbers)
 
@@ -132,7 +132,7 @@ class RowStep:
             stepped: np.ndarray = self._code(rows)
             return stepped
         width, together = (1, 1) if alone else self._block
-        run = _by_xla(self._layout, self.outputs, width, together)
+        run = _compile_xla(self._layout, self.outputs, width, together)
         done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
         for begin in range(0, len(rows), width):
             count = min(width, len(rows) - begin)
@@ -157,7 +157,7 @@ def _like(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 @lru_cache
-def _stepped(layout: Layout) -> Any:
+def _make_step(layout: Layout) -> Any:
     """Return the function of one row to states and outputs, traced once for the outputs' layout, code and text."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
@@ -168,31 +168,31 @@ def _stepped(layout: Layout) -> Any:
 
 
 @lru_cache
-def _in_rows(layout: Layout) -> Any:
+def _make_row_function(layout: Layout) -> Any:
     """Return the function of one row to another, the same one for layouts that are equal."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
-        return jnp.concatenate([row_of(tree) for tree in _stepped(layout)(numbers, row)])
+        return jnp.concatenate([row_of(tree) for tree in _make_step(layout)(numbers, row)])
 
     return step
 
 
-def _traced(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
+def _trace_step(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
     """Return the traced step of a row, which JAX holds for networks that differ in numbers alone."""
     with jax.enable_x64(True):
-        return _stepped(layout).trace(list(numbers), _like((layout.size,), np.float64))
+        return _make_step(layout).trace(list(numbers), _like((layout.size,), np.float64))
 
 
 @lru_cache(TEXTS)
 def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
     """Return the step as text, once for networks that differ in numbers alone."""
-    return text_of(_traced(layout, numbers).jaxpr)
+    return text_of(_trace_step(layout, numbers).jaxpr)
 
 
 @lru_cache
-def _by_xla(layout: Layout, outputs: Flat, width: int, together: int) -> PyTree:
+def _compile_xla(layout: Layout, outputs: Flat, width: int, together: int) -> PyTree:
     """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns."""
-    step = _in_rows(layout)
+    step = _make_row_function(layout)
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
         def turn(i: jax.Array, done: jax.Array) -> jax.Array:

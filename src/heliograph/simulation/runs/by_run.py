@@ -27,7 +27,7 @@ def trajectories(
     traced, shape = jax.make_jaxpr(
         lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
     )(example_carry, keys[0], example)
-    body = _needed(traced)
+    body = _drop_unused(traced)
     known = [False] * len(jax.tree.leaves(example))
     # Parts of the carry that depend on the key, as a fixed point; then those of the outputs.
     spread = _unchanging(lambda marks: _dependent(body, [*marks, True, *known])[: len(example_carry)], varies)
@@ -89,13 +89,13 @@ def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[j
     return start, varies, jax.tree.structure(shape)
 
 
-def _needed(program: ClosedJaxpr) -> ClosedJaxpr:
+def _drop_unused(program: ClosedJaxpr) -> ClosedJaxpr:
     """Program without operations that none of its results needs, such as unused likelihoods."""
     jaxpr, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=True)
     return ClosedJaxpr(jaxpr, program.consts)
 
 
-def _marked(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
+def _find_dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
     """Variables that depend on the marked inputs; each operation is assumed to use all its arguments."""
     marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
     for operation in program.jaxpr.eqns:
@@ -106,7 +106,7 @@ def _marked(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
 
 def _dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
     """Mask of the results that depend on the marked inputs."""
-    marked = _marked(program, inputs)
+    marked = _find_dependent(program, inputs)
     return [not isinstance(v, Literal) and v in marked for v in program.jaxpr.outvars]
 
 

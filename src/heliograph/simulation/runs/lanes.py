@@ -54,9 +54,9 @@ class Lanes:
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
-        recorded = self._vectorised(runs, lanes) if self.wide else self._threads(runs, lanes)
+        recorded = self._init_lanes(runs, lanes) if self.wide else self._threads(runs, lanes)
         used = np.concatenate(lanes)
-        return jax.tree.map(lambda *parts: _in_order(np.concatenate(parts), used), *recorded)
+        return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), used), *recorded)
 
     def _threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
         def go(lane: int) -> PyTree:
@@ -69,7 +69,7 @@ class Lanes:
             self.pool = ThreadPoolExecutor(1 if self.one_by_one else min(self.count, os.cpu_count() or 1))
         return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
 
-    def _vectorised(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+    def _init_lanes(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
         shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
             every = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
@@ -132,7 +132,7 @@ def batch_counts(first_run: int, stop: int) -> np.ndarray:
     return np.bincount(np.arange(first_run, stop) % BATCHES, minlength=BATCHES).astype(float)
 
 
-def _in_order(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
+def _order_blocks(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
     ordered = np.empty_like(recorded)
     ordered[used] = recorded

@@ -69,7 +69,7 @@ def native(
     arrays = [np.asarray(leaf) for leaf, h in zip(leaves, held, strict=True) if not h]
     # One program for networks of one structure.
     try:
-        made = _made(tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value))
+        made = _find_program(tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value))
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
@@ -122,7 +122,7 @@ def _is_given(array: np.ndarray) -> bool:
 
 
 @lru_cache(PROGRAMS)
-def _made(
+def _find_program(
     tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool
 ) -> tuple[Any, Any] | Unsupported:
     """Cached `_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
@@ -146,7 +146,9 @@ def _program(tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: t
         whole = [value if h else next(items) for value, h in zip(fixed, held, strict=True)]
         world, later, inputs, reducer = jax.tree.unflatten(tree, whole)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
-        reduced = _run(world, u, reducer, run_key) if later is None else _smoothed(world, later, u, reducer, run_key)
+        reduced = (
+            _run(world, u, reducer, run_key) if later is None else _collect_smoothed(world, later, u, reducer, run_key)
+        )
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
         form[:] = [jax.tree.structure(OfStep(summed[0], summed[1], reduced.collected))]
         return summed, reduced.collected
@@ -159,7 +161,7 @@ def _program(tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: t
 
 
 @eqx.filter_jit
-def _stepped(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+def _step_world(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
     """Step a world, traced once for worlds that differ in numbers alone, however long and whatever is collected."""
     return world.step(state, key, row)
 
@@ -168,20 +170,20 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
     """Collect the results of a run: stacked over time, but for flags that hold if true at any step."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
-        state, outputs = _stepped(world, state, key, row)
+        state, outputs = _step_world(world, state, key, row)
         return state, reducer.of_step(outputs)
 
     _, recorded = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
     return recorded._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), recorded.ever))
 
 
-def _smoothed(
+def _collect_smoothed(
     world: World, later: Smoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
     """Collect the results of a run's filtered and smoothed estimates, from the whole run with its smoother steps."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        return _stepped(world, state, key, row)
+        return _step_world(world, state, key, row)
 
     _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
     return reduced_run(reducer, later, outputs)
@@ -210,7 +212,7 @@ def natively(
         return (
             None
             if code is None
-            else finished(reducer, _recorded(code, first_run, runs, chunk, progress), network, smoothing)
+            else finished(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
         )
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
@@ -223,7 +225,7 @@ def natively(
             if progress is not None:
                 progress((number * total + done) // len(parts), total)  # noqa: B023
 
-        results.append(finished(reducer, _recorded(code, first_run, runs, chunk, shown), some, None))
+        results.append(finished(reducer, _run_chunks(code, first_run, runs, chunk, shown), some, None))
     return reducer.joined(results, network)
 
 
@@ -255,7 +257,7 @@ def _code(
     return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts)
 
 
-def _recorded(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
+def _run_chunks(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
     """Sums over all runs, and what is collected of them, chunk by chunk."""
     lanes = NativeLanes(code, first_run, first_run + runs)
     parts = in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)

@@ -39,10 +39,10 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
     # Native code where it supports the function.
     choice = chosen(function, values, [True] * len(values))
-    return choice.results() if choice.code is not None else _by_xla(function, values, width)
+    return choice.results() if choice.code is not None else _apply_by_xla(function, values, width)
 
 
-def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:
+def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:
     """Apply the function as a program of XLA, `width` runs in parallel."""
     # Width and blocks such that all cores are busy and little is padding.
     runs, cores = len(values[0]), os.cpu_count() or 1
@@ -52,7 +52,7 @@ def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: in
 
     def work(core: int) -> PyTree:
         first, last = core * share * width, min((core + 1) * share * width, runs)
-        parts = [_filled(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
+        parts = [_pad_runs(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
             outputs = to_numpy(_blocks(function, parts))
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], outputs)
@@ -80,7 +80,7 @@ def _numbers(value: PyTree) -> np.ndarray:
     return values
 
 
-def _filled(values: np.ndarray, count: int) -> np.ndarray:
+def _pad_runs(values: np.ndarray, count: int) -> np.ndarray:
     """Pad to `count` runs with copies of the last one."""
     missing = count - len(values)
     return values if not missing else np.concatenate([values, np.repeat(values[-1:], missing, axis=0)])
