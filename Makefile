@@ -46,6 +46,7 @@ soak: .venv/.test  ## Kill, interrupt, try thousands of random programs and netw
 	@$(BIN)/python benchmarks/kills.py
 	@$(BIN)/python benchmarks/upper_claims.py
 	@$(BIN)/python benchmarks/upper_fusion.py
+	@$(BIN)/python benchmarks/upper_networks.py
 	@$(BIN)/python benchmarks/interruptions.py
 	@$(BIN)/python benchmarks/random_programs.py
 	@$(BIN)/python benchmarks/soak.py

@@ -1,4 +1,4 @@
-"""A short search for a broken claim of "upper"; benchmarks/upper_claims.py and upper_fusion.py make long ones."""
+"""A short search for a broken claim of "upper"; long ones are benchmarks/upper_claims.py, _fusion.py, _networks.py."""
 
 import importlib
 from pathlib import Path
@@ -51,3 +51,23 @@ def test_the_search_finds_a_fusion_that_is_no_bound(search, monkeypatch):
             return mean, covariance / len(means)
 
     assert search.ascended(fusion.intersected(lambda read: Naive()), 0, 5).largest > 1.5
+
+
+def test_no_claim_of_events_quantizers_and_bounds_in_a_network_is_broken(search):
+    networks = importlib.import_module("upper_networks")
+    for name, ratio in networks.families().items():
+        assert search.ascended(ratio, 0, 0).largest <= 1 + search.ROUNDING, name
+
+
+def test_the_search_finds_events_that_are_worse_than_they_say(search):
+    """Thresholds three times what is claimed of them."""
+    networks = importlib.import_module("upper_networks")
+
+    class Coarse(hg.fusion.EventSending):
+        def error(self, n):
+            return super().error(n) / 3
+
+    def ratio(numbers):
+        return networks.at_a_centre(lambda read: hg.CovarianceIntersection(), lambda read: Coarse(3.0))(numbers)
+
+    assert search.ascended(ratio, 0, 5).largest > 1.1

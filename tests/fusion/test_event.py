@@ -33,3 +33,30 @@ def test_silence_taken_for_a_loss_needs_a_rule_that_receives_reports():
         hg.Network(plant, nodes, {"one": hg.Fusion("local", hg.fusion.EqualIntersection(), quantizer=sends)})
     with pytest.raises(ValueError, match="threshold: expected positive numbers"):
         hg.fusion.EventSending(0.0)
+
+
+LINKS = {
+    "lost": hg.fusion.ReportLink(hg.erasure(hg.perfect(), 0.5)),
+    "noisy": hg.fusion.ReportLink(hg.hop(1.0, 0.1)),
+    "late by chance": hg.fusion.ReportLink(delay=[0.5, 0.5]),
+}
+
+
+def centre(link, announced):
+    plant, sensor = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 0.1)
+    nodes = {"a": hg.Node(sensor, hg.perfect(), {"local": hg.kalman_filter(plant, sensor)})}
+    sends = hg.fusion.EventSending(0.1, announced)
+    return hg.Network(plant, nodes, {"one": hg.Fusion("local", hg.fusion.AllReports(), quantizer=sends, uplink=link)})
+
+
+@pytest.mark.parametrize("link", LINKS.values(), ids=LINKS)
+def test_silence_is_understood_only_where_what_was_sent_has_arrived(link):
+    """Else the receiver knows no last value: silence would bring it what was lost when it was sent."""
+    with pytest.raises(ValueError, match="whose silence is understood: expected a report link"):
+        centre(link, True)
+    assert centre(link, False).claims()["fused"]["one"] == "nominal"
+
+
+@pytest.mark.parametrize("link", [hg.fusion.ReportLink(hg.perfect()), hg.fusion.ReportLink(delay=2, every=3)])
+def test_silence_is_understood_over_a_link_that_delivers(link):
+    assert centre(link, True).claims()["fused"]["one"] == "upper"

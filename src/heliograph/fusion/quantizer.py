@@ -49,6 +49,11 @@ class AbstractQuantizer(Module):
         """True if a value may not arrive."""
         return False
 
+    @property
+    def holds(self) -> bool:
+        """True if nothing may be sent, and the receiver takes what was sent last for the value."""
+        return False
+
     def init(self, n: int) -> PyTree:
         """Return the state before the first value, for values of n components."""
         raise unwritten(self, "init")

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantized
-from heliograph.model.channel import Channel
+from heliograph.model.channel import Channel, perfect
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import first
 from heliograph.numerics.check import array, check_count, fail, instance, probabilities, rank
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, same
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -37,7 +37,8 @@ class EventSending(AbstractQuantizer):
         announced: whether the receiver knows the thresholds, so that silence means that x is within them of the last
             value; True by default. That error bound is used at every step, so that it does not depend on the data: what
             was "exact" or "upper" becomes "upper". Otherwise silence is taken for a loss: the receiver's claim is for
-            losses that do not depend on the data, and these do; the claim is "nominal".
+            losses that do not depend on the data, and these do; the claim is "nominal". Over a `ReportLink` silence is
+            understood only where all that is sent arrives as it is, after a fixed delay.
 
     Raises:
         ValueError: thresholds that are not positive.
@@ -56,6 +57,11 @@ class EventSending(AbstractQuantizer):
     def silent(self) -> bool:
         """True where a step may pass without a value for the receiver."""
         return not self.announced
+
+    @property
+    def holds(self) -> bool:
+        """True where silence is understood: then the receiver has to know the value that was sent last."""
+        return self.announced
 
     @in_float64
     def init(self, n: int) -> LastSent:
@@ -127,6 +133,10 @@ class ReportLink(Module):
             )
         if first(self.channel).remembers:
             raise fail("channel of a report link", "one that forgets", f"{type(first(self.channel)).__name__}")
+
+    def delivers(self, n: int) -> bool:
+        """True if every report of n numbers that is sent arrives as it is, after a fixed delay."""
+        return bool(np.max(self.delay) == 1) and (self.channel is None or same(self.channel, perfect(n)))
 
     def received(self, n: int) -> int:
         """Number of received components of a report of n."""

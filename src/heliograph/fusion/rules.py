@@ -359,10 +359,13 @@ class Fusion(Module):
             raise fail("fusion over report links", "a rule that uses reports (AllReports)", type(self.rule).__name__)
         for link in self.links(nodes):
             instance("report link", link, ReportLink, "a ReportLink").check(n)
-        for quantizer in self._quantizers(nodes):
+        for link, quantizer in zip(self.links(nodes), self._quantizers(nodes), strict=False):  # none, or one for each
             if isinstance(quantizer, OverTime):
                 raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
             quantizer.error(n)
+            if quantizer.holds and not link.delivers(n):
+                raise fail(f"reports through {type(quantizer).__name__}, whose silence is understood", "a report link "
+                           "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
         """Report links of these nodes."""
