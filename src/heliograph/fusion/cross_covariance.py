@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import Plan
+from heliograph.filters.linear.plan import LinearStep
 from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
@@ -74,18 +74,17 @@ def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], st
     return Errors(mean, covariance, mean - starts, values, joint)
 
 
-def error_step(plan: Plan, motion: Motion, observation: Observation) -> ErrorStep:
-    """Recursion of the errors of linear filters; `plan` has a leading axis of nodes."""
-    gain, identity = jnp.asarray(plan.gain), jnp.eye(motion.matrix.shape[-1])
-    keep = identity - gain @ plan.output
-    astray = gain @ _difference(observation.gain, plan.output)
-    moves = _difference(jnp.broadcast_to(motion.matrix, plan.transition.shape), plan.transition)
-    shifts = _difference(jnp.broadcast_to(motion.shift, plan.drift.shape), plan.drift)
+def error_step(filters: LinearStep, motion: Motion, observation: Observation) -> ErrorStep:
+    """Recursion of the errors of linear filters; `filters` has a leading axis of nodes."""
+    gain, keep = jnp.asarray(filters.gain), filters.keep()
+    astray = gain @ _difference(observation.gain, filters.output)
+    moves = _difference(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
+    shifts = _difference(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
     drift = _times(keep, shifts) - astray @ jnp.asarray(motion.shift)
     return ErrorStep(
-        transition=keep @ plan.transition,
+        transition=keep @ filters.transition,
         of_state=keep @ moves - astray @ motion.matrix,
-        drift=drift - _times(gain, _difference(observation.offset, plan.offset)),
+        drift=drift - _times(gain, _difference(observation.offset, filters.offset)),
         of_noise=keep - astray,
         gain=gain,
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.engine.choice import chosen, compiled, computed, of_arrays
 from heliograph.filters.base import AbstractFilter, sized
-from heliograph.filters.linear.plan import Plan
+from heliograph.filters.linear.plan import LinearStep
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
@@ -126,7 +126,7 @@ class AllFilters(Module):
         """Centres of filters whose gains do not depend on data."""
         return tuple(centre for centre in self.centres if isinstance(centre, Centre))
 
-    def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
+    def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
         """Matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
         return [self.alike[i].matrices(centre.read, states[i], f, self._quiet(i), u, k) for i, f in centre.sources]
 

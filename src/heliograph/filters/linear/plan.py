@@ -16,16 +16,15 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import in_float64, quickly_compiled
-from heliograph.numerics.linalg import times_vector
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 
-class Plan(NamedTuple):
-    """Matrices of one step: m- = F m + f, m = m- + K (z - C m- - c), with innovation covariance S for complete data.
+class LinearStep(NamedTuple):
+    """One step of a linear filter: m- = F m + f, m = m- + K (z - C m- - c), with innovation covariance S.
 
-    Shapes: transition F (N, N), drift f (N,), gain K (N, m), output C (m, N), offset c (m,), innovation S (m, m).
+    Shapes: transition F (N, N), drift f (N,), gain K (N, m), output C (m, N), offset c (m,), innovation S (m, m); of
+    several filters with a leading axis.
     """
 
     transition: jax.Array
@@ -34,6 +33,22 @@ class Plan(NamedTuple):
     output: jax.Array
     offset: jax.Array
     innovation: jax.Array
+
+    def predict(self, mean: Float[Array, " N"]) -> Float[jax.Array, " N"]:
+        """m- = F m + f."""
+        return jnp.asarray(self.transition @ mean + self.drift)
+
+    def expect(self, mean: Float[Array, " N"]) -> Float[jax.Array, " m"]:
+        """C m- + c, the measurement that is expected."""
+        return jnp.asarray(self.output @ mean + self.offset)
+
+    def correct(self, mean: Float[Array, " N"], innovation: Float[jax.Array, " m"]) -> Float[jax.Array, " N"]:
+        """m = m- + K e."""
+        return jnp.asarray(mean + self.gain @ innovation)
+
+    def keep(self) -> Float[jax.Array, "*node N N"]:
+        """I - K C, what a correction leaves of the predicted mean, and of its error."""
+        return jnp.asarray(jnp.eye(self.gain.shape[-2]) - self.gain @ self.output)
 
 
 class PlannedMean(NamedTuple):
@@ -69,16 +84,16 @@ class PlannedFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
         """F m + f; the input is in f."""
-        p: Plan = at(self.steps, k)
-        return PlannedMean(_affine(p.transition, state.mean, p.drift), _stage(state, 2 * k + 1))
+        step: LinearStep = at(self.steps, k)
+        return PlannedMean(step.predict(state.mean), _stage(state, 2 * k + 1))
 
     @corrects
     def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
         """m + K (z - C m - c)."""
-        p: Plan = at(self.steps, k)
-        expected = _affine(p.output, state.mean, p.offset)
-        mean = _affine(p.gain, jnp.asarray(z) - expected, state.mean)
-        return PlannedMean(mean, _stage(state, 2 * k + 2)), gaussian_innovation(jnp.asarray(z), expected, p.innovation)
+        step: LinearStep = at(self.steps, k)
+        z, expected = jnp.asarray(z), step.expect(state.mean)
+        mean = step.correct(state.mean, z - expected)
+        return PlannedMean(mean, _stage(state, 2 * k + 2)), gaussian_innovation(z, expected, step.innovation)
 
     @estimates
     def estimate(self, state: PlannedMean) -> Estimate:
@@ -101,13 +116,8 @@ class PlannedFilter(AbstractSizedFilter):
         return replace(self, past=OverTime(steps))
 
     def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
-        x = mean if self.projection is None else _affine(self.projection, mean, jnp.zeros(len(self.projection)))
+        x = mean if self.projection is None else self.projection @ mean
         return Estimate(x, jnp.asarray(self.covariances)[stage], self.claim)
-
-
-@runs_last
-def _affine(matrix: Array, x: Array, offset: Array) -> jax.Array:
-    return times_vector(matrix, jnp.asarray(x)) + offset
 
 
 def _stage(state: PlannedMean, stage: Step) -> jax.Array:
@@ -130,7 +140,7 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
     # Complete data of zeros: the matrices do not depend on their values.
     quiet = jnp.zeros(filter.received)
 
-    def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[Plan, jax.Array]]:
+    def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
         step, prior, after = followed(filter, state, quiet, row[1], row[0])
         return after, (step, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
 
@@ -152,8 +162,10 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
 _plan_by_xla = quickly_compiled(_plan)
 
 
-def followed(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:
-    """Plan a step from this state, whatever its mean: its matrices, and the states after prediction and correction."""
+def followed(
+    filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step
+) -> tuple[LinearStep, PyTree, PyTree]:
+    """Matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
     # F and f: the prior mean is affine in the mean.
     none = jnp.zeros_like(state.mean)
 
@@ -164,7 +176,7 @@ def followed(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, 
     transition, prior = jax.jacfwd(predict, has_aux=True)(none)
     # K and C: derivatives of posterior mean and innovation.
     (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, none, z, k)
-    step = Plan(
+    step = LinearStep(
         transition=transition,
         drift=jnp.asarray(prior.mean),
         gain=gain,
@@ -188,13 +200,13 @@ def _correction_slopes(
     return mean_slopes, innovation_slopes, after, received
 
 
-def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
+def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearStep:
     """Return the matrices of one step of a filter of which only the mean depends on data; of z only the gaps matter.
 
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
     if isinstance(filter, PlannedFilter):
-        outcome: Plan = at(filter.steps, k)
+        outcome: LinearStep = at(filter.steps, k)
         return outcome
     step, _, _ = followed(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.linear.plan import Plan, PlannedFilter
+from heliograph.filters.linear.plan import LinearStep, PlannedFilter
 from heliograph.filters.modes.modal import ObservationModel, observation_models
 from heliograph.linear.jump_system import mixed, moved
 from heliograph.model.channel import Channel, check_link
@@ -103,30 +103,34 @@ def true_error(
     return TrueError(start.states, np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2], np.array(true))
 
 
-def _propagate(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _propagate(
+    moments: np.ndarray, plant: LinearPlant, step: LinearStep, u: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
     """Propagate moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
     n, given, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
     move, noise = np.zeros((2, size, size))
     move[:n, :n], move[n, n] = plant.transition_matrix(given), 1.0
     move[:n, n] = plant.shift(given)
-    move[n + 1 :, n + 1 :], move[n + 1 :, n] = plan.transition, plan.drift
+    move[n + 1 :, n + 1 :], move[n + 1 :, n] = step.transition, step.drift
     noise[:n, :n] = plant.noise_covariance(given)
     before = mixed(rows, moments)
     return np.asarray(moved(move, before, before[:, n, n, None, None] * noise))
 
 
-def _correct_moments(moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, plan: Plan) -> np.ndarray:
+def _correct_moments(
+    moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, step: LinearStep
+) -> np.ndarray:
     """Propagate moments through s = s- + K (z - C s- - c), z = (G, n) of the mode times y~ = C~ x~ + v."""
     p, n = sensor.matrix.shape
-    gain, mean, law = np.asarray(plan.gain), np.asarray(world.mean), moments[:, n, n, None, None]
+    gain, mean, law = np.asarray(step.gain), np.asarray(world.mean), moments[:, n, n, None, None]
     measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
     measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
     # Given the mode: the mean map of r, then what the gain's spread and the noise add.
     use = np.zeros_like(moments) + np.eye(moments.shape[-1])
     use[:, n + 1 :, : n + 1] += gain @ mean @ measure
-    use[:, n + 1 :, n + 1 :] -= gain @ plan.output
-    use[:, n + 1 :, n] -= gain @ plan.offset
+    use[:, n + 1 :, n + 1 :] -= gain @ step.output
+    use[:, n + 1 :, n] -= gain @ step.offset
     second = moved(measure, moments[:, : n + 1, : n + 1], law * noise)
     added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * moved(mean, noise, 0.0)
     after: np.ndarray = moved(use, moments, 0.0)

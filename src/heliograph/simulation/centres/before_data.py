@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import Plan
+from heliograph.filters.linear.plan import LinearStep
 from heliograph.fusion.cross_covariance import Factors, initial_factors, joint_of, weighted_sources
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
@@ -179,7 +179,7 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
     sources = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)  # sources of a step
     start = separate, initial_factors(known[0].errors, sources * len(u))
 
-    def matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> Plan:
+    def matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> LinearStep:
         return centre.gathered(filters.matrices(centre, states, u_k, k))
 
     return centre.factors(start, matrices, filters.followed, u)

@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import homogeneous
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.linear.plan import Linearised, Plan, is_linear_filter, linear_step
+from heliograph.filters.linear.plan import Linearised, LinearStep, is_linear_filter, linear_step
 from heliograph.fusion.all_reports import Knowledge, begin, fused_estimate, moved, receive_reports
 from heliograph.fusion.cross_covariance import (
     Errors,
@@ -141,22 +141,26 @@ class Centre(Module):
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
-    def moved(self, errors: Errors, plan: Plan, u: jax.Array, k: jax.Array) -> Happened:
+    def moved(self, errors: Errors, filters: LinearStep, u: jax.Array, k: jax.Array) -> Happened:
         """Propagate the errors of filters with these matrices over step k, in the order of the nodes."""
-        motion, step, noise = self.moves(errors.mean, errors.covariance, plan, u, k)
+        motion, step, noise = self.moves(errors.mean, errors.covariance, filters, u, k)
         return Happened(motion, step, noise, advance(errors, step, motion, noise))
 
     def moves(
-        self, mean: jax.Array, covariance: jax.Array, plan: Plan, u: jax.Array, k: jax.Array
+        self, mean: jax.Array, covariance: jax.Array, filters: LinearStep, u: jax.Array, k: jax.Array
     ) -> tuple[Motion, ErrorStep, Array]:
         """Motion of plant and errors at step k, and the measurement noise, for a plant with these moments."""
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*moved_state(mean, covariance, motion), k)
-        return motion, error_step(plan, motion, observation), observation.noise
+        return motion, error_step(filters, motion, observation), observation.noise
 
     def factors(
-        self, start: tuple[PyTree, Factors], matrices: Callable[..., Plan], follow: Callable[..., PyTree], u: Array
+        self,
+        start: tuple[PyTree, Factors],
+        matrices: Callable[..., LinearStep],
+        follow: Callable[..., PyTree],
+        u: Array,
     ) -> Factors:
         """Propagate the errors by their sources over all steps, from the filters' states and the factors before them.
 
@@ -174,13 +178,13 @@ class Centre(Module):
         factors: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
         return factors
 
-    def gathered(self, parts: Sequence[Plan]) -> Plan:
+    def gathered(self, parts: Sequence[LinearStep]) -> LinearStep:
         """Matrices of the sources' filters in the order of the nodes, padded with zeros to the longest measurement."""
 
         return gathered(parts, self.order, self.size)
 
     def step(
-        self, state: CentreState, parts: Sequence[Plan], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
+        self, state: CentreState, parts: Sequence[LinearStep], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
     ) -> tuple[CentreState, dict[str, Estimate]]:
         """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
         happened = self.moved(state.errors, self.gathered(parts), u, k)
@@ -193,7 +197,7 @@ class Centre(Module):
 
 
 MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, -1), "noise": (-2, -1)}
-Matrices = TypeVar("Matrices", Plan, Linearised)
+Matrices = TypeVar("Matrices", LinearStep, Linearised)
 
 
 def gathered(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
@@ -348,8 +352,8 @@ class CentreFilter(AbstractSizedFilter):
     def predict(self, state: CentreBelief, u: ArrayLike = (), k: Step = 0) -> CentreBelief:
         """Predict plant and all errors; the nodes send their reports."""
         (centre,), u, step = self.filters.informed, jnp.asarray(u), jnp.asarray(k)
-        plan: Plan = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
-        happened = centre.moved(state.errors, plan, u, step)
+        filters: LinearStep = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
+        happened = centre.moved(state.errors, filters, u, step)
         following = self.filters.followed(state.nodes, u, step)
         return CentreBelief(following, happened.errors, moved(state.known, happened, at(self.links, k)))
 
