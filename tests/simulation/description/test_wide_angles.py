@@ -41,6 +41,33 @@ def test_a_heading_that_nothing_measures_is_said(make):
         hg.run(network, {"n": np.ones((3, 1))})
 
 
+@pytest.mark.slow
+def test_the_way_of_an_unknown_heading_is_not_what_one_gaussian_says():
+    """x = 60 cos h with h of N(0, 4): mean 60 e^-2 = 8.12, deviation 60 ((1 + e^-8) / 2 - e^-4)^.5 = 41.65; y +- 42.4.
+
+    The docs name what one Gaussian says instead, to its digits. Only the points of alpha = .001 drive backwards.
+    """
+    steps = 600
+    spread = 60 * np.sqrt([(1 + np.exp(-8)) / 2 - np.exp(-4), (1 - np.exp(-8)) / 2])
+    np.testing.assert_allclose(spread, [41.65, 42.42], atol=0.005)
+    driven = hg.monte_carlo(driving(2.0), steps, 500, key=0)
+    ends = np.asarray(driven.truth)[:, -1, :2]
+    # Standard errors of 500 runs: 1.9 of a mean, at most 1.3 of a deviation.
+    np.testing.assert_allclose(ends.mean(axis=0), [60 * np.exp(-2), 0], atol=4)
+    np.testing.assert_allclose(ends.std(axis=0), spread, atol=3)
+    errors = ends - np.asarray(driven.estimates["n"]["f"].mean)[:, -1, :2]
+    assert errors.std(axis=0)[0] > 10 * np.sqrt(np.asarray(driven.estimates["n"]["f"].covariance)[0, -1, 0, 0])
+    said = []
+    for make in MAKERS:
+        node = driving(2.0, make).nodes["n"].filters["f"]
+        result = node.run(np.ones((steps, 1)))
+        said.append((float(result.means[-1, 0]), float(np.sqrt(result.covariances[-1, 0, 0]))))
+    for found, expected in zip(said, [(14.3, 2.1), (60.0, 0.04), (14.4, 3.4), (-60.0, 6.9)], strict=True):
+        np.testing.assert_allclose(found, expected, atol=0.05)
+    node = driving(2.0, lambda *parts: hg.unscented_filter(*parts, alpha=1.0)).nodes["n"].filters["f"]
+    assert float(node.run(np.ones((steps, 1))).means[-1, 0]) == said[2][0]  # the default
+
+
 def test_what_is_known_well_enough_is_not():
     """Points of 4 states lie 2 deviations away: at 0.9 rad still before half a turn; of more than 9 states at less."""
     for network in (driving(0.9), driving(2.0, circular=())):
