@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
+from functools import cached_property
 from itertools import accumulate
 from typing import NamedTuple
 from zlib import crc32
@@ -19,6 +20,7 @@ from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
@@ -310,6 +312,17 @@ class Network(Module):
                     named.setdefault(memory.name, []).append(name)
         results = {name: tuple(nodes) for name, nodes in named.items() if len(nodes) > 1}
         return results if self.common is None else {"sensor and channel": self.names}
+
+    @cached_property
+    def angles(self) -> dict[str, Angles]:
+        """Places of the angles among what each node receives."""
+        if self.common is None:
+            return {
+                name: received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
+                for name, node in self.nodes.items()
+            }
+        every = received_angles(self.plant, self.common.sensor, self.common.channel)
+        return {name: tuple(i - row.start for i in every if i in row) for name, row in self.rows.items()}
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""

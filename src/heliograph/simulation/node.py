@@ -13,7 +13,7 @@ from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.rules import Fusion
-from heliograph.model.channel import Channel, check_sent, received_angles
+from heliograph.model.channel import Channel, check_sent
 from heliograph.model.estimate import Claim
 from heliograph.model.limits import Limits, LimitsLike, limits_of
 from heliograph.model.over_time import first
@@ -109,6 +109,8 @@ class Node(Module):
     filters: dict[str, AbstractFilter]
     limits: Limits | None
     trigger: AbstractTrigger | None
+    received: int = eqx.field(static=True, init=False, repr=False)  # length of the measurement that reaches the filters
+    complete: bool = eqx.field(static=True, init=False, repr=False)  # whether everything arrives, always
 
     def __init__(
         self,
@@ -127,6 +129,9 @@ class Node(Module):
         check_sent(first(sensor), first(channel))
         if trigger is not None:
             check_trigger(trigger, first(sensor), first(channel), self.filters)
+        known = 0 if trigger is None else trigger.side_information(len(self.outputs))
+        self.received = int(first(channel).outputs) + known
+        self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
         self.limits = limits_of(self.received, limits, invalid)
         # Side information of the right step; feedback to one filter alone.
@@ -139,12 +144,6 @@ class Node(Module):
                 f"no filter with measurements besides {self.informed_by!r}",
                 observation,
             )
-
-    @property
-    def received(self) -> int:
-        """Length of the measurement that reaches the filters."""
-        known = 0 if self.trigger is None else self.trigger.side_information(len(self.outputs))
-        return int(first(self.channel).outputs) + known
 
     @property
     def predictor(self) -> str | None:
@@ -167,11 +166,6 @@ class Node(Module):
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
         return received_names(self.outputs, self.received)
-
-    @property
-    def complete(self) -> bool:
-        """True if everything arrives, always."""
-        return not first(self.channel).erases and self.trigger is None
 
 
 @readable
@@ -242,6 +236,10 @@ class HasNodes(Protocol):
     @property
     def rows(self) -> FrozenMapping[str, range]:
         """Places of each node among all measurements, joined in the order of the nodes."""
+
+    @property
+    def angles(self) -> dict[str, Angles]:
+        """Places of the angles among what each node receives."""
 
     def claims(self) -> dict[str, dict[str, Claim]]:
         """Claims by node and filter."""
@@ -318,20 +316,10 @@ def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
         return
     # Angles among all that arrives, in the order of the nodes.
     names = [f"{node}.{part}" for node in network.names for part in network.nodes[node].received_names]
-    expected, got = ([names[i] for i in places] for places in (_find_received_angles(network), used.received))
+    angles = [network.rows[node][i] for node in network.names for i in network.angles[node]]
+    expected, got = ([names[i] for i in places] for places in (angles, used.received))
     if expected != got:
         raise fail(name, f"a filter that receives the nodes' angles, {expected}", got)
-
-
-def _find_received_angles(network: HasNodes) -> Angles:
-    if network.common is not None:
-        return received_angles(network.plant, network.common.sensor, network.common.channel)
-    places, start = [], 0
-    for node in (network.nodes[name] for name in network.names):
-        here = received_angles(network.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
-        places += [start + i for i in here]
-        start += node.received
-    return tuple(places)
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:

@@ -8,13 +8,11 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.transform import Cubature
 from heliograph.filters.gaussian.unscented import Unscented
-from heliograph.model.channel import received_angles
 from heliograph.model.over_time import first
 from heliograph.model.sensor import is_linear
 from heliograph.numerics.angle import TURN
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
 
 WIDE = 1.0  # rad: a Gaussian of this deviation has E cos = 0.61, and what lies beyond pi is not on the circle any more
@@ -107,11 +105,12 @@ def _deviations(
 
 def beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
     """Yield a line for each measured angle with values beyond a full turn, as degrees have."""
-    for name, node in network.nodes.items():
-        for i in received_angles(network.plant, node.sensor, node.channel) if isinstance(node, Node) else ():
+    for name, angles in network.angles.items():
+        names = network.nodes[name].received_names if angles else ()
+        for i in angles:
             far = np.abs(z[name][:, i]) > TURN
             if np.any(far):
                 row = int(np.argmax(far))
                 said = f"{np.count_nonzero(far)} of {np.count_nonzero(~np.isnan(z[name][:, i]))} values are beyond 2 pi"
                 value = f"row {row + 1}: {z[name][row, i]:.4g}"
-                yield f"node {name!r}: {node.received_names[i]!r} is an angle in radians, and {said}; {value}: degrees?"
+                yield f"node {name!r}: {names[i]!r} is an angle in radians, and {said}; {value}: degrees?"
