@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.engine.choice import computed
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
+from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, traced_shape
@@ -204,7 +206,7 @@ class Plant(AbstractPlant):
         else:
             self.noise = as_noise("process noise", noise, n)
         self.circular = _circular(self.states, circular)
-        check_turns("plant", lambda x: self.transition(x, jnp.asarray(u)), self.initial_mean, self.angles, self.angles)
+        check_turns("plant", self.transition, self.initial_mean, self.angles, self.angles, u)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """f(x, u)."""
@@ -265,8 +267,7 @@ class LinearPlant(AbstractPlant):
         self.noise = noise if callable(noise) else as_noise("process noise", noise, n)
         self.circular = _circular(self.states, circular)
         u = np.zeros(len(self.inputs))
-        check_turns("plant", lambda x: self.transition_matrix(jnp.asarray(u)) @ x, self.initial_mean, self.angles,
-                    self.angles)  # fmt: skip
+        check_turns("plant", self.transition, self.initial_mean, self.angles, self.angles, u)
 
     def _matrix(self, name: str, value: ArrayLike | MatrixFunction, shape: tuple[int, int]) -> Any:
         if not callable(value):
@@ -292,24 +293,38 @@ def _circular(states: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ..
 
 
 def check_turns(
-    name: str, function: Callable[[jax.Array], jax.Array], center: Vector, given: Angles, angles: Angles
+    name: str,
+    function: Callable[..., jax.Array],
+    center: Vector,
+    given: Angles,
+    angles: Angles,
+    *rest: np.ndarray,
 ) -> None:
     """Raise ValueError where a full turn of a given angle changes f(center) by more than turns of the angles found.
 
-    What depends on a traced number has no value to judge: it was judged where its numbers were known.
+    `rest` are further arguments of the function. What depends on a traced number has no value to judge: it was judged
+    where its numbers were known.
     """
     if not given or is_traced(center):
         return
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        start = function(jnp.asarray(center))
-        if is_traced(start):
-            return
-        for i in given:
-            moved = function(jnp.asarray(center + TURN * np.eye(len(center))[i]))
-            change = wrapped(np.asarray(moved - start), angles)
-            if np.any(np.abs(change) > SAME * (1 + np.abs(np.asarray(start)))):
-                raise fail(f"{name} with circular states", "one that a full turn does not change",
-                           f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
+    points = np.stack([center, *(np.asarray(center) + TURN * np.eye(len(center))[list(given)])])
+    try:
+        start, *turned = computed(_values_at, _values_by_xla, (function, points, rest))
+    except jax.errors.TracerArrayConversionError:  # the function holds a traced number
+        return
+    for i, value in zip(given, turned, strict=True):
+        change = wrapped(value - start, angles)
+        if np.any(np.abs(change) > SAME * (1 + np.abs(start))):
+            raise fail(f"{name} with circular states", "one that a full turn does not change",
+                       f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
+
+
+def _values_at(function: Callable[..., jax.Array], points: jax.Array, rest: tuple[jax.Array, ...]) -> jax.Array:
+    """Return f(x) at each of some points x."""
+    return jnp.stack([jnp.asarray(function(point, *rest)) for point in points])
+
+
+_values_by_xla = quickly_compiled(_values_at)
 
 
 def _initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, AbstractNoise | None]:
