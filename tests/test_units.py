@@ -145,6 +145,12 @@ def test_an_indefinite_matrix_is_one_in_any_units():
     assert is_sound(hg.model.Estimate(np.zeros(2), np.diag([1e6, 0.0]), "exact"))
 
 
+def test_of_several_covariances_each_is_judged_by_itself():
+    several = np.array([np.eye(2), [[1.0, 1.1], [1.1, 1.0]], [[1.0, 1.0], [1.0, 1.0]], np.diag([1e6, np.nan])])
+    estimates = hg.model.Estimate(np.zeros((4, 2)), several, "exact")
+    assert is_sound(estimates).tolist() == [True, False, True, False]
+
+
 def test_the_root_that_draws_a_noise_keeps_every_components_digits():
     units = np.array([1e6, 1e-6, 1.0])
     shape = np.array([[1.0, 0.5, 0.2], [0.5, 1.0, -0.3], [0.2, -0.3, 1.0]]) * np.outer(units, units)

@@ -133,10 +133,11 @@ def number(value: Any, name: str, quoted: bool = False) -> float:
 def unquoted(text: str) -> int | float | str:
     """Return the number that a text is, whole ones with every digit; a text that is none as it is."""
     words = text.strip()
-    for kind in (int, float) if "_" not in words else ():  # Python's own way to write a number, and nobody else's
-        with suppress(ValueError):
-            return kind(words)
-    return text
+    kind = int if words.lstrip("+-").isdecimal() else float
+    try:
+        return text if "_" in words else kind(words)  # Python's own way to write a number, and nobody else's
+    except ValueError:
+        return text
 
 
 def nanoseconds(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> int:

@@ -1,6 +1,6 @@
 """Messages in our own form, in tables and lines: a node, its count, a time, and values, in any order."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,7 @@ class OwnMessages:
         self._table: EventTable | None = None
         self._zero: int | None = None  # that whole numbers are counted from, which doubles could not tell apart
         self._zoned: bool | None = None
+        self._columns: Set[str] = frozenset()
         self.used, self.refused, self.reasons = 0, 0, list[str]()
 
     def add(self, message: FileMessage | InputError, strict: bool) -> None:
@@ -112,7 +113,9 @@ class OwnMessages:
         self._table.add(Reading(plant, node, sequence, time, values), arrival)
 
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
-        """Unknown columns are most likely misspelt: refuse them."""
+        """Refuse unknown columns, which are most likely misspelt; of rows that are alike one is looked at."""
+        if row.keys() == self._columns:
+            return
         known = [*OWN, *(name for names in self.components.values() for name in names)]
         for name in () if self._ignore else row:
             if name not in known:
@@ -121,6 +124,7 @@ class OwnMessages:
         for name in (NODE, SEQUENCE, TIME):
             if name not in row:
                 raise HeaderError(str(fail(f"{self.path}, header", f"a column {name!r}", f"only {', '.join(row)}")))
+        self._columns = row.keys()
 
     def _moment(self, cell: Any, name: str) -> tuple[Any, bool]:
         """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
