@@ -13,7 +13,7 @@ from straightline.compiled import addresses, aligned, memory_of, threads
 from straightline.folding import DTYPES
 from straightline.llvm.module import written
 from straightline.lowering import like
-from straightline.machine import WIDEST, Tiers, features, narrow
+from straightline.machine import Tiers, features, narrow
 from straightline.program import Program, Summed, folded, lower, row_length
 
 PARTS = 64  # sums of their own, which computers of any number of cores share out
@@ -29,14 +29,15 @@ class Accumulated:
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
-        self.code = written(program, differs, WIDEST, features()[2], summed=summed)
+        self.code = written(program, differs, None, features()[2], summed=summed)
         self.common, self.operations = self.code.common, self.code.operations
-        self.blocks = Tiers(self.code.blocks, (narrow(), WIDEST))
+        self.width = self.code.width
+        self.blocks = Tiers(self.code.blocks, (narrow(self.width), self.width))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
 
     def memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
         """Bytes of results of so many single runs, of sums of so many lanes, and of variables of those in flight."""
-        length = row_length(WIDEST, self.summed.batches)
+        length = row_length(self.width, self.summed.batches)
         collected = sums = 0.0
         for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
             if summed:
@@ -63,7 +64,7 @@ class Accumulated:
             first: number of the first one; 0 by default.
         """
         begun = self.begin(jax.tree.leaves(arguments), runs)
-        share = -(-runs // (PARTS * WIDEST)) * WIDEST
+        share = -(-runs // (PARTS * self.width)) * self.width
         starts = range(first, first + runs, share)
         sums = [begun.zeros() for _ in starts]
 
@@ -101,11 +102,11 @@ class Begun:
                 kind = np.dtype(DTYPES[buffer.type])
                 held = self.memory[offset : offset + buffer.size * kind.itemsize]
                 self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
-        self._machine = None if all(program.common) else program.blocks.machine(-(-runs // WIDEST))
+        self._machine = None if all(program.common) else program.blocks.machine(-(-runs // program.width))
 
     def zeros(self) -> list[np.ndarray]:
         """Return sums over no runs, of each summed result, as `add` and `total` take them."""
-        length = row_length(WIDEST, self.program.summed.batches)
+        length = row_length(self.program.width, self.program.summed.batches)
         return [np.zeros((*b.shape, length)) for b, s in self._outputs() if s]
 
     def add(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
@@ -152,6 +153,7 @@ def accumulate(
     *examples: PyTree,
     batches: int = 1,
     known: Mapping[int, np.ndarray] = MappingProxyType({}),
+    single: bool = False,
 ) -> Accumulated:
     """Compile a JAX function of the number of a run, whose results are summed over runs or collected.
 
@@ -166,6 +168,7 @@ def accumulate(
             default.
         known: of examples by their number among the leaves, which entries (a mask) are the example's in every call,
             such as zeros; they are constants of the code. None by default.
+        single: whether numbers are float32, and draws those of JAX by default; double unless so. Sums are double.
 
     Raises:
         Unsupported: an operation that native code does not take, with the line that it comes from.
@@ -174,7 +177,7 @@ def accumulate(
     features()  # refuses a processor that LLVM does not know
     leaves = jax.tree.leaves(examples)
     numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
-    program = lower(function, *examples, like((), np.uint32), known=numbers)
+    program = lower(function, *examples, like((), np.uint32), known=numbers, single=single)
     pair = program.tree.children()
     if program.tree.node_data() is None or program.tree.node_data()[0] is not tuple or len(pair) != 2:
         expected = "a pair of what is summed and what is collected"

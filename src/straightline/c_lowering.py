@@ -11,7 +11,7 @@ from straightline.folding import is_finite
 from straightline.graph import Graph
 from straightline.lowering import RULES, Lowering, Value, array_of, type_of
 from straightline.memory import LARGE, InMemory
-from straightline.nodes import Buffer, Node, Type
+from straightline.nodes import REAL, Buffer, Node, Type
 
 # Finite where the arguments are, but for overflow and divisions by zero.
 PRESERVING = frozenset((
@@ -38,13 +38,13 @@ class FiniteGraph(Graph):
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Make a node, with products of zero and a finite number simplified."""
-        if op == "mul" and type == "f64":
+        if op == "mul" and type in REAL:
             for a, b in (args, args[::-1]):
                 if a.op == "constant" and a.value == 0 and self._is_finite(b):
-                    return self.constant(0.0, "f64")
+                    return self.constant(0.0, type)
         made = super().node(op, type, *args, value=value)
         numbers = args[1:] if op == "select" else args
-        if type == "f64" and (op in PRESERVING or op == "select") and all(map(self._is_finite, numbers)):
+        if type in REAL and (op in PRESERVING or op == "select") and all(map(self._is_finite, numbers)):
             self.finite.add(made)
         return made
 

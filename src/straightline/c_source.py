@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from straightline.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Type, Unsupported
+from straightline.nodes import REAL, Block, Buffer, Check, Guard, Loop, Node, Store, Type, Unsupported
 from straightline.program import needed
 
 Real = Literal["double", "float"]
@@ -55,8 +55,9 @@ UNSIGNED: dict[str, Callable[..., str]] = {
 
 def c_type(type: Type, real: Real) -> str:
     """Return the C type of a number in the program."""
-    names = {"f64": real, "bool": "int", "i32": "int32_t", "i64": "int64_t", "u32": "uint32_t", "u64": "uint64_t"}
-    return names[type]
+    if type in REAL:
+        return real if type == "f64" else "float"
+    return {"bool": "int", "i32": "int32_t", "i64": "int64_t", "u32": "uint32_t", "u64": "uint64_t"}[type]
 
 
 def literal(value: float | int | bool, type: Type, real: Real) -> str:
@@ -67,7 +68,7 @@ def literal(value: float | int | bool, type: Type, real: Real) -> str:
     """
     if type == "bool":
         return "1" if value else "0"
-    if type != "f64":
+    if type not in REAL:
         ending = f"{'u' if type[0] == 'u' else ''}{'ll' if type[1:] == '64' else ''}"
         if value >= 0:
             return f"{int(value)}{ending}"
@@ -77,7 +78,7 @@ def literal(value: float | int | bool, type: Type, real: Real) -> str:
         return "NAN"
     if math.isinf(value):
         return "INFINITY" if value > 0 else "(-INFINITY)"
-    if real == "float":
+    if c_type(type, real) == "float":
         with np.errstate(over="ignore", under="ignore"):
             single = np.float32(value)
         if not np.isfinite(single):
@@ -101,21 +102,21 @@ def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
         return (_converted if op == "convert" else _as_other)(source, node.type, arguments[0], real)
     if op == "not":
         return f"!{arguments[0]}" if source == "bool" else f"({c_type(source, real)})~{arguments[0]}"
-    if source == "f64" and op in QUIET:
+    if source in REAL and op in QUIET:
         return f"{QUIET[op]}({', '.join(arguments)})"
     if op in ORDER:
         return f"{arguments[0]} {ORDER[op]} {arguments[1]}"
     # Integers first, since C's operators differ from those of floating-point numbers.
     if source == "bool" and op in ("max", "min"):
         return WHOLE[op](*arguments)
-    if source not in ("f64", "bool") and op in WHOLE:
+    if source not in (*REAL, "bool") and op in WHOLE:
         return _of_integers(op, source, arguments)
     if op in COMPOSED:
         return COMPOSED[op](*arguments)
     if op in INFIX:
         return f"{arguments[0]} {INFIX[op]} {arguments[1]}"
-    if op in FUNCTIONS and source == "f64":
-        return f"{FUNCTIONS[op]}{'f' if real == 'float' else ''}({', '.join(arguments)})"
+    if op in FUNCTIONS and source in REAL:
+        return f"{FUNCTIONS[op]}{'f' if c_type(source, real) == 'float' else ''}({', '.join(arguments)})"
     raise Unsupported(op)
 
 
@@ -135,10 +136,10 @@ def _converted(source: Type, target: Type, name: str, real: Real) -> str:
     if target == "bool":
         return f"({name} != 0)"
     kind = c_type(target, real)
-    if source != "f64" or target == "f64":
+    if source not in REAL or target in REAL:
         return f"({kind}){name}"
     bits, least = int(target[1:]), "0"
-    end = f"{2.0 ** (bits - (target[0] == 'i')):.1f}{'f' if real == 'float' else ''}"
+    end = f"{2.0 ** (bits - (target[0] == 'i')):.1f}{'f' if c_type(source, real) == 'float' else ''}"
     most = f"{kind[:-2].upper()}_MAX"
     if target[0] == "i":
         least = f"{kind[:-2].upper()}_MIN"
@@ -148,7 +149,7 @@ def _converted(source: Type, target: Type, name: str, real: Real) -> str:
 
 def _as_other(source: Type, target: Type, name: str, real: Real) -> str:
     """Read the bits of a number as another; a number of single precision is one of double precision then."""
-    if "f64" not in (source, target):
+    if not {source, target} & REAL:
         return f"({c_type(target, real)}){name}"
     fields = " ".join(f"{c_type(t, 'double')} {t};" for t in (source, target))
     return f"({c_type(target, real)})((union {{ {fields} }}){{ .{source} = {name} }}).{target}"

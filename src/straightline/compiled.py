@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 from straightline.folding import DTYPES
 from straightline.graph import MOST
 from straightline.llvm.module import LINE, Code, written
-from straightline.machine import LONG, WIDEST, Machine, Tiers, features, generated, narrow
+from straightline.machine import LONG, Machine, Tiers, features, generated, narrow
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower
 
@@ -32,14 +32,14 @@ class Compiled:
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
-        self.width = width or WIDEST
         self.differs = list(differs)
         self.types = [DTYPES[b.type] for b in program.inputs]
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
-        self.code: Code = written(program, self.differs, self.width, features()[2])
+        self.code: Code = written(program, self.differs, width, features()[2])
+        self.width = self.code.width
         self.operations, self.divisions = self.code.operations, self.code.divisions
-        self.blocks = Tiers(self.code.blocks, (width or narrow(), self.width))
+        self.blocks = Tiers(self.code.blocks, (width or narrow(self.width), self.width))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
         self._why: str | None = None
         self._first: list[np.ndarray] = []
@@ -178,9 +178,13 @@ class Alone:
 
 
 def compile(
-    function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = (), most: int = MOST
+    function: Callable[..., PyTree],
+    *examples: PyTree,
+    shared: Sequence[int] = (),
+    most: int = MOST,
+    single: bool = False,
 ) -> Compiled:
-    """Compile a JAX function of one run's arrays for many runs, in double precision.
+    """Compile a JAX function of one run's arrays for many runs, in double precision or in single.
 
     The result is called with arrays that have a leading axis of runs, and returns NumPy arrays that have one too. Runs
     are computed side by side in the lanes of the processor's vectors, on all cores; what depends on shared arguments
@@ -192,17 +196,22 @@ def compile(
         shared: numbers of the arguments that all runs share, which calls give without the axis of runs; none by
             default.
         most: operations above which the function is refused; 400,000 by default.
+        single: whether numbers are float32, as those of JAX are by default, with twice as many runs in a vector; as
+            under `jax.enable_x64` unless so, where an array may still be of float32.
 
     Raises:
         Unsupported: an operation that native code does not take, with the line that it comes from.
     """
     features()  # refuses a processor that LLVM does not know
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
-    return Compiled(lower(function, *examples, most=most), differs)
+    return Compiled(lower(function, *examples, most=most, single=single), differs)
 
 
 def compile_one(
-    function: Callable[..., PyTree], *examples: PyTree, in_place: Mapping[int, int] = MappingProxyType({})
+    function: Callable[..., PyTree],
+    *examples: PyTree,
+    in_place: Mapping[int, int] = MappingProxyType({}),
+    single: bool = False,
 ) -> Alone:
     """Compile a JAX function for one run that is computed again and again, such as a step of a controller.
 
@@ -215,28 +224,32 @@ def compile_one(
         examples: arguments, of which shapes and types count alone.
         in_place: which results, by their number among the leaves (from the last if negative), are written over which
             arguments, by theirs; none by default.
+        single: whether numbers are float32; double unless so.
 
     Raises:
         Unsupported: an operation that native code does not take, with the line that it comes from.
     """
     features()  # refuses a processor that LLVM does not know
-    program = lower(function, *examples)
+    program = lower(function, *examples, single=single)
     return Alone(program, {n % len(program.outputs): argument for n, argument in in_place.items()})
 
 
-def explain(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = ()) -> str:
+def explain(
+    function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = (), single: bool = False
+) -> str:
     """Say of how many operations the code of a function would be, loads of arguments among them, or why there is none.
 
     Args:
         function: of one run's arguments, as for `compile`.
         examples: arguments of one run, of which shapes and types count alone.
         shared: numbers of the arguments that all runs share; none by default.
+        single: whether numbers are float32; double unless so.
 
     Returns:
         "57 operations, 3 of them divisions and roots", or "refused: svd at model.py:12".
     """
     try:
-        code = compile(function, *examples, shared=shared)
+        code = compile(function, *examples, shared=shared, single=single)
     except Unsupported as error:
         return f"refused: {error}"
     return counted(code)
@@ -252,7 +265,7 @@ def memory_of(x: Any, dtype: Any) -> np.ndarray:
     if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
         x = jax.random.key_data(x)
     array = np.asarray(x)
-    if array.dtype.kind not in ("biuf" if dtype == np.float64 else "biu"):
+    if array.dtype.kind not in ("biuf" if np.dtype(dtype).kind == "f" else "biu"):
         raise ValueError(f"arguments: expected numbers of type {np.dtype(dtype)}, got {array.dtype}")
     return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
 

@@ -10,11 +10,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from straightline.nodes import Node, Number, Type
+from straightline.nodes import REAL, Node, Number, Type
 
 COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
 DTYPES: dict[str, Any] = {
     "f64": np.float64,
+    "f32": np.float32,
     "bool": np.bool_,
     "i32": np.int32,
     "i64": np.int64,
@@ -97,14 +98,14 @@ def _round_away(a: Any) -> Any:
 def _power(a: Any, b: Any) -> Any:
     """Compute a^b as the C library does; NumPy takes the root for b = 1/2, also of -0 and -infinity."""
     try:
-        return np.float64(math.pow(a, b))
+        return type(a)(math.pow(a, b))
     except (ValueError, OverflowError):
         return np.power(a, b)
 
 
 def _converted(a: Any, kind: Any) -> Any:
     """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
-    if not isinstance(a, np.floating) or kind in (np.float64, np.bool_):
+    if not isinstance(a, np.floating) or kind in (np.float64, np.float32, np.bool_):
         return a.astype(kind)
     ends = np.iinfo(kind)
     return kind(0 if np.isnan(a) else ends.max if a >= ends.max else ends.min if a <= ends.min else int(a))
@@ -156,9 +157,11 @@ def _is(node: Node, number: float) -> bool:
 
 def is_finite(node: Node) -> bool:
     """Return whether a number is finite whatever the data."""
-    if node.type != "f64" or (node.op == "constant" and math.isfinite(node.value)):
+    if node.type not in REAL or (node.op == "constant" and math.isfinite(node.value)):
         return True
-    return node.op == "convert" or (node.op == "select" and all(is_finite(a) for a in node.args[1:]))
+    if node.op == "convert":
+        return node.args[0].type not in REAL
+    return node.op == "select" and all(is_finite(a) for a in node.args[1:])
 
 
 def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
@@ -166,9 +169,9 @@ def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
         return b
     if b.op == "constant" and b.value == 0:
         return a
-    if type == "f64" and b.op == "neg":
+    if type in REAL and b.op == "neg":
         return graph.node("sub", type, a, b.args[0])
-    if type == "f64" and a.op == "neg":
+    if type in REAL and a.op == "neg":
         return graph.node("sub", type, b, a.args[0])
     return None
 
@@ -176,9 +179,9 @@ def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
 def _sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     if _is(b, 0):
         return a
-    if type == "f64" and _is(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
+    if type in REAL and _is(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
         return graph.node("neg", type, b)
-    if type == "f64" and b.op == "neg":
+    if type in REAL and b.op == "neg":
         return graph.node("add", type, a, b.args[0])
     return None
 
@@ -192,7 +195,7 @@ def _mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
         return b
     if a.value == 0 and is_finite(b):
         return a
-    if type == "f64" and a.value == -1:
+    if type in REAL and a.value == -1:
         return graph.node("neg", type, b)
     if a.value == 0.5 and b.op == "add" and b.args[0] is b.args[1]:
         return b.args[0]
@@ -203,9 +206,10 @@ def _mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
 
 def _div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     """Replace a division by a power of two by the product with its reciprocal, which is exact."""
-    if type != "f64" or b.op != "constant" or not b.value or not math.isfinite(b.value):
+    if type not in REAL or b.op != "constant" or not b.value or not math.isfinite(b.value):
         return None
-    if abs(math.frexp(b.value)[0]) != 0.5 or not 1e-300 < abs(b.value) < 1e300:
+    largest = 1e300 if type == "f64" else 1e37
+    if abs(math.frexp(b.value)[0]) != 0.5 or not 1 / largest < abs(b.value) < largest:
         return None
     return graph.node("mul", type, a, graph.constant(1 / b.value, type))
 
@@ -271,7 +275,7 @@ def _select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node
 def _compare(op: str) -> Callable[..., Node | None]:
     def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
         """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
-        if a is b and (a.type != "f64" or a in graph.numbers or is_finite(a)):
+        if a is b and (a.type not in REAL or a in graph.numbers or is_finite(a)):
             return graph.constant(op == "eq", "bool")
         if a.op == "constant":
             a, b = b, a
@@ -299,8 +303,10 @@ def _order(strict: bool, turned: bool) -> Callable[..., Node | None]:
 def _convert(graph: Graph, type: Type, a: Node) -> Node | None:
     if a.type == type:
         return a
+    if type == "f32" and a.op == "convert" and a.args[0].type == "f32" and a.type == "f64":  # nothing was lost
+        return a.args[0]
     if type == "bool":
-        return graph.node("ne", "bool", a, graph.constant(0.0 if a.type == "f64" else 0, a.type))
+        return graph.node("ne", "bool", a, graph.constant(0.0 if a.type in REAL else 0, a.type))
     return None
 
 

@@ -7,8 +7,8 @@ outermost block that has all its arguments: what a loop does not change is compu
 from collections.abc import Sequence
 from typing import Any
 
-from straightline.folding import COMMUTATIVE, folded
-from straightline.nodes import Block, Buffer, Node, Number, Store, Type, Unsupported
+from straightline.folding import COMMUTATIVE, DTYPES, folded
+from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, Unsupported
 
 MOST = 400_000  # nodes made, constants and what is dropped again among them
 
@@ -33,8 +33,9 @@ class Graph:
         return self._once(op, type, args, value)
 
     def constant(self, value: Number, type: Type) -> Node:
-        """Make a constant."""
-        key = (type, value if value != 0 or type != "f64" else str(value))  # two zeros
+        """Make a constant, rounded to single precision if it is of that type."""
+        value = DTYPES[type](value).item() if type == "f32" else value
+        key = (type, value if value != 0 or type not in REAL else str(value))  # two zeros
         known = self.top.seen.get(key)
         if known is None:
             known = self.top.seen[key] = self.fresh("constant", type, (), self.top, value)

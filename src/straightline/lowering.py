@@ -115,7 +115,12 @@ class Lowering:
         return array_of([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 
     def _read(self, values: dict[Var, Value], v: Any) -> Value:
-        return self.known(v.val) if isinstance(v, Literal) else values[v]
+        return self.known(_as_traced(v.val, v)) if isinstance(v, Literal) else values[v]
+
+
+def _as_traced(number: Any, variable: Any) -> Any:
+    """Return a literal in the type that the trace has for it: of single precision it may be a number of Python."""
+    return np.asarray(number, np.float32) if variable.aval.dtype == np.float32 else number
 
 
 def failed(operation: str, error: Exception, where: str) -> Unsupported:
@@ -216,8 +221,8 @@ jax.tree_util.register_pytree_node(_Held, lambda held: ((), held.value), lambda 
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float, complex)
 
 
-def traced(function: Callable[..., PyTree], *examples: PyTree) -> tuple[ClosedJaxpr, Any]:
-    """Trace a function of one run in double precision; return its program and the structure of its result.
+def traced(function: Callable[..., PyTree], *examples: PyTree, single: bool = False) -> tuple[ClosedJaxpr, Any]:
+    """Trace a function of one run, in double precision or in single; return its program and its result's structure.
 
     What a result has beside arrays, as a filter its model's functions, is part of the structure.
     """
@@ -229,7 +234,7 @@ def traced(function: Callable[..., PyTree], *examples: PyTree) -> tuple[ClosedJa
         structure[:] = [form]
         return arrays
 
-    with jax.enable_x64(True):
+    with jax.enable_x64(not single):
         flat, tree = jax.tree.flatten(examples)
         program = jax.make_jaxpr(call)(*flat)
     return program, structure[0]

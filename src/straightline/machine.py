@@ -78,15 +78,12 @@ def often(operations: int) -> float:
     return OFTEN * min(max(operations, SMALL), LARGE) / LARGE
 
 
-WIDEST = 8  # runs of a vector: one register of the widest processors, two of others; more only spill
-
-
-def narrow() -> int:
-    """Return the runs of one register, at most WIDEST: for code in haste, which is sooner generated so.
+def narrow(width: int) -> int:
+    """Return the runs of one register where `width` are those of one of the widest: for code in haste, sooner made so.
 
     LLVM splits what does not fit one register: selections and comparisons of event filters take it three times as long.
     """
-    return WIDEST if "+avx512f" in features()[1].split(",") else WIDEST // 2
+    return width if "+avx512f" in features()[1].split(",") else width // 2
 
 
 @cache

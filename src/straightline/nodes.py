@@ -6,15 +6,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-Type = Literal["f64", "bool", "i32", "i64", "u32", "u64"]
+Type = Literal["f64", "f32", "bool", "i32", "i64", "u32", "u64"]
 TYPES: dict[str, Type] = {
     "float64": "f64",
+    "float32": "f32",
     "bool": "bool",
     "int32": "i32",
     "int64": "i64",
     "uint32": "u32",
     "uint64": "u64",
 }
+REAL = frozenset(("f64", "f32"))  # types of floating-point numbers
 Number = float | int | bool
 
 

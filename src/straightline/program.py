@@ -14,10 +14,11 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
+from straightline.folding import DTYPES
 from straightline.graph import MOST, Graph
 from straightline.lowering import Lowering, Value, array_of, keys_of, traced, type_of
 from straightline.memory import LONG, InMemory
-from straightline.nodes import Block, Buffer, Guard, Loop, Node, Store
+from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store
 from straightline.rules import (  # noqa: F401  (they fill the rules)
     calls,
     decompositions,
@@ -57,9 +58,10 @@ def lower(
     *examples: PyTree,
     most: int = MOST,
     known: Known = MappingProxyType({}),
+    single: bool = False,
 ) -> Program:
     """Lower a function of one run, for arguments of these shapes, to at most so many operations."""
-    return lower_traced(*traced(function, *examples), most, known)
+    return lower_traced(*traced(function, *examples, single=single), most, known, single)
 
 
 def lower_traced(
@@ -67,8 +69,9 @@ def lower_traced(
     tree: Any,
     most: int = MOST,
     known: Known = MappingProxyType({}),
+    single: bool = False,
 ) -> Program:
-    """Lower a program that is traced already."""
+    """Lower a program that is traced already, in single precision or in double."""
     lowering = Lowering(most)
     avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
     inputs, values = [], []
@@ -82,7 +85,7 @@ def lower_traced(
             values.append(_partly_known(lowering, view, *known[number]))
         else:
             values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
-    with jax.enable_x64(True):
+    with jax.enable_x64(not single):
         outputs = lowering.results(traced, values)
     return Program(lowering.graph, inputs, outputs, tree)
 
@@ -90,7 +93,7 @@ def lower_traced(
 def _partly_known(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
     """Return an array of which some entries are known: all, or a few of a short one, as constants."""
     if mask.all():
-        return lowering.known(numbers)
+        return lowering.known(numbers.astype(DTYPES[view.type]))
     if view.size > LONG:
         return view
     graph, kind = lowering.graph, view.type
@@ -161,7 +164,7 @@ def products_of(items: Iterable[Any]) -> set[Node]:
     users: dict[Node, Any] = {}
     for statement in items:
         for used in uses(statement):
-            if used.op == "mul" and used.type == "f64":
+            if used.op == "mul" and used.type in REAL:
                 users[used] = None if used in users else statement
     results: set[Node] = set()
     taken: set[Node] = set()

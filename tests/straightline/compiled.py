@@ -13,20 +13,23 @@ WIDTH = 8
 
 
 class Compiled:
-    """The functions of these names on vectors of 8 numbers; a call takes and gives arrays."""
+    """The functions of these names on vectors of 8 numbers, doubles or floats; a call takes and gives arrays."""
 
-    def __init__(self, names: Iterable[str]):
-        names = list(names)
-        self.engine = engine_of(functions(names, WIDTH) + "".join(_loop(name) for name in names))
+    def __init__(self, names: Iterable[str], single: bool = False):
+        self.single = single
+        names = [f"{name}f" if single else name for name in names]
+        self.engine = engine_of(functions(names, WIDTH) + "".join(_loop(name, single) for name in names))
 
     def __call__(self, name: str, *arguments: np.ndarray) -> np.ndarray:
         """The function's results."""
         count = len(arguments[0])
-        filled = [np.concatenate([a, np.ones(-count % WIDTH)]) for a in (*arguments, arguments[-1])[:2]]
+        dtype, ending = (np.float32, "f") if self.single else (np.float64, "")
+        both = (*arguments, arguments[-1])[:2]
+        filled = [np.concatenate([a, np.ones(-count % WIDTH)]).astype(dtype) for a in both]
         result = np.empty_like(filled[0])
         pointers = [a.ctypes.data for a in (*filled, result)]
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64)
-        kind(self.engine.get_function_address(f"loop_{name}"))(*pointers, len(result) // WIDTH)
+        kind(self.engine.get_function_address(f"loop_{name}{ending}"))(*pointers, len(result) // WIDTH)
         return result[:count]
 
 
@@ -44,9 +47,9 @@ def engine_of(text: str) -> llvm.ExecutionEngine:
     return engine
 
 
-def _loop(name: str) -> str:
-    vector = "%double"
-    arguments = f"{vector} %a" + (f", {vector} %b" if name in ("atan2", "pow") else "")
+def _loop(name: str, single: bool) -> str:
+    vector = "%float" if single else "%double"
+    arguments = f"{vector} %a" + (f", {vector} %b" if name.removesuffix("f") in ("atan2", "pow") else "")
     return f"""
 define void @loop_{name}(ptr %x, ptr %y, ptr %z, i64 %count) {{
 entry:
@@ -56,10 +59,10 @@ loop:
   %p = getelementptr {vector}, ptr %x, i64 %t
   %q = getelementptr {vector}, ptr %y, i64 %t
   %s = getelementptr {vector}, ptr %z, i64 %t
-  %a = load {vector}, ptr %p, align 8
-  %b = load {vector}, ptr %q, align 8
+  %a = load {vector}, ptr %p, align 4
+  %b = load {vector}, ptr %q, align 4
   %r = call {vector} @hg_{name}({arguments})
-  store {vector} %r, ptr %s, align 8
+  store {vector} %r, ptr %s, align 4
   %next = add i64 %t, 1
   %more = icmp slt i64 %next, %count
   br i1 %more, label %loop, label %end

@@ -8,7 +8,7 @@ from straightline.llvm.transposed import Lines
 @cache
 def types(width: int) -> str:
     """Return the text that names each type <W x T> `%T`, and an integer of W bits `%lanes`."""
-    vectors = [f"%{scalar} = type <{width} x {scalar}>\n" for scalar in ("double", "i64", "i32", "i8", "i1")]
+    vectors = [f"%{scalar} = type <{width} x {scalar}>\n" for scalar in ("double", "float", "i64", "i32", "i8", "i1")]
     return "".join([*vectors, f"%lanes = type i{width}\n"])
 
 

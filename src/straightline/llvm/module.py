@@ -13,10 +13,10 @@ from straightline.folding import DTYPES
 from straightline.llvm.lanes import WIDTH, gather, lane_numbers, types
 from straightline.llvm.operations import BITS
 from straightline.llvm.text import Slots, Writer, loops_of, turns_of
-from straightline.llvm.transposed import mover
+from straightline.llvm.transposed import mover, mover_name
 from straightline.lowering import Lowering, Value, refusing
 from straightline.memory import LONG, InMemory, contiguous
-from straightline.nodes import Buffer, Node, Type, Unsupported
+from straightline.nodes import REAL, Buffer, Node, Type, Unsupported
 from straightline.program import (
     Program,
     Summed,
@@ -34,6 +34,8 @@ from straightline.vectors.elementary import functions
 
 LONGEST = 200_000  # operations: at 120,000 LLVM takes half as long as XLA, 0.1 ms each
 LINE = 64  # bytes: where vectors of any width may start
+WIDEST = 8  # runs of a vector of doubles: one register of the widest processors, two of others; more only spill
+SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
 
 
 class Source(NamedTuple):
@@ -71,7 +73,7 @@ class Code(NamedTuple):
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
     `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` are those in the
-    program, `divisions` those of them that divide or take roots.
+    program, `divisions` those of them that divide or take roots. `width`: the most runs of a vector.
     """
 
     blocks: Source
@@ -84,6 +86,7 @@ class Code(NamedTuple):
     scratch: int
     operations: int
     divisions: int
+    width: int
 
 
 def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
@@ -123,7 +126,7 @@ def _filled(lowering: Lowering, value: Value) -> InMemory:
 def written(
     program: Program,
     differing: Iterable[bool],
-    width: int,
+    width: int | None,
     fuse: bool,
     alone: bool = False,
     last: Collection[int] = (),
@@ -131,8 +134,9 @@ def written(
 ) -> Code:
     """Write a program; `differing` says of each input whether it differs between runs.
 
-    `width`: the most runs of a vector. `alone`: one run, whose arrays are used in place; results of the numbers `last`
-    may overwrite arguments. `summed`: outputs that are summed over runs. The program is let go of.
+    `width`: the most runs of a vector, as many as suit the program if None. `alone`: one run, whose arrays are used in
+    place; results of the numbers `last` may overwrite arguments. `summed`: outputs that are summed over runs. The
+    program is let go of.
 
     Raises:
         Unsupported: an operation that has no text, or a program that is too long.
@@ -144,6 +148,7 @@ def written(
     operations = counts.total() - counts["constant"]
     if operations > LONGEST:
         raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
+    width = width or widest(items)
     # Numbers that differ between runs; all others are computed once.
     spread = {*items, *program.inputs} if alone else varying(items, lanes)
     products = products_of(items) if fuse else set()
@@ -187,13 +192,19 @@ def written(
     source, results = _source(text, blocks, movers), [Output(b.type, b.shape) for b in outputs]
     divisions = counts["div"] + counts["sqrt"]
     program.graph.top.let_go()
-    return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions)
+    return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions, width)
+
+
+def widest(items: Iterable[Any]) -> int:
+    """Return the most runs of a vector: twice as many where most real numbers are of single precision."""
+    counts = Counter([x.type for x in items if isinstance(x, Node)])
+    return 2 * WIDEST if counts["f32"] > counts["f64"] else WIDEST
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
     """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
     read = _read(items) if outputs else set()
-    if any(b.inside is not None or b in read or b.type != "f64" for b in outputs):
+    if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
         raise Unsupported("a sum over runs of numbers that are used again")
 
 
@@ -257,13 +268,13 @@ def _blocks(
     writer.start("block")
     writer.line("%number = phi i64 [%begin, %entry], [%next, %done]")
     writer.line(f"%first = mul i64 %number, {WIDTH}")
-    movers = set[tuple[int, bool]]()
+    movers = set[tuple[int, bool, bool]]()
 
     def move(kind: str, buffer: Buffer) -> None:
-        bits = BITS[buffer.type]
-        movers.add((bits, kind == "take"))
+        mover_kind = BITS[buffer.type], kind == "take", buffer.type in SQUARED
+        movers.add(mover_kind)
         pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
-        writer.line(f"call void @{kind}{bits}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
+        writer.line(f"call void @{mover_name(*mover_kind)}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
 
     # Inputs to lanes, the operations, lanes to outputs.
     taken = [] if alone else [b for b in lanes if b in in_scratch and b.size]

@@ -8,11 +8,11 @@ depend neither on the width nor on the level of optimisation.
 import struct
 from collections.abc import Callable
 
-from straightline.nodes import Node, Type, Unsupported
+from straightline.nodes import REAL, Node, Type, Unsupported
 from straightline.vectors.elementary import FUNCTIONS, SCALAR
 
-LLVM = {"f64": "double", "bool": "i1", "i32": "i32", "i64": "i64", "u32": "i32", "u64": "i64"}
-BITS = {"f64": 64, "bool": 8, "i32": 32, "i64": 64, "u32": 32, "u64": 64}  # in memory
+LLVM = {"f64": "double", "f32": "float", "bool": "i1", "i32": "i32", "i64": "i64", "u32": "i32", "u64": "i64"}
+BITS = {"f64": 64, "f32": 32, "bool": 8, "i32": 32, "i64": 64, "u32": 32, "u64": 64}  # in memory
 FLOAT = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor"}
 ORDER = {"eq": "eq", "ne": "ne", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge"}
@@ -35,8 +35,8 @@ def vector(type: Type) -> str:
 
 
 def literal(value: float | int | bool, type: Type) -> str:
-    """Return a constant; doubles by their bits."""
-    if type == "f64":
+    """Return a constant; real ones by their bits as doubles."""
+    if type in REAL:
         return "0x" + struct.pack(">d", float(value)).hex().upper()
     if type == "bool":
         return "true" if value else "false"
@@ -53,7 +53,7 @@ def operation(node: Node, names: list[str], emit: Emit) -> str:
     source: Type = node.args[0].type if node.args else node.type
     operand_type = vector(source)
     op, result_type = node.op, vector(node.type)
-    if source == "f64" and op in FLOAT:
+    if source in REAL and op in FLOAT:
         return emit(f"{FLOAT[op]} {operand_type} {names[0]}, {names[1]}")
     if op == "select":
         return emit(f"select {operand_type} {names[0]}, {result_type} {names[1]}, {result_type} {names[2]}")
@@ -69,20 +69,25 @@ def operation(node: Node, names: list[str], emit: Emit) -> str:
     # Functions of `vector_math`, then arithmetic by type.
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
-        return emit(f"call {result_type} @hg_{op}({typed})")
-    return (_of_doubles if source == "f64" else _of_integers)(node, names, operand_type, emit)
+        return emit(f"call {result_type} @hg_{called(node)}({typed})")
+    return (_of_reals if source in REAL else _of_integers)(node, names, operand_type, emit)
+
+
+def called(node: Node) -> str:
+    """Return the name of the function that computes an operation: in single precision it ends in f, as in C."""
+    return f"{node.op}f" if node.type == "f32" else node.op
 
 
 def _comparison(op: str, type: Type) -> str:
-    if type == "f64":
+    if type in REAL:
         return "fcmp une" if op == "ne" else f"fcmp o{op}"
     if op in ("eq", "ne"):
         return f"icmp {op}"
     return f"icmp {'u' if type in ('u32', 'u64', 'bool') else 's'}{op}"
 
 
-def _of_doubles(node: Node, names: list[str], text: str, emit: Emit) -> str:
-    op, first = node.op, f"{text} {names[0]}"
+def _of_reals(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op == "neg":
         return emit(f"fneg {first}")
     if op in UNARY:
@@ -92,11 +97,11 @@ def _of_doubles(node: Node, names: list[str], text: str, emit: Emit) -> str:
         return emit(f"call {text} @llvm.{op}imum({first}, {text} {names[1]})")
     if op == "is_finite":
         size = emit(f"call {text} @llvm.fabs({first})")
-        return emit(f"fcmp olt {text} {size}, {splat(float('inf'), 'f64')}")
+        return emit(f"fcmp olt {text} {size}, {splat(float('inf'), type)}")
     # sign x = x for zeros and NaN.
     if op == "sign":
-        signed = emit(f"call {text} @llvm.copysign({text} {splat(1.0, 'f64')}, {first})")
-        other = emit(f"fcmp one {first}, {splat(0.0, 'f64')}")
+        signed = emit(f"call {text} @llvm.copysign({text} {splat(1.0, type)}, {first})")
+        other = emit(f"fcmp one {first}, {splat(0.0, type)}")
         return emit(f"select {vector('bool')} {other}, {text} {signed}, {first}")
     if op == "rem":
         return emit(f"frem {first}, {names[1]}")
@@ -162,9 +167,11 @@ def _converted(source: Type, target: Type, name: str, emit: Emit) -> str:
     operand_type, result_type = vector(source), vector(target)
     if source == target or LLVM[source] == LLVM[target]:
         return name
-    if target == "f64":
+    if source in REAL and target in REAL:
+        return emit(f"{'fpext' if target == 'f64' else 'fptrunc'} {operand_type} {name} to {result_type}")
+    if target in REAL:
         return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {operand_type} {name} to {result_type}")
-    if source == "f64":
+    if source in REAL:
         how = "fptosi" if target[0] == "i" else "fptoui"
         return emit(f"call {result_type} @llvm.{how}.sat({operand_type} {name})")
     if BITS[target] < BITS[source]:
@@ -174,11 +181,11 @@ def _converted(source: Type, target: Type, name: str, emit: Emit) -> str:
 
 def fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
     """Emit a b + c, c - a b or a b - c, rounded once, from the names of a, b, c."""
-    doubles = vector("f64")
+    reals = vector(node.type)
     a, b, c = names
     if node.op == "sub":
         if node.args[1] is product:
-            a = emit(f"fneg {doubles} {a}")
+            a = emit(f"fneg {reals} {a}")
         else:
-            c = emit(f"fneg {doubles} {c}")
-    return emit(f"call {doubles} @llvm.fma({doubles} {a}, {doubles} {b}, {doubles} {c})")
+            c = emit(f"fneg {reals} {c}")
+    return emit(f"call {reals} @llvm.fma({reals} {a}, {reals} {b}, {reals} {c})")

@@ -8,8 +8,8 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from straightline.llvm.lanes import gather_name
-from straightline.llvm.operations import BITS, CALLED, LLVM, fused, operation, splat, vector
-from straightline.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Type
+from straightline.llvm.operations import BITS, CALLED, LLVM, called, fused, operation, splat, vector
+from straightline.nodes import REAL, Block, Buffer, Check, Guard, Loop, Node, Store, Type
 from straightline.program import fusable
 
 Scope = dict[Any, str]
@@ -128,7 +128,7 @@ class Writer:
             names = [self.operand(n) for n in (*product.args, rest)]
             return fused(node, product, names, self.add)
         if node.op in CALLED:
-            self.called.add(node.op)
+            self.called.add(called(node))
         return operation(node, [self.operand(a) for a in node.args], self.add)
 
     def operand(self, node: Node) -> str:
@@ -245,13 +245,15 @@ class Writer:
         loaded = self.add(f"call %i{bits} @{gather_name(bits, spread)}(ptr {self._base(owner)}, %i64 {positions})")
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {loaded}, zeroinitializer")
-        return self.add(f"bitcast %i64 {loaded} to %double") if node.type == "f64" else loaded
+        return self.add(f"bitcast %i{bits} {loaded} to {vector(node.type)}") if node.type in REAL else loaded
 
     def _store(self, store: Store) -> None:
         name, kind, bits = self.operand(store.node), vector(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
         address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
-        if store.buffer in self.sums:
+        if store.buffer in self.sums:  # of doubles
+            if store.node.type == "f32":
+                name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"
             before = self.add(f"load {kind}, ptr {address}, align 8")
             counted = self.add(f"select %i1 {self.counted}, {kind} {name}, {kind} zeroinitializer")
             name = self.add(f"fadd {kind} {before}, {counted}")

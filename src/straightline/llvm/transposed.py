@@ -1,11 +1,11 @@
 """Transposition of arrays [run][entry] to [entry][lane] for a block of runs, and back, as text of LLVM IR.
 
-64-bit numbers are moved in squares, of eight runs by eight entries or as many as a vector has; others one by one.
+Long numbers are moved in squares, of as many runs and entries as a register has, or as a vector has; others one by one.
 """
 
 from collections.abc import Callable
 
-SIDE = 8  # runs and entries of the largest square
+REGISTER = 512  # bits of the largest one: a row of a square
 
 
 class Lines:
@@ -33,14 +33,19 @@ class Lines:
         self.lines += [f"  br label %{head}", f"{after}:"]
 
 
-def mover(bits: int, inwards: bool, width: int) -> str:
+def mover_name(bits: int, inwards: bool, squared: bool) -> str:
+    """Return the name of a mover."""
+    return f"{'take' if inwards else 'give'}{'f' if squared and bits < 64 else ''}{bits}"
+
+
+def mover(bits: int, inwards: bool, squared: bool, width: int) -> str:
     """Write `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`, which moves back.
 
     Lane l is run first + l, or the last run if there are fewer: it then repeats the computation of that run.
     """
-    text, name = Lines(), f"{'take' if inwards else 'give'}{bits}"
+    text, name = Lines(), mover_name(bits, inwards, squared)
     bytes_ = bits // 8
-    side = min(SIDE, width)
+    side = min(REGISTER // bits if squared else 8, width)
     for group in range(0, width, side):
         # Address of each lane's run.
         rows = []
@@ -51,8 +56,8 @@ def mover(bits: int, inwards: bool, width: int) -> str:
             rows.append(text.add(f"getelementptr i{bits}, ptr %runs, i64 {start}"))
         # Squares, then the remaining entries.
         start = "0"
-        if bits == 64:
-            text.loop(f"g{group}", "0", "%size", side, _square(text, rows, width, group, inwards))
+        if squared:
+            text.loop(f"g{group}", "0", "%size", side, _square(text, rows, width, group, bits, inwards))
             start = text.add(f"and i64 %size, {-side}")
         text.loop(f"h{group}", start, "%size", 1, _single(text, rows, width, group, bits, inwards))
     body = "\n".join(text.lines)
@@ -60,27 +65,27 @@ def mover(bits: int, inwards: bool, width: int) -> str:
     return f"define internal void @{name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}} ; {bytes_}\n"
 
 
-def _square(text: Lines, rows: list[str], width: int, group: int, inwards: bool) -> Callable[[str], None]:
+def _square(text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool) -> Callable[[str], None]:
     """Move as many entries as there are lanes."""
 
     def body(i: str) -> None:
-        vector = f"<{len(rows)} x i64>"
-        in_rows = [text.add(f"getelementptr i64, ptr {row}, i64 {i}") for row in rows]
+        vector = f"<{len(rows)} x i{bits}>"
+        in_rows = [text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}") for row in rows]
         base = text.add(f"mul i64 {i}, {width}")
-        base = text.add(f"getelementptr i64, ptr %lanes, i64 {base}")
-        in_lanes = [text.add(f"getelementptr i64, ptr {base}, i64 {k * width + group}") for k in range(len(rows))]
+        base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
+        in_lanes = [text.add(f"getelementptr i{bits}, ptr {base}, i64 {k * width + group}") for k in range(len(rows))]
         sources, targets = (in_rows, in_lanes) if inwards else (in_lanes, in_rows)
-        moved = [text.add(f"load {vector}, ptr {p}, align 8") for p in sources]
+        moved = [text.add(f"load {vector}, ptr {p}, align {bits // 8}") for p in sources]
         half = len(rows) // 2
         while half:
-            moved, half = _exchanged(text, moved, half), half // 2
+            moved, half = _exchanged(text, moved, half, bits), half // 2
         for p, x in zip(targets, moved, strict=True):
-            text.lines.append(f"  store {vector} {x}, ptr {p}, align 8")
+            text.lines.append(f"  store {vector} {x}, ptr {p}, align {bits // 8}")
 
     return body
 
 
-def _exchanged(text: Lines, rows: list[str], half: int) -> list[str]:
+def _exchanged(text: Lines, rows: list[str], half: int, bits: int) -> list[str]:
     """Do one step of a transposition: exchange off-diagonal squares of this size."""
     exchanged, side = rows[:], len(rows)
     for i in range(side):
@@ -91,7 +96,7 @@ def _exchanged(text: Lines, rows: list[str], half: int) -> list[str]:
         high = [k + half if not k & half else k + side for k in range(side)]
         for row, order in ((i, low), (j, high)):
             mask = ", ".join(f"i32 {k}" for k in order)
-            pair = f"<{side} x i64> {rows[i]}, <{side} x i64> {rows[j]}"
+            pair = f"<{side} x i{bits}> {rows[i]}, <{side} x i{bits}> {rows[j]}"
             exchanged[row] = text.add(f"shufflevector {pair}, <{side} x i32> <{mask}>")
     return exchanged
 

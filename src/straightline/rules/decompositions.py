@@ -29,13 +29,13 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     Source: Jacobi, Ueber ein leichtes Verfahren (1846); Golub and Van Loan, Matrix computations, section 8.5; Luk and
     Park, On parallel Jacobi orderings (1989), by which it converges as the order by rows does.
     """
-    n, eps = len(a), float(np.finfo(np.float64).eps)
+    n, eps = len(a), float(np.finfo(a.dtype).eps)
     finite = jnp.all(jnp.isfinite(a))
     unit = _unit(a)
     entries = {(i, j): (a[i, j] / unit + a[j, i] / unit) / 2 for i in range(n) for j in range(i, n)}
     # Off-diagonal entries below eps ||A||_F / n are rounding.
     size = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
-    vectors = {(i, j): jnp.asarray(float(i == j)) for i in range(n) for j in range(n)}
+    vectors = {(i, j): jnp.asarray(float(i == j), a.dtype) for i in range(n) for j in range(n)}
 
     def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
         rest = [jnp.abs(state[0][pair]) > size for pair in combinations(range(n), 2)]
@@ -58,8 +58,8 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _unit(a: jax.Array) -> jax.Array:
     """Return a power of two in whose units squares of the matrix's entries neither overflow nor vanish, mostly 1."""
-    largest = jnp.max(jnp.abs(a))
-    return jnp.where(largest > 2.0**300, 2.0**600, jnp.where(largest < 2.0**-300, 2.0**-600, 1.0))
+    largest, power = jnp.max(jnp.abs(a)), 300 if a.dtype == np.float64 else 50
+    return jnp.where(largest > 2.0**power, 4.0**power, jnp.where(largest < 2.0**-power, 4.0**-power, 1.0))
 
 
 def _tournament(n: int) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
@@ -124,7 +124,7 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     shape = avals[0].shape
     if shape[-1] > LARGEST or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    return _of_each(lowering, _program(shape[-1]), equation, inputs[0])
+    return _of_each(lowering, _program(shape[-1], avals[0].dtype), equation, inputs[0])
 
 
 def _of_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
@@ -138,9 +138,9 @@ def _of_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matri
 
 
 @cache
-def _program(n: int) -> ClosedJaxpr:
+def _program(n: int, dtype: Any) -> ClosedJaxpr:
     with jax.enable_x64(True):
-        return jax.make_jaxpr(eigh)(like((n, n), np.float64))
+        return jax.make_jaxpr(eigh)(like((n, n), dtype))
 
 
 IN_MEMORY |= {"eigh": _eigh}
@@ -192,13 +192,13 @@ def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Val
     shape = avals[0].shape
     if shape[-2] != shape[-1] or shape[-1] > LARGEST:
         raise Unsupported(f"factors of a matrix of shape {shape[-2:]}")
-    return _of_each(lowering, _lu_program(shape[-1]), equation, inputs[0])
+    return _of_each(lowering, _lu_program(shape[-1], avals[0].dtype), equation, inputs[0])
 
 
 @cache
-def _lu_program(n: int) -> ClosedJaxpr:
+def _lu_program(n: int, dtype: Any) -> ClosedJaxpr:
     with jax.enable_x64(True):
-        return jax.make_jaxpr(lu)(like((n, n), np.float64))
+        return jax.make_jaxpr(lu)(like((n, n), dtype))
 
 
 def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from straightline.folding import DTYPES
 from straightline.graph import Graph
 from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
-from straightline.nodes import Key, Node, Type, Unsupported
+from straightline.nodes import REAL, Key, Node, Type, Unsupported
 
 # Operation of JAX -> the graph's.
 ELEMENTWISE = {name: name for name in (
@@ -19,6 +20,9 @@ ELEMENTWISE = {name: name for name in (
     "and", "or", "xor", "not", "shift_left", "erf", "erf_inv", "erfc", "lgamma", "asin", "acos", "atan",
     "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2",
 )} | {"add_any": "add", "shift_right_logical": "shift_right"}  # fmt: skip
+
+
+WORDS: dict[Type, tuple[Type, Type]] = {"f64": ("u64", "i64"), "f32": ("u32", "i32")}  # integers of as many bits
 
 
 def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
@@ -81,7 +85,7 @@ def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
         exponent //= 2
         if exponent:
             square = graph.node("mul", type, square, square)
-    unit = graph.constant(1.0 if type == "f64" else 1, type)
+    unit = graph.constant(1.0 if type in REAL else 1, type)
     product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, unit)
     return product if params["y"] >= 0 else graph.node("div", type, unit, product)
 
@@ -157,27 +161,28 @@ def _total_order(op: str) -> Callable[..., Node]:
 
     def rank(graph: Graph, x: Node) -> Node:
         # Bits as an integer without sign: all of a negative number's are turned round, of others the sign's.
-        if x.type != "f64":
+        if x.type not in REAL:
             return x
-        bits = graph.node("bitcast", "u64", x)
-        negative = graph.node("shift_right", "u64", bits, graph.constant(63, "u64"))
-        all_bits = graph.node("sub", "u64", graph.constant(0, "u64"), negative)
-        sign = graph.constant(1 << 63, "u64")
-        return graph.node("xor", "u64", bits, graph.node("or", "u64", all_bits, sign))
+        whole, last = WORDS[x.type][0], int(x.type[1:]) - 1
+        bits = graph.node("bitcast", whole, x)
+        negative = graph.node("shift_right", whole, bits, graph.constant(last, whole))
+        all_bits = graph.node("sub", whole, graph.constant(0, whole), negative)
+        sign = graph.constant(1 << last, whole)
+        return graph.node("xor", whole, bits, graph.node("or", whole, all_bits, sign))
 
     return lambda graph, type, params, x, y: graph.node(op, type, rank(graph, x), rank(graph, y))
 
 
 def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node:
     """Return the number next to x towards y: its bits, as an integer, and one more or less; y of equal ones."""
-    node, zero, one = graph.node, graph.constant(0.0, type), graph.constant(1, "i64")
-    bits = node("bitcast", "i64", x)
+    whole, smallest = WORDS[type][1], float(np.finfo(DTYPES[type]).smallest_subnormal)
+    node, zero, one = graph.node, graph.constant(0.0, type), graph.constant(1, whole)
+    bits = node("bitcast", whole, x)
     # Away from zero one more: where x < y and x is positive, or x > y and it is negative.
     away = node("eq", "bool", node("lt", "bool", x, y), node("lt", "bool", zero, x))
-    beside = node("select", "i64", away, node("add", "i64", bits, one), node("sub", "i64", bits, one))
-    tiny = node(
-        "select", type, node("lt", "bool", y, zero), graph.constant(-5e-324, type), graph.constant(5e-324, type)
-    )
+    beside = node("select", whole, away, node("add", whole, bits, one), node("sub", whole, bits, one))
+    down, up = graph.constant(-smallest, type), graph.constant(smallest, type)
+    tiny = node("select", type, node("lt", "bool", y, zero), down, up)
     moved = node("select", type, node("eq", "bool", x, zero), tiny, node("bitcast", type, beside))
     moved = node("select", type, node("eq", "bool", x, y), y, moved)
     known = node("and", "bool", node("eq", "bool", x, x), node("eq", "bool", y, y))

@@ -11,7 +11,7 @@ from jax.extend.core import JaxprEqn
 from straightline.folding import DTYPES
 from straightline.graph import Graph
 from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
-from straightline.nodes import Node, Type, Unsupported
+from straightline.nodes import REAL, Node, Type, Unsupported
 
 
 def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
@@ -36,7 +36,7 @@ ALL_BITS = np.nan  # of "and": true, -1, or the greatest unsigned integer
 
 def _within(type: Type, number: float) -> float:
     """Return the number of this type that is nearest to one: infinity is no integer. ALL_BITS: that of all bits."""
-    if type == "f64" or np.isfinite(number):
+    if type in REAL or np.isfinite(number):
         return number
     greatest = number > 0 or number is ALL_BITS
     if type == "bool":
@@ -131,7 +131,7 @@ def _sums_of_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray
                 continue
             term, before = graph.node(product, type, a[k], b[k]), sums[place]
             sums[place] = term if before is None else graph.node(sum_, type, before, term)
-    return [graph.constant(0.0 if type == "f64" else 0, type) if s is None else s for s in sums]
+    return [graph.constant(0.0 if type in REAL else 0, type) if s is None else s for s in sums]
 
 
 def _leaves_out(x: Node, y: Node) -> bool:
@@ -190,10 +190,16 @@ def _each_matrix(function: Any) -> Rule:
     return rule
 
 
+def _type_of(matrix: np.ndarray) -> Type:
+    """Return the type of a matrix's numbers; of one without entries any will do."""
+    type: Type = matrix.flat[0].type if matrix.size else "f64"
+    return type
+
+
 def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
     """Compute A = L L' column by column, one reciprocal each; all NaN if the matrix is not positive definite."""
-    n = len(a)
-    zero, missing = graph.constant(0.0, "f64"), graph.constant(float("nan"), "f64")
+    n, real = len(a), _type_of(a)
+    zero, missing = graph.constant(0.0, real), graph.constant(float("nan"), real)
     definite = graph.constant(True, "bool")
     lower = np.full((n, n), zero, dtype=object)
     for j in range(n):
@@ -202,17 +208,17 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
         for i in range(j, n):
             rest = a[i, j]
             for k in range(j):
-                rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", lower[i, k], lower[j, k]))
+                rest = graph.node("sub", real, rest, graph.node("mul", real, lower[i, k], lower[j, k]))
             rests.append(rest)
         # l_jj = sqrt(rest), l_ij = rest / l_jj.
-        root = graph.node("sqrt", "f64", rests[0])
+        root = graph.node("sqrt", real, rests[0])
         negative = graph.node("le", "bool", rests[0], zero)  # NaN is not, and stays where it leads to
         definite = graph.node("and", "bool", definite, graph.node("not", "bool", negative))
-        scale = graph.node("div", "f64", graph.constant(1.0, "f64"), root)
+        scale = graph.node("div", real, graph.constant(1.0, real), root)
         lower[j, j] = root
         for i in range(j + 1, n):
-            lower[i, j] = graph.node("mul", "f64", rests[i - j], scale)
-    numbers = [graph.node("select", "f64", definite, x, missing) for x in lower.ravel().tolist()]
+            lower[i, j] = graph.node("mul", real, rests[i - j], scale)
+    numbers = [graph.node("select", real, definite, x, missing) for x in lower.ravel().tolist()]
     return array_of(numbers, lower.shape)
 
 
@@ -226,16 +232,17 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
     if transposed:
         a, lower = a.T, not lower
     # x_i = (b_i - sum_j a_ij x_j) / a_ii, in the order of substitution.
-    n, unit = len(a), graph.constant(1.0, "f64")
-    scales = [unit if params["unit_diagonal"] else graph.node("div", "f64", unit, a[i, i]) for i in range(n)]
+    n, real = len(a), _type_of(a)
+    unit = graph.constant(1.0, real)
+    scales = [unit if params["unit_diagonal"] else graph.node("div", real, unit, a[i, i]) for i in range(n)]
     x = np.empty(b.shape, dtype=object)
     order = list(range(n)) if lower else list(range(n))[::-1]
     for step, i in enumerate(order):
         for column in range(b.shape[1]):
             rest = b[i, column]
             for j in order[:step]:
-                rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", a[i, j], x[j, column]))
-            x[i, column] = graph.node("mul", "f64", rest, scales[i])
+                rest = graph.node("sub", real, rest, graph.node("mul", real, a[i, j], x[j, column]))
+            x[i, column] = graph.node("mul", real, rest, scales[i])
     return x if params["left_side"] else x.T
 
 

@@ -5,7 +5,7 @@ from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
 from straightline.lowering import RULES, Lowering, type_of
-from straightline.nodes import Node, Unsupported
+from straightline.nodes import REAL, Node, Unsupported
 from straightline.rules.elementwise import select
 
 SORTED = 20  # numbers: more are many comparisons
@@ -32,7 +32,7 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 def _wrong(graph: Graph, a: Node, b: Node) -> Node:
     """Return whether a belongs behind b."""
     larger = graph.node("gt", "bool", a, b)
-    if a.type != "f64":
+    if a.type not in REAL:
         return larger
     number, missing = graph.node("eq", "bool", b, b), graph.node("ne", "bool", a, a)
     return graph.node("or", "bool", larger, graph.node("and", "bool", missing, number))

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from straightline.lowering import IN_MEMORY, Lowering, Value, like
-from straightline.nodes import Unsupported
+from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, like, type_of
+from straightline.nodes import Type, Unsupported
 
 EPSILON = float(np.finfo(np.float64).eps)
 FAR = 30.0  # the argument of a Bessel function from which its asymptotic series has all digits
@@ -178,10 +178,19 @@ def _masses(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
 
 
 def _inlined(function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Compute in double precision, of numbers of single precision too, for whose results it has digits to spare."""
     avals: list[Any] = [v.aval for v in equation.invars]
-    if avals[0].dtype != np.float64:
+    if avals[0].dtype not in (np.float64, np.float32):
         raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
-    return lowering.inline(_program(function, len(avals), avals[0].shape), inputs)
+    results = lowering.inline(
+        _program(function, len(avals), avals[0].shape), [_of_type(lowering, "f64", x) for x in inputs]
+    )
+    return [_of_type(lowering, type_of(avals[0]), x) for x in results]
+
+
+def _of_type(lowering: Lowering, type: Type, value: Value) -> Value:
+    nodes = lowering.nodes(value)
+    return array_of((lowering.graph.node("convert", type, n) for n in nodes.ravel().tolist()), nodes.shape)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Elementary functions of vectors of doubles as text of LLVM IR, each one straight line of operations.
+"""Elementary functions of vectors of doubles or floats as text of LLVM IR, each one straight line of operations.
 
 LLVM's own intrinsics call the scalar library once for each number of a vector; these compute all numbers of a vector at
 once. Each is within 2 units of rounding of the true value over its whole range, with NaN, infinities, zeros of both
@@ -29,6 +29,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Vector], int]] = {
     "erfc": (error.erfc, 1),
     "erf_inv": (error.erf_inv, 1),
 }
+OF_FLOATS = {"erf_inv": (error.erf_inv_of_floats, 1)}  # which have a form of their own
 ATTRIBUTES = "attributes #9 = { noinline nounwind }\n"
 
 # Called for each number of a vector: seldom used, or hard to get right.
@@ -49,25 +50,34 @@ SCALAR = {
 
 
 def functions(names: Iterable[str], width: int) -> str:
-    """Return the text of `define internal %double @hg_NAME(%double ...)` for each name, with declarations."""
-    names = sorted(set(names))
-    scalar = [name for name in names if name in SCALAR]
-    declared = [f"declare double @{name}({', '.join(['double'] * SCALAR[name])})\n" for name in scalar]
-    texts = [_by_number(name, width) if name in SCALAR else function(name, *FUNCTIONS[name]) for name in names]
+    """Return the text of `define internal %double @hg_NAME(%double ...)` for each name, with declarations.
+
+    A name that ends in f is that of a function of floats, as in C.
+    """
+    declared, texts = [], []
+    for name in sorted(set(names)):
+        kind = "double" if name in FUNCTIONS or name in SCALAR else "float"
+        op = name if kind == "double" else name[:-1]
+        if op in SCALAR:
+            declared.append(f"declare {kind} @{name}({', '.join([kind] * SCALAR[op])})\n")
+            texts.append(_by_number(name, kind, SCALAR[op], width))
+        else:
+            formula, count = OF_FLOATS.get(op, FUNCTIONS[op]) if kind == "float" else FUNCTIONS[op]
+            texts.append(function(name, formula, count, kind))
     return "\n".join([*declared, *texts, ATTRIBUTES])
 
 
-def _by_number(name: str, width: int) -> str:
+def _by_number(name: str, kind: str, count: int, width: int) -> str:
     """Write a function that calls the scalar library for each number."""
-    double, count = "%double", SCALAR[name]
+    real = f"%{kind}"
     lines, total = [], "poison"
     for lane in range(width):
         for i in range(count):
-            lines.append(f"%a{lane}_{i} = extractelement {double} %x{i}, i64 {lane}")
-        args = ", ".join(f"double %a{lane}_{i}" for i in range(count))
-        lines.append(f"%b{lane} = call double @{name}({args})")
-        lines.append(f"%r{lane} = insertelement {double} {total}, double %b{lane}, i64 {lane}")
+            lines.append(f"%a{lane}_{i} = extractelement {real} %x{i}, i64 {lane}")
+        args = ", ".join(f"{kind} %a{lane}_{i}" for i in range(count))
+        lines.append(f"%b{lane} = call {kind} @{name}({args})")
+        lines.append(f"%r{lane} = insertelement {real} {total}, {kind} %b{lane}, i64 {lane}")
         total = f"%r{lane}"
-    signature = ", ".join(f"{double} %x{i}" for i in range(count))
+    signature = ", ".join(f"{real} %x{i}" for i in range(count))
     body = "".join(f"  {line}\n" for line in lines)
-    return f"define internal {double} @hg_{name}({signature}) #9 {{\n{body}  ret {double} {total}\n}}\n"
+    return f"define internal {real} @hg_{name}({signature}) #9 {{\n{body}  ret {real} {total}\n}}\n"

@@ -4,7 +4,7 @@ import math
 
 import jaxlib.version
 
-from straightline.vectors.exponential import exp_of_sum, log, log1p
+from straightline.vectors.exponential import exp_of_sum, format_of, log, log1p
 from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select, sqrt
 
 # erf x = x + x P / Q in x^2, |x| < 27/32.
@@ -55,6 +55,13 @@ INVERSE = (
      7.599527703001776e-05, -0.00021503011930044477, -0.00013871931833623122, 1.0103004648645344, 4.849906401408584],
 )  # fmt: skip
 
+INVERSE_OF_FLOATS = (
+    [2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087, -0.00125372503, -0.00417768164,
+     0.246640727, 1.50140941],
+    [-0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773, -0.0076224613, 0.00943887047,
+     1.00167406, 2.83297682],
+)  # fmt: skip
+
 PRECISE = (0, 11, 2)  # the first jaxlib, among those that were tried, whose log1p is precise
 
 # log(1 + t) = t - t^2 / 2 + t^3 P / Q for |t| < sqrt(2) - 1. Source: Moshier's Cephes, https://www.netlib.org/cephes.
@@ -92,13 +99,14 @@ def _parts(size: Vector) -> tuple[Vector, Vector, Vector]:
     # Near 1 and beyond: one rational function whose coefficients and argument depend on where x is.
     near, far = size < 1.25, size >= 1 / 0.35
     above, below = (
-        [select(near, a, select(far, c, b)) for a, b, c in zip(MIDDLE[i], OUTER[i], FAR[i], strict=True)]
+        [select(near, a, select(far, size.like(c), b)) for a, b, c in zip(MIDDLE[i], OUTER[i], FAR[i], strict=True)]
         for i in (0, 1)
     )
     argument = select(near, size - 1, 1 / square)
     middle = polynomial(argument, above) / polynomial(argument, below)
     # e^(-x^2) to all digits: x = z + (x - z), z of so few digits that z^2 is exact.
-    z = (size.as_type("i64") & -(1 << 32)).as_type("double")
+    dropped = 32 if size.scalar == "double" else 13
+    z = (size.as_type(format_of(size).word) & -(1 << dropped)).as_type(size.scalar)
     square, rest = fma(-z, z, -0.5625), fma(z - size, z + size, middle)
     power = square + rest
     tail = exp_of_sum(power, (square - power) + rest) / size
@@ -117,6 +125,16 @@ def erf_inv(x: Vector) -> Vector:
         return select(middle, end, tail)
 
     factor = x.body.where_any(w >= 6.25, outer, polynomial(w - 3.125, INVERSE[0][::-1]))
+    return x * select(abs(x).equals(1.0), math.inf, factor)
+
+
+def erf_inv_of_floats(x: Vector) -> Vector:
+    """Invert erf by XLA's polynomials for float32, in w - 2.5 and sqrt(w) - 3, w = -log(1 - x^2)."""
+    w = -log1p(-(x * x))
+    near = w < 5.0
+    moved = select(near, w - 2.5, sqrt(w) - 3)
+    pairs = zip(*INVERSE_OF_FLOATS, strict=True)
+    factor = polynomial(moved, [select(near, x.like(a), b) for a, b in pairs][::-1])
     return x * select(abs(x).equals(1.0), math.inf, factor)
 
 

@@ -1,64 +1,101 @@
 """Exponential, logarithm and related functions on vectors."""
 
 import math
+from typing import NamedTuple
 
 from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select
 
 LOG2_E = 1 / math.log(2)
-LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # the first has 21 zeros at its end
-ROUND = 1.5 * 2.0**52  # added to a number below 2^51, it rounds it to an integer, the lowest bits of the sum
-ROUND_BITS = 0x4338000000000000
-ONE_BITS, ROOT_HALF_BITS, FRACTION = 0x3FF0000000000000, 0x3FE6A09E667F3BCD, 52
-TINY = 2.0**-1022  # the smallest normal number
 
-# 1/2!, 1/3!, ... of exp on |r| <= ln(2)/2, where 1/14! is below half a unit of rounding of 1.
-EXP = [1 / math.factorial(i) for i in range(2, 15)]
-# log(1 + f) = 2 s + s z (c_0 + c_1 z + ...), s = f / (2 + f), z = s^2, on 1/sqrt(2) < 1 + f < sqrt(2).
-LOG = [
-    6.666666666666735130e-01,
-    3.999999999940941908e-01,
-    2.857142874366239149e-01,
-    2.222219843214978396e-01,
-    1.818357216161805012e-01,
-    1.531383769920937332e-01,
-    1.479819860511658591e-01,
-]
+
+class Format(NamedTuple):
+    """Numbers of a precision, and what depends on it in a formula.
+
+    `word`: the integer of as many bits. `fraction`: bits after the leading one, of which `round`, added to a small
+    number, leaves the nearest integer. `tiny`: the smallest normal number, `largest` and `smallest` where e^x is
+    infinite and zero. `log`: c_i of log(1 + f) = 2 s + s z (c_0 + c_1 z + ...), s = f / (2 + f), z = s^2, on
+    1/sqrt(2) < 1 + f < sqrt(2). `exp`: 1/2!, 1/3!, ... for e^r on |r| <= ln(2)/2, to below half a unit of rounding.
+    """
+
+    word: str
+    fraction: int
+    round: float
+    round_bits: int
+    one_bits: int
+    root_half_bits: int
+    ln2: tuple[float, float]  # as a sum of which the first has zeros at its end
+    tiny: float
+    largest: float
+    smallest: float
+    exp: list[float]
+    log: list[float]
+
+    @property
+    def negligible(self) -> float:
+        """Return a number whose square is lost beside 2, and its third power beside 1."""
+        return 2.0 ** -(self.fraction + 2)
+
+
+FORMATS = {
+    "double": Format(
+        "i64", 52, 1.5 * 2.0**52, 0x4338000000000000, 0x3FF0000000000000, 0x3FE6A09E667F3BCD,
+        (6.93147180369123816490e-01, 1.90821492927058770002e-10), 2.0**-1022, 709.782712893384, -745.1332191019412,
+        [1 / math.factorial(i) for i in range(2, 15)],
+        [6.666666666666735130e-01, 3.999999999940941908e-01, 2.857142874366239149e-01, 2.222219843214978396e-01,
+         1.818357216161805012e-01, 1.531383769920937332e-01, 1.479819860511658591e-01],
+    ),
+    "float": Format(
+        "i32", 23, 1.5 * 2.0**23, 0x4B400000, 0x3F800000, 0x3F3504F3,
+        (6.9314575195e-01, 1.4286067653e-06), 2.0**-126, 88.72283935546875, -103.97208404541016,
+        [1 / math.factorial(i) for i in range(2, 8)],
+        [0.66666662693, 0.40000972152, 0.28498786688, 0.24279078841],
+    ),
+}  # fmt: skip
+
+
+def format_of(x: Vector) -> Format:
+    """Return the format of a vector's numbers."""
+    return FORMATS[x.scalar]
 
 
 def exp(x: Vector) -> Vector:
     """e^x = 2^n e^r, r = x - n ln 2."""
-    count, n = _nearest(x * LOG2_E)
-    r = fma(n, -LN2_LOW, fma(n, -LN2_HIGH, x))
-    return _limited(x, _scaled(1 + fma(r * r, polynomial(r, EXP), r), count), 709.782712893384, -745.1332191019412)
+    form = format_of(x)
+    count, n = nearest(x * LOG2_E)
+    r = fma(n, -form.ln2[1], fma(n, -form.ln2[0], x))
+    return _limited(x, _scaled(1 + fma(r * r, polynomial(r, form.exp), r), count), form.largest, form.smallest)
 
 
 def exp_of_sum(x: Vector, low: Vector) -> Vector:
     """e^(x + low), |low| small against 1, within 0.6 units of rounding: 1 + r as a sum of two numbers."""
-    count, n = _nearest(x * LOG2_E)
+    form = format_of(x)
+    count, n = nearest(x * LOG2_E)
     first, rest = _reduced(x, n)
     r = first + (rest + low)
     rest = (first - r) + (rest + low)
     leading = 1 + r
-    small = fma(r * r, polynomial(r, EXP), fma(r, rest, rest))
-    return _limited(x, _scaled(leading + ((1 - leading + r) + small), count), 709.782712893384, -745.1332191019412)
+    small = fma(r * r, polynomial(r, form.exp), fma(r, rest, rest))
+    return _limited(x, _scaled(leading + ((1 - leading + r) + small), count), form.largest, form.smallest)
 
 
 def expm1(x: Vector) -> Vector:
     """e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
-    count, n = _nearest(select(x < -50.0, -50.0, x) * LOG2_E)
+    form = format_of(x)
+    count, n = nearest(select(x < -50.0, -50.0, x) * LOG2_E)
     r, low = _reduced(select(x < -50.0, -50.0, x), n)
     # e^(r + low) - 1 = r + low + r low + r^2/2 + ...
-    small = r + fma(r * r, polynomial(r, EXP), fma(r, low, low))
-    power = _power(count - 1)
+    small = r + fma(r * r, polynomial(r, form.exp), fma(r, low, low))
+    power = _power(form, count - 1)
     whole = 2 * fma(power, small, power - 0.5)
-    return _limited(x, select(abs(x) < 2.0**-54, x, whole), 709.782712893384, -math.inf)
+    return _limited(x, select(abs(x) < form.negligible, x, whole), form.largest, -math.inf)
 
 
 def log(x: Vector) -> Vector:
     """log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
-    small = x < TINY
-    k, m = _exponent(select(small, x * 2.0**54, x))
-    value = _log(k - select(small, 54.0, 0.0), m - 1, 0.0)
+    form = format_of(x)
+    small, lifted = x < form.tiny, form.fraction + 2
+    k, m = _exponent(select(small, x * 2.0**lifted, x))
+    value = _log(k - select(small, x.like(lifted), 0.0), m - 1, 0.0)
     return _with_domain(x, value)
 
 
@@ -68,7 +105,7 @@ def log1p(x: Vector) -> Vector:
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
     k, m = _exponent(u)
     value = _log(k, m - 1, rounded / u)
-    return select(abs(x) < 2.0**-54, x, _with_domain(u, value))
+    return select(abs(x) < format_of(x).negligible, x, _with_domain(u, value))
 
 
 def tanh(x: Vector) -> Vector:
@@ -80,29 +117,31 @@ def tanh(x: Vector) -> Vector:
     return copy_sign(select(large, 1 + ratio, ratio), x)
 
 
-def _nearest(x: Vector) -> tuple[Vector, Vector]:
-    """The nearest integer, as 64 bits and as a double; |x| < 2^51."""
-    moved = x + ROUND
-    return moved.as_type("i64") - ROUND_BITS, moved - ROUND
+def nearest(x: Vector) -> tuple[Vector, Vector]:
+    """Return the nearest integer, as one and as a real number; of doubles |x| < 2^51, of floats 2^22."""
+    form = format_of(x)
+    moved = x + form.round
+    return moved.as_type(form.word) - form.round_bits, moved - form.round
 
 
 def _reduced(x: Vector, n: Vector) -> tuple[Vector, Vector]:
     """x - n ln 2 as the sum of two numbers."""
-    first = fma(n, -LN2_HIGH, x)
-    rest = n * LN2_LOW
+    high, low = format_of(x).ln2
+    first = fma(n, -high, x)
+    rest = n * low
     r = first - rest
     return r, (first - r) - rest
 
 
-def _power(n: Vector) -> Vector:
-    """2^n of integers -1022 ... 1023."""
-    return ((n << FRACTION) + ONE_BITS).as_type("double")
+def _power(form: Format, n: Vector) -> Vector:
+    """2^n of integers -1022 ... 1023, of floats -126 ... 127."""
+    return ((n << form.fraction) + form.one_bits).as_type("double" if form.word == "i64" else "float")
 
 
 def _scaled(x: Vector, n: Vector) -> Vector:
     """x 2^n in two factors, each of which is a normal number."""
-    half = n >> 1
-    return x * _power(half) * _power(n - half)
+    form, half = format_of(x), n >> 1
+    return x * _power(form, half) * _power(form, n - half)
 
 
 def _limited(x: Vector, value: Vector, largest: float, smallest: float) -> Vector:
@@ -112,19 +151,21 @@ def _limited(x: Vector, value: Vector, largest: float, smallest: float) -> Vecto
 
 def _exponent(x: Vector) -> tuple[Vector, Vector]:
     """k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number."""
-    bits = x.as_type("i64")
-    k = (bits - ROOT_HALF_BITS) >> FRACTION
-    m = (bits - (k << FRACTION)).as_type("double")
-    return (k + ROUND_BITS).as_type("double") - ROUND, m
+    form = format_of(x)
+    bits = x.as_type(form.word)
+    k = (bits - form.root_half_bits) >> form.fraction
+    m = (bits - (k << form.fraction)).as_type(x.scalar)
+    return (k + form.round_bits).as_type(x.scalar) - form.round, m
 
 
 def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
     """K ln 2 + log(1 + f) + more, where `more` is small against the rest or the rest is zero."""
+    form = format_of(f)
     s = f / (2 + f)
     z = s * s
     half = 0.5 * f * f
-    r = z * polynomial(z, LOG)
-    return fma(k, LN2_HIGH, f - (half - fma(s, half + r, fma(k, LN2_LOW, more))))
+    r = z * polynomial(z, form.log)
+    return fma(k, form.ln2[0], f - (half - fma(s, half + r, fma(k, form.ln2[1], more))))
 
 
 def _with_domain(x: Vector, value: Vector) -> Vector:

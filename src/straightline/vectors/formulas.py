@@ -11,6 +11,7 @@ from functools import cache
 from typing import TypeAlias
 
 Operand: TypeAlias = "Vector | float"  # a vector, or a number for a vector of it
+REALS = ("double", "float")
 
 
 @dataclass
@@ -33,7 +34,7 @@ class Body:
     def where_any(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
         """Return `costly` where needed, else the value, with a jump past its operations if no lane needs it."""
         start, mark = self.block, len(self.lines)
-        truth, double = self.type("i1"), self.type("double")
+        truth = self.type("i1")
         self.lines.append(f"%some{mark} = call i1 @llvm.vector.reduce.or({truth} {needed.name})")
         self.lines.append(f"br i1 %some{mark}, label %costly{mark}, label %end{mark}")
         self.lines.append(f"costly{mark}:")
@@ -41,30 +42,28 @@ class Body:
         self.lines.append(f"br label %end{mark}")
         self.lines.append(f"end{mark}:")
         self.block = f"end{mark}"
-        return self.add("double", f"phi {double} [{value.name}, %{start}], [{chosen.name}, %costly{mark}]")
+        return self.add(value.scalar, f"phi {value.type} [{value.name}, %{start}], [{chosen.name}, %costly{mark}]")
 
     def call(self, intrinsic: str, *args: "Vector") -> "Vector":
-        """Return the result of an LLVM intrinsic of doubles, such as "fma"."""
-        double = self.type("double")
-        return self.add("double", f"call {double} @llvm.{intrinsic}({', '.join(f'{double} {a.name}' for a in args)})")
+        """Return the result of an LLVM intrinsic of real numbers, such as "fma"."""
+        real = args[0].type
+        return self.add(args[0].scalar, f"call {real} @llvm.{intrinsic}({', '.join(f'{real} {a.name}' for a in args)})")
 
 
 def _operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector", Operand], "Vector"]:
-    """Operator of vectors: an instruction on doubles, another on integers, with its arguments turned round or not."""
+    """Operator of vectors: an instruction on real numbers, another on integers, arguments turned round or not."""
 
     def apply(self: "Vector", other: Operand) -> "Vector":
         pair = (self, self.like(other))
         a, b = reversed(pair) if turned else pair
-        return self.body.add(
-            self.scalar, f"{real if self.scalar == 'double' else whole} {self.type} {a.name}, {b.name}"
-        )
+        return self.body.add(self.scalar, f"{real if self.scalar in REALS else whole} {self.type} {a.name}, {b.name}")
 
     return apply
 
 
 def _comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Vector"]:
     def compare(self: "Vector", other: Operand) -> "Vector":
-        how = f"fcmp {real}" if self.scalar == "double" else f"icmp {whole}"
+        how = f"fcmp {real}" if self.scalar in REALS else f"icmp {whole}"
         return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
 
     return compare
@@ -72,7 +71,7 @@ def _comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Vector"
 
 @dataclass(frozen=True, eq=False)
 class Vector:
-    """A vector in a body: doubles, 64-bit or 32-bit integers, or truths (scalars "double", "i64", "i32", "i1")."""
+    """A vector in a body: doubles, floats, integers or truths (scalars "double", "float", "i64", "i32", "i1")."""
 
     body: Body
     scalar: str
@@ -107,10 +106,22 @@ class Vector:
         """Reinterpret the bits as another type."""
         return self.body.add(scalar, f"bitcast {self.type} {self.name} to {self.body.type(scalar)}")
 
+    def converted(self, scalar: str) -> "Vector":
+        """Return the nearest real numbers of another precision."""
+        how = "fpext" if scalar == "double" else "fptrunc"
+        return self.body.add(scalar, f"{how} {self.type} {self.name} to {self.body.type(scalar)}")
+
+
+def rounded(value: float) -> float:
+    """Return the nearest number of single precision."""
+    nearest: float = struct.unpack("f", struct.pack("f", value))[0]
+    return nearest
+
 
 def constant(body: Body, scalar: str, value: float) -> Vector:
     """Return a vector of one number."""
-    if scalar == "double":
+    if scalar in REALS:
+        value = value if scalar == "double" else rounded(value)
         text = "0x" + struct.pack(">d", value).hex().upper()
     elif scalar == "i1":
         text = "true" if value else "false"
@@ -153,11 +164,11 @@ def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
 
 
 @cache
-def function(name: str, formula: Callable[..., Vector], arguments: int = 1) -> str:
-    """Return the text of an internal function of vectors of doubles."""
+def function(name: str, formula: Callable[..., Vector], arguments: int = 1, scalar: str = "double") -> str:
+    """Return the text of an internal function of vectors of doubles, or of floats."""
     body = Body()
-    double = body.type("double")
-    value = formula(*(Vector(body, "double", f"%x{i}") for i in range(arguments)))
+    real = body.type(scalar)
+    value = formula(*(Vector(body, scalar, f"%x{i}") for i in range(arguments)))
     lines = "".join(f"  {line}\n" for line in body.lines)
-    signature = ", ".join(f"{double} %x{i}" for i in range(arguments))
-    return f"define internal {double} @hg_{name}({signature}) #9 {{\nentry:\n{lines}  ret {double} {value.name}\n}}\n"
+    signature = ", ".join(f"{real} %x{i}" for i in range(arguments))
+    return f"define internal {real} @hg_{name}({signature}) #9 {{\nentry:\n{lines}  ret {real} {value.name}\n}}\n"

@@ -2,11 +2,13 @@
 
 import math
 
-from straightline.vectors.exponential import _nearest
-from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select
+from straightline.vectors.exponential import format_of, nearest
+from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, rounded, select
 
 HALF_PI = 1.57079632679489661923, 6.12323399573676603587e-17, -1.4973849048591833e-33  # pi / 2 as a sum
-LARGEST = 2.0**20  # up to which the sum above is long enough; beyond, the scalar library is called
+HALF_PI_OF_FLOATS = 1.5707963705062866, -4.371138828673793e-08, -1.7151244994428829e-15
+LARGEST = {"double": 2.0**20, "float": 2.0**16}  # up to which the sum is long enough; beyond, the library is called
+PI_LOW = {"double": 1.2246467991473531772e-16, "float": -8.7422776573475858e-08}  # what pi lacks as rounded
 
 SIN = [
     -1.66666666666666324348e-01,
@@ -24,6 +26,7 @@ COS = [
     2.08757232129817482790e-09,
     -1.13596475577881948265e-11,
 ]
+TERMS_OF_FLOATS = 4  # of these
 ATAN = [
     3.33333333333329318027e-01,
     -1.99999999998764832476e-01,
@@ -37,6 +40,7 @@ ATAN = [
     -3.65315727442169155270e-02,
     1.62858201153657823623e-02,
 ]
+ATAN_OF_FLOATS = [3.3333328366e-01, -1.9999158382e-01, 1.4253635705e-01, -1.0648017377e-01, 6.1687607318e-02]
 # Where atan turns by a known angle: from, (numerator and denominator of (a x + b) / (c x + d)), the angle as a sum.
 TURNS = [
     (7 / 16, (2.0, -1.0, 1.0, 2.0), 4.63647609000806093515e-01, 2.26987774529616870924e-17),
@@ -51,7 +55,7 @@ def sin(x: Vector) -> Vector:
     quarter, r, low = _turned(x)
     value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
     value = select((quarter & 2).equals(0), value, -value)
-    return _of_any_size(x, select(abs(x) < 2.0**-27, x, value), "sin")
+    return _of_any_size(x, select(abs(x) < 2.0 ** -(27 if x.scalar == "double" else 13), x, value), "sin")
 
 
 def cos(x: Vector) -> Vector:
@@ -64,14 +68,15 @@ def cos(x: Vector) -> Vector:
 
 def _turned(x: Vector) -> tuple[Vector, Vector, Vector]:
     """Return the number of quarter turns in x, and the rest as a sum; the first difference is exact."""
-    quarter, n = _nearest(x * (2 / math.pi))
-    first = fma(n, -HALF_PI[0], x)
-    # first - n HALF_PI[1] as a sum: the product and the difference each with what rounding takes from it.
-    product = n * HALF_PI[1]
+    quarter, n = nearest(x * (2 / math.pi))
+    parts = HALF_PI if x.scalar == "double" else HALF_PI_OF_FLOATS
+    first = fma(n, -parts[0], x)
+    # first - n parts[1] as a sum: the product and the difference each with what rounding takes from it.
+    product = n * parts[1]
     second = first - product
     taken = second - first
     lost = (first - (second - taken)) - (product + taken)
-    rest = lost - fma(n, HALF_PI[1], -product) - n * HALF_PI[2]
+    rest = lost - fma(n, parts[1], -product) - n * parts[2]
     r = second + rest
     return quarter, r, (second - r) + rest
 
@@ -80,7 +85,7 @@ def _sin(x: Vector, low: Vector) -> Vector:
     """sin(x + low), |x| <= pi / 4."""
     z = x * x
     v = z * x
-    r = polynomial(z, SIN[1:])
+    r = polynomial(z, _terms(x, SIN)[1:])
     return x - ((z * (0.5 * low - v * r) - low) - v * SIN[0])
 
 
@@ -89,12 +94,17 @@ def _cos(x: Vector, low: Vector) -> Vector:
     z = x * x
     half = 0.5 * z
     w = 1 - half
-    return w + (((1 - w) - half) + (z * (z * polynomial(z, COS)) - x * low))
+    return w + (((1 - w) - half) + (z * (z * polynomial(z, _terms(x, COS))) - x * low))
+
+
+def _terms(x: Vector, coefficients: list[float]) -> list[float]:
+    """Return the coefficients that count in a vector's precision."""
+    return coefficients if x.scalar == "double" else coefficients[:TERMS_OF_FLOATS]
 
 
 def _of_any_size(x: Vector, value: Vector, name: str) -> Vector:
     """Return the value where |x| is small enough for it, else that of the scalar library, if a lane needs it."""
-    return x.body.where_any(abs(x) >= LARGEST, lambda: x.body.call(name, x), value)
+    return x.body.where_any(abs(x) >= LARGEST[x.scalar], lambda: x.body.call(name, x), value)
 
 
 def atan(x: Vector) -> Vector:
@@ -105,17 +115,19 @@ def atan(x: Vector) -> Vector:
 def _positive_atan(x: Vector) -> Vector:
     # A large x takes the place of infinity, which times 0 is none.
     x = select(x > 2.0**66, 2.0**66, x)
-    over: tuple[Vector | float, ...] = (1.0, 0.0, 0.0, 1.0)
-    high: Vector | float = 0.0
-    low: Vector | float = 0.0
+    over = tuple(map(x.like, (1.0, 0.0, 0.0, 1.0)))
+    high = low = x.like(0.0)
     for start, turned, angle, rest in TURNS:
         beyond = x >= start
         over = tuple(select(beyond, new, old) for new, old in zip(turned, over, strict=True))
+        if x.scalar == "float":
+            whole, angle = angle, rounded(angle)
+            rest = whole - angle
         high, low = select(beyond, angle, high), select(beyond, rest, low)
     a, b, c, d = over
     t = fma(x, a, b) / fma(x, c, d)
     z = t * t
-    return high - ((t * (z * polynomial(z, ATAN)) - low) - t)
+    return high - ((t * (z * polynomial(z, ATAN if x.scalar == "double" else ATAN_OF_FLOATS)) - low) - t)
 
 
 def atan2(y: Vector, x: Vector) -> Vector:
@@ -123,10 +135,10 @@ def atan2(y: Vector, x: Vector) -> Vector:
     ratio = abs(y / x)
     both = abs(x).equals(abs(y))
     # 0/0 and infinity/infinity: along an axis, or a diagonal.
-    ratio = select(both, select(y.equals(0.0), 0.0, 1.0), ratio)
+    ratio = select(both, select(y.equals(0.0), y.like(0.0), 1.0), ratio)
     angle = _positive_atan(ratio)
-    behind = x.as_type("i64") < 0
-    angle = select(behind, math.pi - (angle - 1.2246467991473531772e-16), angle)
+    behind = x.as_type(format_of(x).word) < 0
+    angle = select(behind, math.pi - (angle - PI_LOW[x.scalar]), angle)
     return copy_sign(select(_is_number(x) & _is_number(y), angle, math.nan), y)
 
 

@@ -20,6 +20,8 @@ def numbers(dtype: Any) -> np.ndarray:
     """Edge values of a type: NaN, infinities, both zeros, halves; of integers both ends and what is near zero."""
     if dtype == np.float64:
         return REALS
+    if dtype == np.float32:
+        return REALS[~(np.isfinite(REALS) & (np.abs(REALS) > 1e38))].astype(dtype)
     if dtype == np.bool_:
         return TRUTHS
     ends = np.iinfo(dtype)
@@ -47,6 +49,16 @@ class Case(NamedTuple):
     def row(self, run: int) -> tuple[np.ndarray, ...]:
         """One run's arguments."""
         return tuple(a[run] for a in self.arguments)
+
+
+def in_single(case: Case, units: float) -> Case:
+    """Return the case with reals of single precision; runs with a number that is beyond that are left out."""
+    with np.errstate(over="ignore"):
+        floats = tuple(a.astype(np.float32) if a.dtype == np.float64 else a for a in case.arguments)
+    pairs_ = zip(case.arguments, floats, strict=True)
+    beyond = [np.isfinite(a) != np.isfinite(f) for a, f in pairs_ if f.dtype == np.float32]
+    kept = ~np.any([b.reshape(case.runs, -1).any(axis=1) for b in beyond], axis=0)
+    return case._replace(arguments=tuple(f[kept] for f in floats), units=units, label=f"{case.label} in single")
 
 
 def pairs(*tables: np.ndarray) -> tuple[np.ndarray, ...]:

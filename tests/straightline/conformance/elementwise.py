@@ -54,13 +54,14 @@ def _conversions() -> list[Case]:
             (numbers(d),),
             label=f"{np.dtype(d).name} to {np.dtype(to).name}",
         )
-        for d in DTYPES
-        for to in DTYPES
+        for d in (*DTYPES, np.float32)
+        for to in (*DTYPES, np.float32)
     ]
 
 
 def _bits() -> list[Case]:
     made = [(np.float64, d) for d in (np.uint64, np.int64, np.uint32)]
+    made += [(np.float32, np.uint32), (np.float32, np.int32), (np.uint32, np.float32), (np.int32, np.float32)]
     made += [
         (np.uint64, np.uint32),
         (np.uint64, np.float64),

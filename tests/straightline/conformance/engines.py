@@ -13,8 +13,6 @@ from straightline.nodes import Buffer
 from straightline.program import Program, lower
 from tests.straightline.conformance.case import Case
 
-SMALLEST = np.finfo(np.float64).tiny
-
 
 def by_xla(cases: Sequence[Case]) -> list[list[np.ndarray]]:
     """Of each run by itself, as XLA computes it; case by case and leaf by leaf, (run, ...)."""
@@ -76,10 +74,11 @@ def difference(result: np.ndarray, expected: np.ndarray, units: float) -> np.nda
     assert result.dtype == expected.dtype and result.shape == expected.shape, (
         result.dtype, expected.dtype, result.shape, expected.shape,
     )  # fmt: skip
-    if expected.dtype != np.float64:
+    if expected.dtype.kind != "f":
         return np.asarray(result != expected)
     # XLA takes subnormal numbers for zeros.
-    result, expected = (np.where(np.abs(x) < SMALLEST, np.copysign(0.0, x), x) for x in (result, expected))
+    smallest = np.finfo(expected.dtype).tiny
+    result, expected = (np.where(np.abs(x) < smallest, np.copysign(0.0, x), x) for x in (result, expected))
     with np.errstate(all="ignore"):
         near = np.abs(result - expected) <= units * np.spacing(np.abs(expected))
     same = (result == expected) & (np.signbit(result) == np.signbit(expected))

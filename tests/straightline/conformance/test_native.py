@@ -29,12 +29,13 @@ from straightline.compiled import Compiled
 from straightline.lowering import IN_MEMORY, NAMED, RULES, traced
 from straightline.nodes import Unsupported
 from tests.straightline.conformance import arrays, elementwise, matrices, programs
-from tests.straightline.conformance.case import Case
+from tests.straightline.conformance.case import Case, in_single
 from tests.straightline.conformance.engines import by_known, by_lanes, by_xla, difference, program_of
 
 CASES = arrays.CASES | elementwise.CASES | matrices.CASES | programs.CASES
 ADDED = {"add", "sub", "add_any", "reduce_sum", "cumsum", "dot_general", "scatter-add", "scatter_add", "scatter-sub"}
 PRODUCTS = {"dot_general"}
+SINGLE: dict[str, float] = {}  # units of functions in single precision, where they are more than in double
 RULES_OF_ALL = sorted({*RULES, *IN_MEMORY} - NAMED)
 MOST = 12  # cases of an operation
 ONE_AT_A_TIME = {
@@ -96,7 +97,7 @@ def thinned(case: Case, most: int) -> Case:
 def finite(case: Case) -> Case:
     """A case with halves in place of NaN and infinities."""
     return case._replace(
-        arguments=tuple(np.where(np.isfinite(a), a, 0.5) if a.dtype == np.float64 else a for a in case.arguments)
+        arguments=tuple(np.where(np.isfinite(a), a, 0.5) if a.dtype.kind == "f" else a for a in case.arguments)
     )
 
 
@@ -106,7 +107,7 @@ def compare(
     """All leaves of all cases."""
     leaves = [(case, e) for case, one in zip(cases, expected, strict=True) for e in one]
     for (case, e), result in zip(leaves, results, strict=True):
-        if name in ADDED and e.dtype == np.float64:
+        if name in ADDED and e.dtype.kind == "f":
             result, e = result + 0.0, e + 0.0
         differs = difference(result, e, case.units)
         runs = np.unique(np.nonzero(differs)[0]) if differs.ndim else []
@@ -144,9 +145,27 @@ def test_every_rule_has_cases_in_which_it_is_used(name):
 @pytest.mark.parametrize("name", RULES_OF_ALL)
 def test_a_rule_computes_what_xla_computes(name):
     """Of data, each run a lane and all in one program; of known numbers; and of both."""
+    check(name, CASES.get(name, []))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RULES_OF_ALL)
+def test_a_rule_computes_what_xla_computes_in_single_precision(name):
+    """The same table with numbers of float32, which meet doubles where JAX makes doubles of what is known."""
+    check(name, singles(name))
+
+
+def singles(name: str) -> list[Case]:
+    """The cases of an operation that have real numbers, of single precision."""
+    of_reals = [c for c in CASES.get(name, []) if any(a.dtype == np.float64 for a in c.arguments)]
+    return [in_single(c, max(c.units, SINGLE.get(name, 0.0))) for c in of_reals]
+
+
+def check(name: str, table: list[Case]) -> None:
+    """Compare the cases of an operation with XLA."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        cases = taken(name, some(CASES.get(name, []), MOST))
+        cases = taken(name, some(table, MOST))
         expected = by_xla(cases)
         for case, e in zip(cases, expected, strict=True):
             compare(name, [case], by_lanes(case), [e], "in lanes")
@@ -158,14 +177,9 @@ def test_a_rule_computes_what_xla_computes(name):
         expected = {only_finite: by_xla(tables[only_finite]) for only_finite in {False, name in PRODUCTS}}
         for known in product((False, True), repeat=arity):
             meets_zeros = name in PRODUCTS and len(set(known)) == 2
+            some_cases, how = tables[meets_zeros], f"known: {known}"
             try:
-                compare(
-                    name,
-                    tables[meets_zeros],
-                    by_known(tables[meets_zeros], known),
-                    expected[meets_zeros],
-                    f"known: {known}",
-                )
+                compare(name, some_cases, by_known(some_cases, known), expected[meets_zeros], how)
             except Unsupported:
                 continue
 
@@ -191,6 +205,14 @@ def test_the_commonest_rules_compute_what_xla_computes(name):
     """Some runs of some cases, of data and of known numbers."""
     cases = [thinned(case, 12) for case in some(CASES[name], 6)]
     cases, expected = taken(name, cases), by_xla(cases)
+    for known in ((False,) * 4, (True,) * 4):
+        compare(name, cases, by_known(cases, known), expected, f"known: {known[0]}")
+
+
+@pytest.mark.parametrize("name", DAILY)
+def test_the_commonest_rules_compute_in_single_precision_what_xla_computes(name):
+    cases = taken(name, [thinned(case, 12) for case in some(singles(name), 3)])
+    expected = by_xla(cases)
     for known in ((False,) * 4, (True,) * 4):
         compare(name, cases, by_known(cases, known), expected, f"known: {known[0]}")
 

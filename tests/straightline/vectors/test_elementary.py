@@ -46,6 +46,11 @@ def compiled() -> Compiled:
     return Compiled([*FUNCTIONS, *SCALAR])
 
 
+@pytest.fixture(scope="module")
+def of_floats() -> Compiled:
+    return Compiled([*FUNCTIONS, *SCALAR], single=True)
+
+
 def _erf(x: np.ndarray) -> np.ndarray:
     """2 / sqrt(pi) e^(-x^2) sum of 2^n x^(2n+1) / (1 3 ... (2n+1)): all terms of one sign."""
     size = np.minimum(np.abs(x), 6)
@@ -101,6 +106,64 @@ def test_numbers_of_any_size(compiled: Compiled, numbers: list[float]) -> None:
         if len(here):
             true = TRUE.get(name, getattr(np, name, None))(here.astype(LONG))
             assert _units(compiled(name, here), true).max() <= 2
+
+
+SMALL = {"exp": (-87.0, 88.7), "exp2": (-126.0, 127.9), "expm1": (-80.0, 88.7), "erfc": (-9.0, 9.0)}
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_a_function_of_floats_is_within_two_units_of_rounding(of_floats: Compiled, name: str) -> None:
+    """Beside the doubles that are right to their last digits."""
+    for numbers in RANGES[name]:
+        with np.errstate(over="ignore"):
+            x = numbers.astype(np.float32)
+        low, high = SMALL.get(name, (-np.inf, np.inf))
+        x = x[np.isfinite(x) & (x >= low) & (x <= high) & ((x == 0) | (np.abs(x) > 1e-37))]
+        with np.errstate(divide="ignore"):
+            true = np.asarray(TRUE.get(name, getattr(np, name, None))(x.astype(LONG)), float)
+        x, true = x[np.isfinite(true)], true[np.isfinite(true)]  # without log of a number that was rounded to zero
+        units = np.abs(of_floats(name, x) - true) / np.spacing(np.abs(true).astype(np.float32))
+        assert units.max() <= 2, f"{units.max()} at {x[units.argmax()]}"
+
+
+def test_the_inverse_of_erf_of_floats_is_that_of_xla(of_floats: Compiled) -> None:
+    x = np.concatenate([np.random.default_rng(2).uniform(-1, 1, 300_000), 1 - 10.0 ** np.linspace(-7, -3, 30_000)])
+    x = np.clip(x.astype(np.float32), -0.99999994, 0.99999994)
+    expected = np.asarray(jax.jit(jax.lax.erf_inv)(x))
+    units = np.abs(of_floats("erf_inv", x) - expected) / np.spacing(np.abs(expected))
+    # Beyond 0.999 a unit of rounding of the logarithm counts for several of the result.
+    assert units[np.abs(x) < 0.999].max() <= 2
+    assert units.max() <= 8
+    assert np.mean(units == 0) > 0.9
+
+
+@pytest.mark.parametrize("name", [name for name in (*FUNCTIONS, *SCALAR) if name not in ("atan2", "pow")])
+def test_special_values_of_floats_are_those_of_jax(of_floats: Compiled, name: str) -> None:
+    with np.errstate(over="ignore"):
+        special = SPECIAL.astype(np.float32)
+    expected = np.asarray(jax.jit(getattr(jax.lax, name))(special))
+    result = of_floats(name, special)
+    np.testing.assert_allclose(result, expected, rtol=2e-5, atol=1e-6 if name == "lgamma" else 1e-37)
+    zero = (result == 0) & (expected == 0)
+    np.testing.assert_array_equal(np.signbit(result[zero]), np.signbit(expected[zero]))
+
+
+@pytest.mark.parametrize("name", ["atan2", "pow"])
+def test_special_pairs_of_floats_are_those_of_jax(of_floats: Compiled, name: str) -> None:
+    with np.errstate(over="ignore"):
+        y, x = (a.ravel().astype(np.float32) for a in np.meshgrid(SPECIAL, SPECIAL))
+    expected = np.asarray(jax.jit(getattr(jnp, {"atan2": "arctan2", "pow": "power"}[name]))(y, x))
+    result = of_floats(name, y, x)
+    np.testing.assert_allclose(result, expected, rtol=2e-5, atol=1e-37)
+
+
+def test_denormal_floats(of_floats: Compiled) -> None:
+    small = np.array([1e-45, 1e-42, 2e-39, -3e-40], np.float32)
+    for name in ("sin", "tan", "atan", "asin", "tanh", "expm1", "log1p"):
+        np.testing.assert_array_equal(of_floats(name, small), small)
+    np.testing.assert_allclose(of_floats("log", small[:3]), np.log(small[:3].astype(float)), rtol=1.2e-7)
+    below = np.array([-87.5, -95.0, -103.5, -104.0], np.float32)
+    np.testing.assert_allclose(of_floats("exp", below), np.exp(below.astype(float)), rtol=0, atol=1.5e-45)
 
 
 @pytest.mark.parametrize("name", [name for name in (*FUNCTIONS, *SCALAR) if name not in ("atan2", "pow")])
