@@ -95,9 +95,9 @@ def pytest_collection_finish():
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item, nextitem):
     """Tests trace from deep within pytest: they have room on the interpreter's stack."""
-    from heliograph.numerics.stack import with_room
+    from heliograph.numerics.stack import make_room
 
-    return with_room(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
+    return make_room(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
 
 
 @pytest.fixture(scope="session")

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen, computed
-from heliograph.filters.base import AbstractFilter, given, measured
+from heliograph.engine.choice import chosen, compute_once
+from heliograph.filters.base import AbstractFilter, check_input, check_measurement
 from heliograph.model import Estimate, Innovation
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 
 ROWS = 64  # what is compiled serves every number of rows up to the next multiple of it, and rows cost next to nothing
 ROWS_OF_EACH = 16  # of thousands of filters side by side they do cost
@@ -37,11 +37,11 @@ def follow(item: AbstractFilter, z: Any, u: Any = None, written_out: bool = True
     z: (rows, received), or (rows,) for one component, NaN where nothing arrived; u: (rows, inputs). Matrices of many
     entries are not `written_out`, 100,000 instructions of native code: XLA has each product as one operation.
     """
-    z = np.array([measured(item, row) for row in z])
-    u = np.array([given(item, row) for row in (np.zeros((len(z), 0)) if u is None else u)])
+    z = np.array([check_measurement(item, row) for row in z])
+    u = np.array([check_input(item, row) for row in (np.zeros((len(z), 0)) if u is None else u)])
     assert len(u) == len(z) and (item.horizon is None or len(z) <= item.horizon)
     arguments = (item, *_padded(z, u), np.asarray(len(z)))
-    return _cut(computed(_scan, _scan_by_xla, arguments) if written_out else _scan_by_xla(*arguments), len(z), 0)
+    return _cut(compute_once(_scan, _scan_by_xla, arguments) if written_out else _scan_by_xla(*arguments), len(z), 0)
 
 
 def follow_known(item: AbstractFilter, z: Any, u: Any) -> Followed:
@@ -115,7 +115,7 @@ def _scan(item: AbstractFilter, z: Any, u: Any, last: Any) -> Followed:
     return Followed(*steps, state)
 
 
-_scan_by_xla = compiled(_scan)
+_scan_by_xla = compile_in_float64(_scan)
 
 
 def _followed(items: AbstractFilter, z: Any, u: Any) -> Followed:
@@ -129,6 +129,6 @@ def _every_row(item: AbstractFilter, z: Any, u: Any) -> Followed:
     return _scan(item, z, u, len(z))
 
 
-@compiled
+@compile_in_float64
 def _followed_by_xla(items: AbstractFilter, z: Any, u: Any) -> Followed:
     return jax.vmap(_every_row)(items, z, u)

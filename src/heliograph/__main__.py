@@ -27,10 +27,10 @@ def command() -> None:
             signal.signal(number, lambda number, _: os._exit(128 + number))  # while it is imported nothing is to undo
     gc.set_threshold(*RARELY)
     from heliograph.cli import SIGNALLED, main
-    from heliograph.numerics.stack import with_room
+    from heliograph.numerics.stack import make_room
 
     try:
-        code = with_room(main)()
+        code = make_room(main)()
     except BaseException as error:
         code = _code_of(error)
     for number in (signal.SIGINT, signal.SIGTERM):  # all is done

@@ -6,7 +6,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign import work
-from heliograph.campaign.engines import in_processes
+from heliograph.campaign.engines import run_in_processes
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import open_results, read_summary
 from heliograph.campaign.work import Job
@@ -104,7 +104,7 @@ def test_no_setting_can_be_built(tmp_path, trouble):
 def test_a_worker_that_dies_is_replaced(tmp_path, trouble):
     trouble.write_text("die")
     campaign = write(tmp_path)
-    with in_processes(campaign.as_json(), tmp_path / "no store", 1) as engine:
+    with run_in_processes(campaign.as_json(), tmp_path / "no store", 1) as engine:
         (died, described) = (dict(engine([Job(setting)]))[Job(setting)] for setting in (2, 0))
     assert died.error == "WorkerDied: the worker process ended with exit code 9"
     assert described.error == "" and described.value["labels"]["nodes"] == ["near"]

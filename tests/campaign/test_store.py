@@ -14,11 +14,11 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign import engines
-from heliograph.campaign.engines import in_processes
+from heliograph.campaign.engines import run_in_processes
 from heliograph.campaign.plan import versions
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.work import Job
-from heliograph.disk.whole_file import LOCK, held, only_here
+from heliograph.disk.whole_file import LOCK, only_here, try_lock
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write
 
 HOLD = """
@@ -73,7 +73,7 @@ def test_a_lock_whose_file_was_removed_by_its_last_holder_is_taken_on_a_new_one(
     monkeypatch.setattr(fcntl, "flock", flock)
     with only_here(tmp_path) as alone:
         assert alone and len(real) == 2
-        with held(tmp_path / LOCK) as ours:
+        with try_lock(tmp_path / LOCK) as ours:
             assert not ours
 
 
@@ -162,7 +162,7 @@ def test_a_setting_that_hangs_or_reads_is_a_failure_like_any_other(
 def test_seconds_are_counted(tmp_path):
     campaign = write(tmp_path)
     begun = time.monotonic()
-    with in_processes(campaign.as_json(), tmp_path / "no store", 1, timeout=0.1) as engine:
+    with run_in_processes(campaign.as_json(), tmp_path / "no store", 1, timeout=0.1) as engine:
         ((_, reply),) = engine([Job(0)])  # a process needs longer to import JAX
     assert reply.late and reply.error == "TimedOut: no answer within 0.1 s, the campaign's timeout"
     assert 0.1 <= time.monotonic() - begun < 20
@@ -232,9 +232,9 @@ def test_a_client_that_cannot_close_does_not_hide_why_the_work_ended(tmp_path, m
             raise RuntimeError("Cannot change state of expiring Timeout")
 
     monkeypatch.setattr(distributed, "Client", Ending)
-    with engines.on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
+    with engines.run_on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
         pass
-    with pytest.raises(ValueError, match="the reason"), engines.on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
+    with pytest.raises(ValueError, match="the reason"), engines.run_on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
         raise ValueError("the reason")
 
 
@@ -268,7 +268,7 @@ def test_names_end_no_campaign_and_act_in_no_page(tmp_path, capsys, monkeypatch)
 @pytest.mark.slow
 def test_a_worker_that_is_late_is_replaced(tmp_path, out_of_time_where_it_hangs):
     campaign = write(tmp_path, network=HANGING)
-    with in_processes(campaign.as_json(), tmp_path / "no store", 1, timeout=15) as engine:
+    with run_in_processes(campaign.as_json(), tmp_path / "no store", 1, timeout=15) as engine:
         late, described = (dict(engine([Job(setting)]))[Job(setting)] for setting in (2, 0))
     assert late.late and late.error.startswith("TimedOut")
     assert not described.late and described.value["labels"]["nodes"] == ["near"]

@@ -4,7 +4,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign.failures import Failure
-from heliograph.campaign.page import NEES, RMSE, against, by_setting, campaign_figures, campaign_page
+from heliograph.campaign.page import NEES, RMSE, against, campaign_figures, campaign_page, plot_by_setting
 from heliograph.campaign.summary import read_summary
 from heliograph.report.progress import Countdown, spoken
 from tests.campaign.example import CAMPAIGN, write
@@ -92,7 +92,7 @@ def test_figures(tmp_path, finished):
     (line,) = [line for line in figure.axes[1].lines if len(line.get_xdata()) == 3]
     assert list(line.get_xdata()) == [0.5, 0.7, 0.9]
     assert list(line.get_ydata()) == [scores[i].rmse for i in (1, 3, 5)]
-    assert len(by_setting(campaign, scores, NEES).axes[0].get_yticklabels()) == 6
+    assert len(plot_by_setting(campaign, scores, NEES).axes[0].get_yticklabels()) == 6
 
 
 def test_words_make_no_axis(tmp_path, finished):

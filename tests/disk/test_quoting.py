@@ -6,15 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import FORMULA, from_cell, in_cell, in_figure, visible
+from heliograph.disk.quoting import FORMULA, quote_for_cell, quote_for_figure, unquote_cell, visible
 
 matplotlib.use("agg")
 
 
 @given(st.text())
 def test_a_cell_is_no_formula_and_can_be_read_again(text):
-    cell = in_cell(text)
-    assert not cell.startswith(FORMULA) and from_cell(cell) == visible(text)
+    cell = quote_for_cell(text)
+    assert not cell.startswith(FORMULA) and unquote_cell(cell) == visible(text)
 
 
 @pytest.mark.slow
@@ -27,7 +27,7 @@ def test_what_is_visible_moves_no_cursor(text):
 def test_a_figure_draws_any_name_and_shows_it_in_the_legend(name):
     figure = Figure()
     axes = figure.subplots()
-    axes.plot([0, 1], label=in_figure(name))
-    axes.set_title(in_figure(name))
+    axes.plot([0, 1], label=quote_for_figure(name))
+    axes.set_title(quote_for_figure(name))
     assert len(axes.legend().get_texts()) == 1
     figure.canvas.draw()

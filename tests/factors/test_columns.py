@@ -8,9 +8,9 @@ import pytest
 from heliograph.factors.columns import (
     Columns,
     columns_of,
-    decorrelated,
-    eliminated,
-    joined,
+    decorrelate,
+    eliminate,
+    join_columns,
     root_of,
     rounding_of,
     triangular,
@@ -39,7 +39,7 @@ def product(c):
 def test_both_ways_to_factors_give_the_sum(n):
     """Written out up to 16 rows, a loop above."""
     given = columns(n, n + 3)
-    for factors in (triangular(given), eliminated(given.covariance)):
+    for factors in (triangular(given), eliminate(given.covariance)):
         np.testing.assert_allclose(product(factors), product(given), **EXACT)
         assert np.all(np.triu(factors.matrix, 1) == 0) and np.all(np.diagonal(factors.matrix) == 1)
         assert np.all(np.asarray(factors.weights) > 0)
@@ -50,7 +50,7 @@ def test_a_row_made_of_others_leaves_nothing(n):
     """Exactly nothing of a row of zeros; of twice another the square of rounding, or, eliminated, rounding."""
     given = columns(n, n + 3)
     given.matrix[1], given.matrix[2] = 2 * given.matrix[0], 0.0
-    orthogonal, formed = triangular(given), eliminated(given.covariance)
+    orthogonal, formed = triangular(given), eliminate(given.covariance)
     assert orthogonal.weights[2] == 0 and np.all(np.asarray(orthogonal.matrix)[3:, 2] == 0)
     assert 0 <= orthogonal.weights[1] < 1e-28 and 0 <= formed.weights[1] < 1e-13
     np.testing.assert_allclose(product(orthogonal), product(given), **EXACT)
@@ -60,21 +60,21 @@ def test_a_pivot_is_at_least_its_share():
     """[[1, 1], [1, 1 - eps]] has the pivot -eps."""
     least = 1e-14
     covariance = jnp.asarray([[1.0, 1.0], [1.0, 1 - 2.3e-16]])
-    assert eliminated(covariance).weights[1] == 0
-    assert eliminated(covariance, least).weights[1] == pytest.approx(least)
+    assert eliminate(covariance).weights[1] == 0
+    assert eliminate(covariance, least).weights[1] == pytest.approx(least)
 
 
 def test_derivatives_exist_where_variances_are_zero():
     """Of d_2 of W diag(w) W' by the weight of a column that alone carries the second row: its square."""
     matrix = np.array([[1.0, 0.0], [0.5, 3.0]])
     of_weight = jax.grad(lambda w: triangular(Columns(matrix, jnp.stack([0.0 * w, w]))).weights[1])
-    of_pivot = jax.grad(lambda v: eliminated(jnp.diag(jnp.stack([v, 2 * v]))).weights[1])
+    of_pivot = jax.grad(lambda v: eliminate(jnp.diag(jnp.stack([v, 2 * v]))).weights[1])
     assert of_weight(0.0) == pytest.approx(9.0) and of_pivot(0.0) == pytest.approx(2.0)
 
 
 def test_decorrelated_rows_have_independent_noises():
     lower, rows = triangular(columns(4, 7)).matrix, np.random.default_rng(1).normal(size=(4, 3))
-    np.testing.assert_allclose(lower @ decorrelated(lower, rows), rows, **EXACT)
+    np.testing.assert_allclose(lower @ decorrelate(lower, rows), rows, **EXACT)
 
 
 @pytest.mark.parametrize("rank", [0, 1, 2, 3])
@@ -98,7 +98,7 @@ def test_a_covariance_that_is_traced_is_eliminated():
 
 def test_covariances_add_as_columns():
     first, second = columns(3, 2), columns(3, 4, 1)
-    np.testing.assert_allclose(product(joined(first, second)), product(first) + product(second), **EXACT)
+    np.testing.assert_allclose(product(join_columns(first, second)), product(first) + product(second), **EXACT)
     turn = np.random.default_rng(2).normal(size=(2, 3))
     np.testing.assert_allclose(first.through(turn).covariance, turn @ product(first) @ turn.T, **EXACT)
 

@@ -12,6 +12,7 @@ from heliograph.factors.columns import Columns, columns_of, nothing, rounding_of
 from heliograph.factors.gaussian import (
     Gaussian,
     Image,
+    append_rows,
     backwards,
     given,
     leading,
@@ -21,9 +22,8 @@ from heliograph.factors.gaussian import (
     of_columns,
     of_sum,
     revise,
-    smoothed,
+    smooth,
     transform,
-    with_rows,
 )
 from tests.factors.exact import after, congruence, exactly, total
 
@@ -149,7 +149,7 @@ def test_smoothing_is_rauch_s(n, state_noise):
     ahead = move(x, f, np.zeros(n), columns_of(q))
     back = backwards(x, f @ x.root, ahead.mean, triangular(columns_of(q)))
     later = given(np.asarray(ahead.mean) + 0.3, 0.4 * np.asarray(ahead.covariance))
-    known = smoothed(back, later)
+    known = smooth(back, later)
     prior = f @ p @ f.T + q
     gain = np.linalg.solve(prior, f @ p).T
     np.testing.assert_allclose(known.mean, mean + gain @ np.full(n, 0.3), rtol=1e-9)
@@ -166,7 +166,7 @@ def test_a_part_that_others_determine_says_nothing_of_the_state_before(n):
     rounding = triangular(rounding_of(np.diagonal(f @ p @ f.T)))
     back = backwards(x, f @ x.root, f @ mean, rounding)
     assert np.all(np.asarray(back.gain)[:, -1] == 0) and np.all(np.any(np.asarray(back.gain)[:, :-1], axis=0))
-    known = smoothed(back, Gaussian(jnp.asarray(f @ mean), back.lower, jnp.zeros(n)))
+    known = smooth(back, Gaussian(jnp.asarray(f @ mean), back.lower, jnp.zeros(n)))
     part = f[:-1]  # x given its first parts exactly
     gain = np.linalg.solve(part @ p @ part.T, part @ p).T
     np.testing.assert_allclose(known.covariance, p - gain @ part @ p, rtol=0, atol=1e-10)
@@ -262,7 +262,7 @@ def test_revising_what_has_no_variance_leaves_all_as_it_is():
 def test_rows_below_a_gaussian_are_the_joint_law_and_its_first_components_the_same_again():
     mean, p, h, r, _ = problem(3, 2)
     x = given(mean, p)
-    both = with_rows(x, h @ x.mean, h @ x.root, triangular(columns_of(r)))
+    both = append_rows(x, h @ x.mean, h @ x.root, triangular(columns_of(r)))
     np.testing.assert_allclose(both.covariance[3:, 3:], h @ p @ h.T + r, **EXACT)
     np.testing.assert_allclose(both.covariance[3:, :3], h @ p, **EXACT)
     for before, now in zip(x, leading(both, 3), strict=True):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.files.table import columns_of, read_table, write_table
-from heliograph.numerics.dates import dates, in_iso, instant, seconds_between
+from heliograph.numerics.dates import dates, format_dates, instant, seconds_between
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
 SENSOR = hg.Sensor(lambda x: x, noise=0.1, outputs=["pos"])
@@ -29,7 +29,7 @@ def test_a_date_is_the_instant_that_python_says(moment, zone, space):
     (result,) = dates([text], "time")
     expected = np.datetime64(aware.astimezone(UTC).replace(tzinfo=None), "ns")
     assert result == expected and dates([aware], "time")[0] == expected
-    assert dates(in_iso(np.array([result])), "time")[0] == result
+    assert dates(format_dates(np.array([result])), "time")[0] == result
 
 
 def test_what_else_is_a_date_and_what_is_none():

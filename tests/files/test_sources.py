@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.fields import at, decoded, matches, nanoseconds
+from heliograph.files.fields import at, decode_json, matches, nanoseconds
 from heliograph.files.sources import Sources
 
 json_field = hg.files.json_field
@@ -248,10 +248,10 @@ def test_the_heading_of_a_quaternion(angle):
     ],
 )
 def test_bare_words_for_no_number_cost_their_field_alone(text, expected):
-    assert decoded(text, "m") == expected
+    assert decode_json(text, "m") == expected
 
 
 @pytest.mark.parametrize("text", ['{"v": 1, "v": 2}', '{"a": {"v": nan, "v": 2}}'])
 def test_a_doubled_field_is_refused(text):
     with pytest.raises(ValueError, match="m: expected distinct fields, got 'v' more than once"):
-        decoded(text, "m")
+        decode_json(text, "m")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.angle import nearest, wrapped
+from heliograph.numerics.angle import nearest, wrap_angles
 
 STEPS = 30
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
@@ -90,7 +90,7 @@ def recording() -> dict[str, np.ndarray]:
 @pytest.fixture(scope="module")
 def east_and_west() -> tuple[hg.Record, hg.Record]:
     east = recording()
-    west = {name: wrapped(z + np.array([0.0, np.pi]), (1,)) for name, z in east.items()}
+    west = {name: wrap_angles(z + np.array([0.0, np.pi]), (1,)) for name, z in east.items()}
     smooth = hg.smoothing.FixedInterval()
     return hg.run(network(1.0), east, U, smooth=smooth), hg.run(network(-1.0), west, U, smooth=smooth)
 
@@ -108,7 +108,7 @@ def test_half_a_turn_further_everything_is_turned(east_and_west):
         pairs[name] = [hg.run(alone(side, name), z, U).estimates["a"][name] for side, z in received]
     del pairs["particle"]
     for name, (item, other) in pairs.items():
-        mean = wrapped(np.asarray(other.mean) - np.asarray(item.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
+        mean = wrap_angles(np.asarray(other.mean) - np.asarray(item.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
         np.testing.assert_allclose(mean, 0.0, atol=1e-8, err_msg=name)
         turned = TURNED @ np.asarray(item.covariance) @ TURNED
         np.testing.assert_allclose(other.covariance, turned, rtol=1e-7, atol=1e-9, err_msg=name)
@@ -121,7 +121,7 @@ def test_what_is_smoothed_is_turned_too(east_and_west):
     for node, estimate in results[0].estimates.items():
         for name, item in estimate.items():
             other = np.asarray(results[1].estimates[node][name].mean)
-            turned = wrapped(other - np.asarray(item.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
+            turned = wrap_angles(other - np.asarray(item.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
             np.testing.assert_allclose(turned, 0.0, atol=1e-7, err_msg=f"{node}/{name}")
             assert np.all(np.abs(other[:, 2]) <= np.pi)
 
@@ -173,7 +173,7 @@ def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
     wound = np.cumsum(np.full(100, 0.3)) + 3.0 + rng.normal(0, 0.2, 100)
     wound[40:43] = np.nan
     results = []
-    for angles, z in ((False, wound), (True, wrapped(wound[:, None], (0,))[:, 0])):
+    for angles, z in ((False, wound), (True, wrap_angles(wound[:, None], (0,))[:, 0])):
         plant, sensor = turning(angles)
         item = MAKERS[name](plant, sensor, hg.perfect())
         record = hg.run(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": item})}), {"a": z})

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from tests.filters.modal_problems import BURSTS, PLANT, RELAY, SENSOR, bursts, variances
 
 STEPS = 200  # after which no variance changes any more
@@ -117,6 +117,6 @@ def test_the_likelihood_has_a_gradient_in_what_the_links_remember():
 
     at, steps = np.array([0.05, 0.1, 1.0, 0.3, 0.8]), 1e-5 * np.eye(5)
     slope = jax.grad(likelihood)
-    slopes = computed(slope, jax.jit(slope), (at,))  # a third of the time of XLA
+    slopes = compute_once(slope, jax.jit(slope), (at,))  # a third of the time of XLA
     expected = [(likelihood(at + d) - likelihood(at - d)) / 2e-5 for d in steps]
     np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-6)

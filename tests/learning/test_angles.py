@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 
 STEPS, PROCESS, NOISE = 150, 0.01, 0.04
 
@@ -29,7 +29,7 @@ def heard():
 def test_a_compass_is_learned_as_well_as_one_on_a_line_that_was_wound_up():
     """The same data without their turns; the best numbers and their likelihood are those of a grid, too."""
     _, wound = heard()
-    z = wrapped(wound[:, None], (0,))
+    z = wrap_angles(wound[:, None], (0,))
     assert z.max() > 3 and z.min() < -3
     circle, line = (
         hg.fit(lambda c=c: compass(hg.free(0.1), hg.free(0.1), c)[0], {"a": rows})
@@ -55,7 +55,10 @@ def bearings(noise):
 @pytest.mark.slow
 def test_two_nodes_with_bearings_are_learned_as_a_grid_has_it():
     rng = np.random.default_rng(1)
-    z = {n: wrapped(np.arctan2(-y, -10.0) + 0.05 * rng.normal(size=(STEPS, 1)), (0,)) for n, y in (("a", 0), ("b", 3))}
+    z = {
+        n: wrap_angles(np.arctan2(-y, -10.0) + 0.05 * rng.normal(size=(STEPS, 1)), (0,))
+        for n, y in (("a", 0), ("b", 3))
+    }
     assert z["a"].max() > 3 and z["a"].min() < -3
     fit = hg.fit(lambda: bearings(hg.free(1e-3)), z)
     (row,) = fit.rows()

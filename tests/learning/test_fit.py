@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood.data import gathered
+from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.likelihood.surface import Surface
 from tests.oracles.learning_links import likelihood
@@ -134,7 +134,7 @@ def test_several_recordings_are_one_likelihood(result, recording):
     z = recording.measurements["node"][0]
     solution = result.solutions[0]
     surface = solution.surface
-    parts = gathered(result.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
+    parts = gather_data(result.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
     assert parts.lengths == (STEPS, 150) and parts.measurements.shape == (2, STEPS, 2)
     whole = Surface(surface.objective, parts).evaluations(solution.x[None]).total
     values = result.description.parameters.known(solution.x)

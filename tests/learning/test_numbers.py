@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from heliograph.learning.intervals import bartlett, block_sums, cosines, of_model, told_by_few, white
+from heliograph.learning.intervals import bartlett, block_sums, cosines, find_told_by_few, of_model, white
 from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.learning.unidentified import confounded, product_text, rank_of, sum_text
+from heliograph.learning.unidentified import find_confounded, product_text, rank_of, sum_text
 from heliograph.numerics.check import POSITIVE, REAL
 
 RNG = np.random.default_rng(0)
@@ -84,7 +84,7 @@ def groups_of(known, *domains):
     local = parameters(*domains)
     points = [np.random.default_rng(i).uniform(0.3, 1.0, len(domains)) for i in range(3)]
     with np.errstate(all="ignore"):
-        return confounded(local, points, informed(known, local, points))
+        return find_confounded(local, points, informed(known, local, points))
 
 
 def test_a_product_is_found_and_put_in_words():
@@ -116,8 +116,8 @@ def test_a_step_is_told_of_by_few_rows_and_a_mean_by_all():
     """Of 100 rows: all at one, all alike, as a chi-square tells, and in the second half."""
     step, half = (np.arange(100) == 50).astype(float), (np.arange(100) >= 50).astype(float)
     columns = [step, np.ones(100), np.random.default_rng(0).normal(size=100) ** 2, half]
-    assert told_by_few([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
-    assert not told_by_few([np.ones((40, 1)), np.ones((60, 1))]).any()
+    assert find_told_by_few([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
+    assert not find_told_by_few([np.ones((40, 1)), np.ones((60, 1))]).any()
 
 
 def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():

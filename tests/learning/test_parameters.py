@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.learning.likelihood.transforms import from_line, link, slope, to_line, unlink
+from heliograph.learning.likelihood.transforms import link, map_from_line, map_to_line, slope, unlink
 from heliograph.learning.parameters import Parameter, Parameters
 from heliograph.numerics.check import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain
 
@@ -107,10 +107,10 @@ def test_the_line_and_back(domain, x):
 )
 def test_vectors_and_matrices_go_to_the_line_and_back(domain, value):
     item = Parameter("it", value, domain)
-    x = to_line("it", domain, value)
+    x = map_to_line("it", domain, value)
     assert len(x) == item.size
     with jax.enable_x64(True):
-        np.testing.assert_allclose(from_line(domain, value.shape, jnp.asarray(x)), value, rtol=1e-14)
+        np.testing.assert_allclose(map_from_line(domain, value.shape, jnp.asarray(x)), value, rtol=1e-14)
     known = Parameters((item,)).known(x)
     np.testing.assert_allclose(known["it"], value, rtol=1e-14)
     assert len(Parameters((item,)).entries) == len(item.entries)

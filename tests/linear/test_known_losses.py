@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.jump_system import JumpSystem, mixed
-from heliograph.linear.known_losses import KnownLossSystem, certified_radius, find_gains
+from heliograph.linear.jump_system import JumpSystem, mix_modes
+from heliograph.linear.known_losses import KnownLossSystem, certify_radius, find_gains
 from heliograph.random_affine.modes import long_run_law
 from heliograph_studies.intermittent_observations import setting
 from heliograph_studies.intermittent_observations.mean_error import mean_error
@@ -38,7 +38,7 @@ def lower_bound(system):
     lost = np.array([len(system.outputs[s]) == 0 for s in system.known])[:, None, None]
     noise = system.law[:, None, None] * system.process
     jumps = JumpSystem(system.chain[None], (lost * system.transition)[None], noise[None])
-    return mixed(system.chain, jumps.steady()[0])
+    return mix_modes(system.chain, jumps.steady()[0])
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_bounds_of_published_examples_at_arrival_0_6(example, upper, lower, radi
     digits = {"rtol": 5e-6}  # the numbers have six digits
     np.testing.assert_allclose(np.trace(bound(system)), upper, **digits)
     np.testing.assert_allclose(np.trace(lower_bound(system).sum(axis=0)), lower, **digits)
-    np.testing.assert_allclose(certified_radius(system, gains), radius, rtol=1e-5)
+    np.testing.assert_allclose(certify_radius(system, gains), radius, rtol=1e-5)
 
 
 def test_the_bound_solves_the_modified_riccati_equation():
@@ -110,10 +110,10 @@ def test_permuting_modes_changes_nothing():
 def test_a_certificate_does_not_trust_the_gains():
     system = independent(SCALAR, 0.6)
     good, none = find_gains(system), (np.zeros((1, 1)), np.zeros((1, 0)))
-    assert certified_radius(system, good) < 1 < certified_radius(system, none)
-    np.testing.assert_allclose(certified_radius(system, none), 1.25**2)
+    assert certify_radius(system, good) < 1 < certify_radius(system, none)
+    np.testing.assert_allclose(certify_radius(system, none), 1.25**2)
     closed = -1.25 - good[0][0, 0]
-    np.testing.assert_allclose(certified_radius(system, good), 0.4 * 1.25**2 + 0.6 * closed**2)
+    np.testing.assert_allclose(certify_radius(system, good), 0.4 * 1.25**2 + 0.6 * closed**2)
 
 
 def test_the_radius_is_the_growth_of_the_mean_square_under_the_gains():
@@ -134,7 +134,7 @@ def test_modes_that_tell_the_same_share_their_gain():
     system = KnownLossSystem(a, q, chain, law, np.array([0, 0, 1]), (c, none), (r, r, none[:, :0]))
     gains = find_gains(system)
     assert len(gains) == 2
-    assert certified_radius(system, gains) < 1
+    assert certify_radius(system, gains) < 1
     rng = np.random.default_rng(0)
     mode, p, results = 0, q, []
     for _ in range(5000):
@@ -152,7 +152,7 @@ def test_a_mode_that_is_left_for_good_has_its_gain_too():
     np.testing.assert_allclose(law, (0, 1), atol=1e-15)
     system = KnownLossSystem(a, q, chain, law, np.array([0, 1]), (c, 2 * c), (r, r))
     gains = find_gains(system)
-    assert certified_radius(system, gains) < 1
+    assert certify_radius(system, gains) < 1
     always = KnownLossSystem(a, q, np.ones((1, 1)), np.ones(1), np.array([0]), (2 * c,), (r,))
     np.testing.assert_allclose(bound(system), bound(always), rtol=1e-9)
 
@@ -183,7 +183,7 @@ def test_bounds_enclose_the_mean_of_random_systems(seed):
     q = np.diag(draw.uniform(0.1, 2.0, 2))
     system = KnownLossSystem(a, q, chain, law, np.arange(3), outputs, noises)
     gains = find_gains(system)
-    assert certified_radius(system, gains) < 1
+    assert certify_radius(system, gains) < 1
     upper = system.bound(gains)
     paths = [(p, i, u / p) for i, (u, p) in enumerate(zip(upper, law, strict=True))]
     for _ in range(5):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.known_losses import eigenspaces, fastest_unseen, reached
+from heliograph.linear.known_losses import eigenspaces, fastest_unseen, is_reached
 
 NONE = np.zeros((0, 2))
 INDEPENDENT = np.array([[0.3, 0.7]] * 2)
@@ -57,7 +57,7 @@ def test_eigenspaces_of_a_rotation_and_of_a_double_eigenvalue():
 
 def test_noise_reaches_what_the_plant_carries_it_to():
     matrix, item = np.array([[1.0, 1.0], [0.0, 1.0]]), np.eye(2)
-    assert reached(item, matrix, np.diag([0.0, 1.0]))
-    assert not reached(item, matrix, np.diag([1.0, 0.0]))
-    assert reached(item[:, :1], matrix, np.diag([1e-20, 0.0]))
-    assert not reached(item[:, :1], matrix, np.zeros((2, 2)))
+    assert is_reached(item, matrix, np.diag([0.0, 1.0]))
+    assert not is_reached(item, matrix, np.diag([1.0, 0.0]))
+    assert is_reached(item[:, :1], matrix, np.diag([1e-20, 0.0]))
+    assert not is_reached(item[:, :1], matrix, np.zeros((2, 2)))

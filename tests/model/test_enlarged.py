@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 
 STEPS = 60
 
@@ -24,7 +24,7 @@ PLACES, TRUTH = {"a": (0.0, 0.0), "b": (0.0, 5.0)}, np.array([-10.0, 0.0])
 def bearings():
     """Both bearings of a target in the west, the first of which jumps between pi and -pi."""
     exact = [np.arctan2(TRUTH[1] - y, TRUTH[0] - x) for x, y in PLACES.values()]
-    return wrapped(exact + 1e-3 * np.random.default_rng(0).normal(size=(STEPS, 2)), (0, 1))
+    return wrap_angles(exact + 1e-3 * np.random.default_rng(0).normal(size=(STEPS, 2)), (0, 1))
 
 
 def test_a_bearing_across_pi_of_a_joint_sensor_is_read_around_the_circle():

@@ -6,7 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.model import Estimate
-from heliograph.model.estimate import with_sound_claim
+from heliograph.model.estimate import lower_unsound_claim
 from tests.losing import Losing
 
 MEAN = np.zeros((4, 2))
@@ -19,7 +19,7 @@ def test_a_claim_holds_where_mean_and_covariance_are_numbers(claim):
     assert result.claims.tolist() == [claim, "none", "none", claim]
     lost = Estimate(np.where([[True], [False], [False], [False]], np.nan, MEAN), COVARIANCE, claim)
     assert lost.claims.tolist() == ["none", "none", "none", claim]
-    assert [with_sound_claim(Estimate(m, p, claim)).claim for m, p in zip(MEAN, COVARIANCE, strict=True)] == list(
+    assert [lower_unsound_claim(Estimate(m, p, claim)).claim for m, p in zip(MEAN, COVARIANCE, strict=True)] == list(
         result.claims
     )
 

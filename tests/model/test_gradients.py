@@ -9,7 +9,7 @@ import pytest
 from scipy import special
 
 import heliograph as hg
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.factors.columns import Columns
 from heliograph.random_affine.moments.push import push
 
@@ -94,7 +94,7 @@ def test_the_gradient_of_the_final_error_is_that_of_finite_differences(name):
         value, pushed = jax.linearize(error, p)
         return value, jax.linear_transpose(pushed, p)(1.0)[0], pushed(direction)
 
-    value, gradient, along = computed(both_ways, jax.jit(both_ways), (p,))  # a quarter of the time of XLA
+    value, gradient, along = compute_once(both_ways, jax.jit(both_ways), (p,))  # a quarter of the time of XLA
     items = STEP * np.eye(len(p))
     differences = [(concrete(channel, p + e) - concrete(channel, p - e)) / (2 * STEP) for e in items]
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-9)
@@ -178,7 +178,7 @@ def test_noises_and_moments_of_every_map_can_be_traced():
         return item.moments(1).matrix, item.moments(4).matrix, push(item, 4, np.ones(15))
 
     p = np.array([0.5, 0.3, 0.1, 0.8, 0.4, 0.7])
-    single, two, pushed = computed(evaluate, jax.jit(evaluate), (p,))
+    single, two, pushed = compute_once(evaluate, jax.jit(evaluate), (p,))
     np.testing.assert_allclose(single, make(p).moments(1).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(two, make(p).moments(4).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(pushed, make(p).moments(4).matrix @ np.ones(15), rtol=1e-12)
@@ -197,7 +197,7 @@ def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
     def described(p):
         return [hg.random_affine.second_order(channel) for channel in make(p)]
 
-    traced = computed(described, jax.jit(described), (p,))
+    traced = compute_once(described, jax.jit(described), (p,))
     known = [hg.random_affine.second_order(channel) for channel in make(p)]
     # Columns of a known noise are a root, of a traced one L and d: their covariance is the same.
     for ours, theirs in zip(traced, known, strict=True):

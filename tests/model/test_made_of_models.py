@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.model.channel import carried
+from heliograph.model.channel import carry_angles
 from heliograph.model.over_time import at
 from heliograph.model.plant import JointNoise
 from heliograph.numerics.types import unit_of
@@ -118,7 +118,7 @@ MODELS = (named, inputs, angles, linear, laws)
 
 def an_angle(made, of, start):
     """The first number that is sent is an angle; so is what arrives of it."""
-    assert carried(made, (start,))
+    assert carry_angles(made, (start,))
 
 
 def knows_losses(made, of, start):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
-from heliograph.numerics.angle import TURN, angles_named, continued, nearest, wrapped
+from heliograph.numerics.angle import TURN, angles_named, continue_angles, nearest, wrap_angles
 
 ANGLE = st.floats(-1e3, 1e3)
 
@@ -22,7 +22,7 @@ def test_the_same_angle_within_half_a_turn(value, reference):
 
 def test_what_is_in_range_keeps_every_bit_and_what_is_missing_stays_missing():
     x = np.array([3.14, -3.14, np.nan, 0.1])
-    np.testing.assert_array_equal(wrapped(x, (0, 1, 2, 3)), x)
+    np.testing.assert_array_equal(wrap_angles(x, (0, 1, 2, 3)), x)
     np.testing.assert_array_equal(nearest(np.array([7.0]), np.array([np.nan]), (0,)), [7.0])
 
 
@@ -48,7 +48,7 @@ def test_an_angle_that_follows_another_has_exact_moments_however_wide(rule, devi
     slope = np.array([[1.0, 0.1], [0.0, 1.0]])
     with jax.enable_x64(True):
         mean = jnp.array([0.2, 0.3])
-        result = rule.apply(continued(heading, mean, (0,), (0,)), mean, jnp.asarray(covariance))
+        result = rule.apply(continue_angles(heading, mean, (0,), (0,)), mean, jnp.asarray(covariance))
     near = nearest(np.asarray(result.mean), np.array([3.23, 0.3]), (0,))
     np.testing.assert_allclose(near, [3.23, 0.3], rtol=0, atol=1e-10)
     # 1e-9: points at 1e2 radians, of which turns are taken off
@@ -63,9 +63,9 @@ def test_a_bearing_across_the_cut_is_the_one_away_from_it_turned():
     covariance = jnp.asarray(np.diag([1.0, 4.0]))
     with jax.enable_x64(True):
         east, west = (
-            Cubature().apply(continued(bearing, mean, (), (0,)), mean, covariance)
+            Cubature().apply(continue_angles(bearing, mean, (), (0,)), mean, covariance)
             for mean in (jnp.array([10.0, 0.5]), jnp.array([-10.0, -0.5]))
         )
-    np.testing.assert_allclose(wrapped(np.asarray(west.mean - east.mean) - np.pi, (0,)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(wrap_angles(np.asarray(west.mean - east.mean) - np.pi, (0,)), 0.0, atol=1e-12)
     np.testing.assert_allclose(west.covariance, east.covariance, rtol=1e-12)
     np.testing.assert_allclose(west.cross, -np.asarray(east.cross), rtol=1e-12, atol=1e-15)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from heliograph.numerics.caching import cached, shared
+from heliograph.numerics.caching import cache_by_object, share_by_object
 from heliograph.random_affine.moments.monomials import symmetric_power
 
 CALLS: list[float] = []
@@ -18,14 +18,14 @@ CALLS: list[float] = []
 class Holder(eqx.Module):
     value: float | jax.Array | np.ndarray
 
-    @cached
+    @cache_by_object
     def power(self, order: int) -> np.ndarray:
         """The value as often."""
         CALLS.append(order)
         return self.value * np.ones(order)
 
 
-@cached
+@cache_by_object
 def refusing(item: object) -> None:
     """Says no."""
     raise ValueError("no")
@@ -95,7 +95,7 @@ class Compiled:
 
 
 def test_what_is_made_of_an_object_is_shared_while_somebody_holds_it():
-    make, source = shared(Compiled), Holder(1.0)
+    make, source = share_by_object(Compiled), Holder(1.0)
     made = make(source)
     assert make(source) is made and make(Holder(1.0)) is not made
     gone = weakref.ref(made)

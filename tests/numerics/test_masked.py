@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.masked import unmasked
+from heliograph.numerics.masked import fill_masked
 
 PLANT = hg.LinearPlant([[1.0]], 1469.0, [1000.0], [[1e6]], states=["level"])
 SENSOR = hg.LinearSensor([[1.0]], 15099.0, outputs=["flow"])
@@ -106,4 +106,4 @@ def test_what_must_be_there_is_refused_where_it_is_masked():
 
 def test_masks_within_a_list_are_kept():
     parts = [np.ma.array([1.0, 2.0], mask=[False, True]), np.ma.array([3.0, 4.0], mask=[True, False])]
-    np.testing.assert_array_equal(unmasked(parts), [[1.0, np.nan], [np.nan, 4.0]])
+    np.testing.assert_array_equal(fill_masked(parts), [[1.0, np.nan], [np.nan, 4.0]])

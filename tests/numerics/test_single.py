@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.traced import rounded_to_single
+from heliograph.numerics.traced import find_rounded_to_single
 from heliograph.simulation.description.doubts import doubts_before_data
 
 TABLE = jnp.asarray([0.1, 0.25])  # as in a user's file: 0.1 is 0.1000000015
@@ -82,4 +82,4 @@ def test_a_network_shows_which_numbers_were_rounded():
 )  # fmt: skip
 def test_a_rounded_number_is_known_by_its_value(number, rounded):
     """A power of two is meant as it is, though its shortest decimal in single precision is another number."""
-    assert rounded_to_single(number) == rounded
+    assert find_rounded_to_single(number) == rounded

@@ -9,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.recording import estimate_columns, read_recording
-from heliograph.numerics.types import NameWithUnit, unit_of, units_in, with_unit
+from heliograph.numerics.types import NameWithUnit, append_unit, unit_of, units_in
 
 
 def plant(states: object) -> hg.LinearPlant:
@@ -21,7 +21,7 @@ def test_a_name_with_a_unit_is_the_name():
     assert name == "position" and hash(name) == hash("position") and {"position": 1}[name] == 1
     for same in (pickle.loads(pickle.dumps(name)), copy.deepcopy(name)):
         assert (same, unit_of(same)) == ("position", "m")
-    assert (with_unit(name), with_unit("position"), unit_of("position")) == ("position (m)", "position", "")
+    assert (append_unit(name), append_unit("position"), unit_of("position")) == ("position (m)", "position", "")
     assert units_in([name, "speed"]) == {"position": "m"}
 
 

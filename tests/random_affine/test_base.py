@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, with_inner_maps
+from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, replace_inner_maps
 from heliograph.random_affine.combine import GainAndNoise, Series, Stack, maps_in_series
 
 HOP = hg.hop(hg.Rayleigh(0.8), 0.1)
@@ -29,11 +29,11 @@ def test_a_map_of_another_kind_is_refused_in_one_line():
 
 def test_a_map_holds_others_in_place_of_its_own():
     first, second = inner_maps(RELAYED)
-    assert with_inner_maps(RELAYED, [first, second]) is RELAYED
+    assert replace_inner_maps(RELAYED, [first, second]) is RELAYED
     louder = hg.hop(1.0, 0.5)
-    changed = with_inner_maps(RELAYED, [louder, second])
+    changed = replace_inner_maps(RELAYED, [louder, second])
     assert type(changed) is Series and inner_maps(changed) == [louder, second]
-    np.testing.assert_array_equal(with_inner_maps(second, [louder]).arrival, second.arrival)
+    np.testing.assert_array_equal(replace_inner_maps(second, [louder]).arrival, second.arrival)
 
 
 def test_series_are_opened_at_any_depth():

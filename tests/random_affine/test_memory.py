@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.h_infinity.system import disturbed_gain
+from heliograph.h_infinity.system import disturb_gain
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.intervals import moment_interval
 from heliograph.random_affine.moments.push import push
@@ -171,7 +171,7 @@ SENSOR = hg.LinearSensor([[1.0]], 0.1)
         lambda c: push(c, 2, np.ones(3)),
         lambda c: moment_interval(c, 2),
         hg.random_affine.second_order,
-        disturbed_gain,
+        disturb_gain,
         hg.model.mean_gain,
         lambda c: hg.linear_filter(PLANT, SENSOR, c),
         lambda c: hg.cubature_filter(PLANT, SENSOR, c),

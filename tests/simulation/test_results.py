@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.disk.quoting import from_file, in_file
+from heliograph.disk.quoting import quote_for_file, unquote_file
 from heliograph.simulation import ErrorStatistics, StatisticsByName, Uplink
 
 matplotlib.use("Agg")
@@ -115,7 +115,7 @@ def test_a_record_comes_back_from_a_file(record, ending, tmp_path):
 @settings(max_examples=200, derandomize=True)
 @given(name=AWKWARD)
 def test_names_in_files_can_be_read_and_undone(name):
-    assert from_file(in_file(name)) == name and in_file(name).isprintable()
+    assert unquote_file(quote_for_file(name)) == name and quote_for_file(name).isprintable()
 
 
 @pytest.mark.slow

@@ -38,18 +38,18 @@ def start_engine(
 ) -> AbstractContextManager[Engine]:
     """Start the engine on the cluster of a scheduler; else with `workers` processes; for 0, in this process."""
     if scheduler is not None:
-        return on_cluster(campaign, store, scheduler, timeout)
-    return in_processes(campaign, store, workers, timeout) if workers else in_this_process(campaign, store)
+        return run_on_cluster(campaign, store, scheduler, timeout)
+    return run_in_processes(campaign, store, workers, timeout) if workers else run_in_this_process(campaign, store)
 
 
 @contextmanager
-def in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
+def run_in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
     """Do one job after another in this process."""
     yield lambda jobs: ((job, perform(campaign, str(store), job.setting, job.chunk)) for job in jobs)
 
 
 @contextmanager
-def in_processes(campaign: str, store: Path, workers: int, timeout: float = math.inf) -> Iterator[Engine]:
+def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = math.inf) -> Iterator[Engine]:
     """Do one job at a time in each worker process; a process that dies, or that takes too long, is replaced."""
     crew = [_Worker(campaign, store, timeout) for _ in range(workers)]
     try:
@@ -158,7 +158,7 @@ def _ending(code: int) -> str:
 
 
 @contextmanager
-def on_cluster(campaign: str, store: Path, address: str, timeout: float = math.inf) -> Iterator[Engine]:
+def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = math.inf) -> Iterator[Engine]:
     """Do jobs on a Dask cluster whose workers have this package and see the store's folder.
 
     Dask repeats the jobs of a worker that dies. Jobs are given up when none came back for `timeout` seconds.

@@ -18,9 +18,9 @@ from heliograph.campaign.store import (
     STORE,
     Labels,
     done_chunks,
+    load_campaign,
     parameter_values,
-    stored_campaign,
-    stored_labels,
+    read_labels,
 )
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from heliograph.numerics.check import fail, file_path
@@ -53,7 +53,7 @@ class Detail:
 
 def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]) -> list[Detail]:
     """Return the scores of every state of every filter in these settings: over all steps, then at each given step."""
-    group, labels = zarr.open_group(store, mode="r"), stored_labels(store)
+    group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
     results: list[Detail] = []
     for setting in settings:
@@ -133,7 +133,7 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
     for name in (STORE, SUMMARY):
         if not (folder / name).exists():
             raise fail(f"results folder {folder}", f"{STORE} and {SUMMARY}, as `heliograph sweep` writes", f"no {name}")
-    campaign, scores = stored_campaign(folder / STORE), read_summary(folder / SUMMARY)
+    campaign, scores = load_campaign(folder / STORE), read_summary(folder / SUMMARY)
     if not scores:
         raise fail(f"results folder {folder}", "at least one score", "none yet")
     text = explore_page(campaign, scores, partial(details, folder / STORE, campaign))

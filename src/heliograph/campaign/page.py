@@ -16,7 +16,7 @@ from heliograph.campaign.failures import FAILURES, Failure, read_failures
 from heliograph.campaign.plan import BITWISE, Campaign, Setting, canonical
 from heliograph.campaign.store import parameter_values
 from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
-from heliograph.disk.quoting import in_figure, visible
+from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import INK, STYLE, WIDTH, svg
 from heliograph.report.page import Block, Code, Page, Picture, Points, Section, Table, Text
 from heliograph.simulation.results.plots import COLOURS
@@ -142,7 +142,7 @@ def campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, F
         for name in parameters:
             figures[f"{quantity.value} against {name}"] = against(campaign, scores, name, quantity)
         if not parameters:
-            figures[f"{quantity.value} by setting"] = by_setting(campaign, scores, quantity)
+            figures[f"{quantity.value} by setting"] = plot_by_setting(campaign, scores, quantity)
     return figures
 
 
@@ -182,18 +182,18 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
             curve.sort(key=lambda score: float(values[score.setting]))
             x = [values[score.setting] for score in curve]
             y, error = _columns(curve, quantity)
-            label = in_figure(name)
+            label = quote_for_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
-        axes.set_title(fill(in_figure(title), TITLE))
+        axes.set_title(fill(quote_for_figure(title), TITLE))
     drawn = [score for of_panel in shown.values() for score in of_panel]
     _scale(grid[0], [values[score.setting] for score in drawn], "x")
-    figure.supxlabel(in_figure(parameter), fontsize=10, color=INK)
+    figure.supxlabel(quote_for_figure(parameter), fontsize=10, color=INK)
     _finish(figure, grid, drawn, quantity, colours)
     return figure
 
 
 @matplotlib.rc_context(STYLE)
-def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) -> Figure:
+def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) -> Figure:
     """Plot a quantity by setting, a point for each filter with two standard errors; one panel for each node."""
     nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
     settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
@@ -205,10 +205,12 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
             curve = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
             y, error = _columns(curve, quantity)
             rows = [settings.index(score.setting) + shift for score in curve]
-            axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=in_figure(name))
+            axes.errorbar(
+                y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=quote_for_figure(name)
+            )
         axes.set_yticks(range(len(settings)), [_name_setting(campaign, setting) for setting in settings])
         axes.set_ylim(len(settings) - 0.5, -0.5)
-        axes.set_title(in_figure(node))
+        axes.set_title(quote_for_figure(node))
         if quantity is NEES:
             axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
     # One scale for all panels, and one legend.
@@ -221,7 +223,7 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
 
 def _name_setting(campaign: Campaign, setting: int) -> str:
     text = ", ".join(f"{name} = {value}" for name, value in campaign.settings[setting].items())
-    return in_figure(text if len(text) <= 36 else text[:35] + "…")
+    return quote_for_figure(text if len(text) <= 36 else text[:35] + "…")
 
 
 def _panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
@@ -264,7 +266,7 @@ def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
 
 def _legend(figure: Figure, grid: list[Axes], colours: Mapping[str, str]) -> None:
     entries = {name: handle for axes in grid for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    names = [name for name in map(in_figure, colours) if name in entries]
+    names = [name for name in map(quote_for_figure, colours) if name in entries]
     figure.legend(
         [entries[name] for name in names],
         names,

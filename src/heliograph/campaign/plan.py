@@ -121,7 +121,7 @@ def canonical(setting: Setting) -> str:
 
 
 @lru_cache(maxsize=8)
-def from_json(text: str) -> Campaign:
+def parse_campaign(text: str) -> Campaign:
     """Restore a campaign from the text of `as_json`."""
     return Campaign(**json.loads(text))
 

@@ -16,13 +16,13 @@ from heliograph.campaign.store import (
     check_same,
     check_within,
     create,
-    described,
     done_chunks,
+    find_described,
     join,
     labels_from,
+    read_labels,
     remove_damaged,
     remove_partial,
-    stored_labels,
     write_claims,
 )
 from heliograph.campaign.summary import SUMMARY, write_summary
@@ -178,7 +178,7 @@ def _describe(
     new = not store.is_dir()
     # Claims are needed of a new store, of the settings to compute, and of those whose claims were damaged.
     begun = {setting for setting, _ in done_chunks(store, campaign)} if not new else set()  # its claims may be damaged
-    known = set() if new else {setting for (setting,) in described(store)}
+    known = set() if new else {setting for (setting,) in find_described(store)}
     lacking = range(len(campaign.settings)) if new else sorted((settings | begun) - known)
     jobs = [Job(setting) for setting in lacking]
     results: dict[int, Description] = {}
@@ -197,7 +197,7 @@ def _describe(
     if new:
         create(store, campaign, join(labels))
     for setting, label in labels.items():
-        check_within(label, stored_labels(store), setting)
+        check_within(label, read_labels(store), setting)
         write_claims(store, setting, results[setting]["claims"])
     return failed
 

@@ -218,7 +218,7 @@ def write_chunk(path: Path, chunk: Chunk, values: Mapping[str, np.ndarray]) -> N
 
 def write_claims(path: Path, setting: int, claims: Claims) -> None:
     """Write the claims of the filters of one setting."""
-    labels = stored_labels(path)
+    labels = read_labels(path)
     table = [[claims.get(node, {}).get(name, "") for name in labels.filters] for node in labels.nodes]
     _open(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
     _sync(path / CLAIM, f"c.{setting}.")
@@ -235,7 +235,7 @@ def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     return set.intersection(*(set(_find_chunks(path / name, 2)) for name in variables(campaign)))
 
 
-def described(path: Path) -> set[tuple[int, ...]]:
+def find_described(path: Path) -> set[tuple[int, ...]]:
     """Return (setting,) of the settings whose claims are written."""
     return set(_find_chunks(path / CLAIM, 1))
 
@@ -269,13 +269,13 @@ def remove_partial(path: Path) -> None:
                 file.unlink(missing_ok=True)
 
 
-def stored_labels(path: Path) -> Labels:
+def read_labels(path: Path) -> Labels:
     """Return the labels that the store was created with."""
     stored: Any = zarr.open_group(path, mode="r").attrs["labels"]
     return labels_from(stored)
 
 
-def stored_campaign(path: Path) -> Campaign:
+def load_campaign(path: Path) -> Campaign:
     """Return the campaign that the store was created with; its file is assumed to be next to the store."""
     attributes: Any = _attributes(path)
     stored = read_campaign(attributes["campaign"], attributes["network_source"], path.parent / "campaign.toml")

@@ -10,8 +10,8 @@ import numpy as np
 import zarr
 
 from heliograph.campaign.plan import Campaign
-from heliograph.campaign.store import CLAIM, STORE, done_chunks, stored_labels
-from heliograph.disk.quoting import from_cell, in_cell
+from heliograph.campaign.store import CLAIM, STORE, done_chunks, read_labels
+from heliograph.disk.quoting import quote_for_cell, unquote_cell
 from heliograph.disk.whole_file import naming, replace
 from heliograph.numerics.check import fail, file_path
 
@@ -69,13 +69,13 @@ def read_summary(path: Path) -> list[Score]:
     """Read the scores that `write_summary` wrote."""
     kinds = get_type_hints(Score)
     with path.open(newline="", encoding="utf-8") as file:
-        rows = [{name: from_cell(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+        rows = [{name: unquote_cell(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
     return [Score(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in rows]
 
 
 def summarize(store: Path, campaign: Campaign) -> list[Score]:
     """Compute the scores of every filter; the store is read chunk by chunk."""
-    group, labels = zarr.open_group(store, mode="r"), stored_labels(store)
+    group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
     scores = []
     for setting in range(len(campaign.settings)):
@@ -163,4 +163,4 @@ def write_summary(store: Path, campaign: Campaign, path: Path) -> None:
 
 
 def _cell(value: object) -> object:
-    return value if isinstance(value, int | float) else in_cell(str(value))
+    return value if isinstance(value, int | float) else quote_for_cell(str(value))

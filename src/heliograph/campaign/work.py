@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.campaign.plan import Campaign, Chunk, from_json, versions
+from heliograph.campaign.plan import Campaign, Chunk, parse_campaign, versions
 from heliograph.campaign.store import (
     Description,
     Labels,
     check_within,
     describe,
     labels_from,
-    stored_labels,
+    read_labels,
     write_chunk,
 )
 from heliograph.model.estimate import Estimate
@@ -27,7 +27,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import by_name, measurements_of
+from heliograph.simulation.results.by_name import measurements_of, split_by_name
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep
 from heliograph.simulation.simulate import monte_carlo
 
@@ -58,7 +58,7 @@ class Reply:
 def perform(campaign: str, store: str, setting: int, chunk: int | None) -> Reply:
     """Do one job of a campaign given as JSON; an error becomes a reply."""
     try:
-        plan = from_json(campaign)
+        plan = parse_campaign(campaign)
         _check_versions(plan)
         network = _network(campaign, setting)
         if chunk is None:
@@ -77,7 +77,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
     """
     if not store.is_dir():
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
-    labels = stored_labels(store)
+    labels = read_labels(store)
     check_within(labels_from(describe(network)["labels"]), labels, chunk.setting)
     # Full width, whatever the chunk has; only its own runs are written.
     recorded = monte_carlo(
@@ -112,7 +112,7 @@ def _check_versions(campaign: Campaign) -> None:
 
 @lru_cache(maxsize=4)
 def _network(campaign: str, setting: int) -> Network:
-    plan = from_json(campaign)
+    plan = parse_campaign(campaign)
     network = plan.function()(**plan.settings[setting])
     network.check_horizon(plan.horizon)
     inputs(plan, network)
@@ -184,7 +184,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """Arrange the collected errors by node and filter."""
         results = {
-            field: by_name(network, collected, itemgetter(field), axis)
+            field: split_by_name(network, collected, itemgetter(field), axis)
             for field, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))
         }
         estimates = {

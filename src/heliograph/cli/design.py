@@ -57,7 +57,7 @@ def stages(file: "DesignFile") -> int:
 def work(file: "DesignFile", advance: "Advance") -> "DesignResults":
     """Compute the design, the front around it, the value of changes, and the map."""
     import heliograph as hg
-    from heliograph.files.design_file import designed_source
+    from heliograph.files.design_file import write_designed_source
     from heliograph.planning.comparisons import totals_about
     from heliograph.report.design_page import SOURCE, DesignResults
 
@@ -75,5 +75,5 @@ def work(file: "DesignFile", advance: "Advance") -> "DesignResults":
         front=hg.planning.error_over_power(file.problem, totals, advance),
         changes=hg.planning.worth_of_changes(best, file.exponent, advance),
         map=None if places is None else hg.planning.error_over_sites(best, places.build, places.x, places.y, advance),
-        written=designed_source(file, SOURCE, best.powers),
+        written=write_designed_source(file, SOURCE, best.powers),
     )

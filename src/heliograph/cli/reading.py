@@ -93,7 +93,7 @@ def read_measured(
     wanted = events.plants if options.plant is None else [options.plant]
     measured = [_convert_events(events.of(plant), plant, options) for plant in wanted]
     # What was read is said once.
-    measured[0].warnings.extend(said_of(path, events))
+    measured[0].warnings.extend(describe_unread(path, events))
     measured[-1].summary.extend(events.notes)
     return measured
 
@@ -164,7 +164,7 @@ def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -
     return Measured(plant, recording, rows, events, lines)
 
 
-def said_of(path: Path, events: "EventTable") -> list[str]:
+def describe_unread(path: Path, events: "EventTable") -> list[str]:
     """Say how many messages could not be read, and why, of the first of them; and where the reading ended."""
     lines = [events.broken] if events.broken else []
     if events.refused:

@@ -80,9 +80,9 @@ def _read_events(path: Path, reference: str, strict: bool) -> "Iterator[tuple[st
     if table is None:
         yield ("", *recorded(path, network))
         return
-    from heliograph.cli.reading import said_of
+    from heliograph.cli.reading import describe_unread
 
-    for line in [*said_of(path, table), *table.notes]:
+    for line in [*describe_unread(path, table), *table.notes]:
         print(f"heliograph: {visible(line)}", file=sys.stderr)
     for name in table.plants:
         events = table.of(name)

@@ -57,10 +57,10 @@ def run(
     """
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
-    from heliograph.smoothing.modes import named_smoothing
+    from heliograph.smoothing.modes import parse_smoothing
 
     # Check the options before JAX is imported.
-    later, options = named_smoothing(smooth), reading or ReadingOptions()
+    later, options = parse_smoothing(smooth), reading or ReadingOptions()
     _check_options(measurements, out, report, lag, options)
     with progress(4) as advance:
         advance("starting")

@@ -51,7 +51,7 @@ def demo(
     changes: Changes | None = None,
 ) -> None:
     """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
-    run(["demo"], out, changed(changes, seed=seed, recording=recording), "example")
+    run(["demo"], out, collect_changes(changes, seed=seed, recording=recording), "example")
 
 
 def example(
@@ -67,7 +67,7 @@ def example(
     """Run an example and report, or list them."""
     if name is None:
         return print_list("example")
-    run([name], out, changed(changes, seed=seed, trace=trace, recording=recording), "example")
+    run([name], out, collect_changes(changes, seed=seed, trace=trace, recording=recording), "example")
 
 
 def reproduce(
@@ -87,7 +87,7 @@ def reproduce(
     if method == "all" and changes:
         raise fail("--set", "one publication, whose settings these are", "all")
     names = list(studies_of("publication")) if method == "all" else [method]
-    run(names, out, changed(changes, runs=runs, seed=seed), "publication", "" if method == "all" else method)
+    run(names, out, collect_changes(changes, runs=runs, seed=seed), "publication", "" if method == "all" else method)
 
 
 def run(
@@ -138,7 +138,7 @@ class Option(str):
     __slots__ = ()
 
 
-def changed(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
+def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
     """Collect values by name: of options that are set, and of each `name=value`.
 
     Raises:

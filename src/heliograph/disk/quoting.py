@@ -10,29 +10,29 @@ def visible(text: str) -> str:
     return "".join(c if c.isprintable() or c == " " else repr(c)[1:-1] for c in text)
 
 
-def in_figure(text: str) -> str:
+def quote_for_figure(text: str) -> str:
     """Quote a text for matplotlib: no dollar sign starts a formula, no leading underscore hides it from the legend."""
     shown = visible(text).replace("$", r"\$")
     return f"\u200b{shown}" if shown.startswith("_") else shown
 
 
-def in_cell(text: str) -> str:
+def quote_for_cell(text: str) -> str:
     """Quote a text for a spreadsheet: what it would compute begins with an apostrophe, which it does not show."""
     shown = visible(text)
     return f"'{shown}" if shown.lstrip("'").startswith(FORMULA) else shown
 
 
-def from_cell(cell: str) -> str:
-    """Undo `in_cell`, but for characters that cannot be printed."""
+def unquote_cell(cell: str) -> str:
+    """Undo `quote_for_cell`, but for characters that cannot be printed."""
     return cell[1:] if cell.startswith("'") and cell.lstrip("'").startswith(FORMULA) else cell
 
 
-def in_file(text: str) -> str:
+def quote_for_file(text: str) -> str:
     """Quote a text for a file of arrays: backslash and characters that cannot be printed as Python's escapes."""
     return "".join(c if c.isprintable() and c != "\\" else c.encode("unicode_escape").decode() for c in text)
 
 
-def from_file(text: str) -> str:
-    """Undo `in_file`."""
+def unquote_file(text: str) -> str:
+    """Undo `quote_for_file`."""
     code = r"\\(?:[\\nrt]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})"
     return re.sub(code, lambda match: match[0].encode().decode("unicode_escape"), text)

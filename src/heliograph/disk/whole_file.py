@@ -10,7 +10,7 @@ from glob import escape as glob_escape
 from pathlib import Path
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.signals import uninterrupted
+from heliograph.numerics.signals import hold_signals
 
 try:
     import fcntl
@@ -21,7 +21,7 @@ LOCK = ".lock"
 
 
 @contextmanager
-def held(path: Path) -> Iterator[bool]:
+def try_lock(path: Path) -> Iterator[bool]:
     """Try to lock the file or folder at `path`; yields whether the lock was obtained."""
     try:
         handle = os.open(path, os.O_RDONLY)
@@ -131,7 +131,7 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
         with naming(paths[0]):
             yield partials
         # Replace one by one, with the earlier contents of all but the last.
-        with uninterrupted():
+        with hold_signals():
             for partial, path in zip(partials, paths, strict=True):
                 before = path.read_bytes() if path != paths[-1] and path.exists() else None
                 with naming(path):
@@ -139,7 +139,7 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
                 replaced.append((path, before))
     except BaseException:
         # Undo: remove temporary files, restore those that were replaced.
-        with uninterrupted():
+        with hold_signals():
             for partial in partials:
                 partial.unlink(missing_ok=True)
             if len(replaced) < len(paths):
@@ -227,19 +227,19 @@ def whole_folder(target: Path) -> Iterator[Path]:
     partial, mine = target.parent, ExitStack()
     try:
         # Write to a temporary folder in the same file system.
-        with uninterrupted():
+        with hold_signals():
             target.parent.mkdir(parents=True, exist_ok=True)
             partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
             (partial / "new").mkdir()
-            mine.enter_context(held(partial))
+            mine.enter_context(try_lock(partial))
         with mine, naming(target):
             yield partial / "new"
             sync_tree(partial / "new")
-        with uninterrupted():
+        with hold_signals():
             _swap(partial, target)
     except BaseException:
         # Undo: restore earlier results, remove everything that was made.
-        with uninterrupted():
+        with hold_signals():
             mine.close()
             if (partial / "old").exists() and not target.exists():
                 (partial / "old").rename(target)
@@ -265,7 +265,7 @@ def clear_left(target: Path) -> None:
     for left in target.parent.glob(f".{glob_escape(target.name)}-*") if target.parent.is_dir() else ():
         if not re.fullmatch(r"-[a-z0-9_]{8}", left.name.removeprefix(f".{target.name}")) or not left.is_dir():
             continue
-        with held(left) as ours:
+        with try_lock(left) as ours:
             if not ours or {p.name for p in left.iterdir()} - {"new", "old"}:
                 continue
             if (left / "old").exists() and not target.exists():

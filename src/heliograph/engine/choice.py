@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 from heliograph.numerics import float64
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.collector import no_collector
-from heliograph.numerics.stack import with_room
+from heliograph.numerics.stack import make_room
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, compile
@@ -71,7 +71,7 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
         ValueError: no function; HELIOGRAPH_ENGINE is "native" and the program is not supported.
     """
     if not callable(function):
-        raise fail("function of one run", "a function of arrays", shown(function))
+        raise fail("function of one run", "a function of arrays", show_value(function))
     return chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
 
 
@@ -93,7 +93,7 @@ def chosen(
     return choice
 
 
-def computed(
+def compute_once(
     function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree], most: int = LONG
 ) -> PyTree:
     """Compute a function once, in double precision, as NumPy arrays: by native code where it supports the function.
@@ -108,28 +108,28 @@ def computed(
         choice = chosen(function, arguments, [False] * len(arguments), most)
         if choice.code is None:
             return float64.to_numpy(by_xla(*arguments))
-        return of_arrays(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
+        return map_arrays(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
 
 
-def of_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> PyTree:
+def map_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> PyTree:
     """Change the arrays of results; what they have beside arrays, such as a model's functions, stays."""
     return jax.tree.map(lambda leaf: change(leaf) if isinstance(leaf, np.ndarray) else leaf, results)
 
 
-def compiled(function: Callable[P, R]) -> Callable[P, R]:
+def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that is called now and then, once per structure and shapes of its arguments.
 
     Native code computes it if it is short, else XLA as by `float64.compiled`; both in double precision, from numbers
     and to NumPy arrays. Inside a trace it is the plain function.
     """
-    by_xla = float64.compiled(function)
+    by_xla = float64.compile_in_float64(function)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
         float64.check_process()
-        returned: R = computed(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
+        returned: R = compute_once(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
         return returned
 
     return call
@@ -143,14 +143,14 @@ def setting() -> str:
     return engine
 
 
-def attempted(make: Callable[[], Code]) -> Code | None:
+def try_native(make: Callable[[], Code]) -> Code | None:
     """Return native code, or None if XLA has to compute instead."""
     engine = setting()
     if engine == "xla":
         return None
     try:
         with no_collector():
-            return with_room(make)()
+            return make_room(make)()
     except Unsupported as error:
         if engine == "native":
             raise fail("native code", "a program of operations that it takes", str(error)) from None
@@ -190,7 +190,7 @@ class _Array(NamedTuple):
 
 
 @lru_cache(COMPILED)
-@with_room
+@make_room
 @no_collector()
 def _compile_structure(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Any, str]:
     """Compile code for one structure, and the shapes and types of its arrays."""

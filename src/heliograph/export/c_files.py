@@ -14,11 +14,11 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import RESERVED, Real, step_program
 from heliograph.export.text import CText, Form, c_text
-from heliograph.factors.columns import computed_in
+from heliograph.factors.columns import use_precision
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
-from heliograph.numerics.check import InputError, fail, instance, shown
+from heliograph.numerics.check import InputError, fail, instance, show_value
 
 PRECISIONS: dict[str, Real] = {"double": "double", "float": "float"}
 COMPILER = "cc"
@@ -71,7 +71,7 @@ def export_named(filter: object, path: str | Path, precision: str, received: Seq
     checked: AbstractFilter = instance("export", filter, AbstractFilter, "a filter")
     source = check_place(path)
     if precision not in PRECISIONS:
-        raise fail("precision", " or ".join(PRECISIONS), shown(precision))
+        raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
     text = text_of(checked, source.stem, PRECISIONS[precision], received)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
@@ -83,7 +83,7 @@ def export_named(filter: object, path: str | Path, precision: str, received: Seq
 def check_place(path: str | Path) -> Path:
     """Check the path of the source, whose name is the prefix of the names in it."""
     if not isinstance(path, str | Path):
-        raise fail("path of the source", "a file that ends in .c", shown(path))
+        raise fail("path of the source", "a file that ends in .c", show_value(path))
     source = Path(path)
     check_output(source, (".c",))
     check_output(source.with_suffix(".h"), (".h",))
@@ -95,13 +95,13 @@ def check_place(path: str | Path) -> Path:
 
 def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
     """Return the text of both files of a filter."""
-    names = received_names(filter) if received is None else received
+    names = name_received(filter) if received is None else received
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
     try:
-        with computed_in(np.float64 if real == "double" else np.float32):
+        with use_precision(np.float64 if real == "double" else np.float32):
             program = step_program(filter, real, prefix)
         return c_text(program, Form(prefix, real, names, kind))
     except ValueError as error:
@@ -113,7 +113,7 @@ def carries_factors(filter: AbstractFilter) -> bool:
     return any(keystr(path).endswith(".variances") for path, _ in tree_flatten_with_path(filter.init())[0])
 
 
-def received_names(filter: AbstractFilter) -> Sequence[str]:
+def name_received(filter: AbstractFilter) -> Sequence[str]:
     """Return the sensor's outputs if the filter has a sensor and as many arrive, else z0, z1, ..."""
     outputs: tuple[str, ...] = first(filter.sensor).outputs if hasattr(filter, "sensor") else ()
     return outputs if len(outputs) == filter.received else [f"z{i}" for i in range(filter.received)]

@@ -2,7 +2,7 @@
 
 L is unit lower triangular and d is never negative, so that a variance is a sum of positive terms in any precision. Rows
 are made orthogonal (`triangular`) where digits matter: a row is known to eps, so its square to eps^2. The sum is formed
-and eliminated (`eliminated`) where products matter: two thirds of them, and a pivot is known to eps of its variance.
+and eliminated (`eliminate`) where products matter: two thirds of them, and a pivot is known to eps of its variance.
 
 A known zero of a matrix stays a known zero through a matrix product, not through a product of numbers, which might be
 NaN: so products of rows and columns are written as matrix products here.
@@ -55,7 +55,7 @@ class Columns(NamedTuple):
         return Columns(self.matrix, self.weights * factor)
 
 
-def joined(*parts: Columns) -> Columns:
+def join_columns(*parts: Columns) -> Columns:
     """Add covariances: their columns side by side."""
     matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
     return Columns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
@@ -143,7 +143,7 @@ def triangular(columns: Columns) -> Columns:
     return _factors(lower, variances, rows.dtype)
 
 
-def eliminated(covariance: jax.Array, least: float = 0.0) -> Columns:
+def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
     """Return L and d with L diag(d) L' = P, by elimination: n^3 / 6 products, n reciprocals.
 
     A pivot is known to eps of its own variance, of which rounding may leave less than nothing: it is at least `least`
@@ -161,7 +161,7 @@ def eliminated(covariance: jax.Array, least: float = 0.0) -> Columns:
     return _factors(lower, variances, covariance.dtype)
 
 
-def decorrelated(lower: jax.Array, rows: jax.Array) -> jax.Array:
+def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
     """L^-1 times rows (m, ...): of z = rows x + n with Cov n = L diag(d) L', rows whose noises are uncorrelated."""
     solved: list[jax.Array] = []
     for i in range(len(rows)):
@@ -189,7 +189,7 @@ def root_of(covariance: np.ndarray) -> np.ndarray:
     return scale[:, None] * np.where(np.abs(root) > RANK, root, 0.0)
 
 
-def known_factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def factor_constant(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Factor a known covariance: entries of L below its diagonal, and d, by the orthogonal rows of its root."""
     rows = root_of(covariance)
     n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
@@ -205,7 +205,7 @@ def columns_of(covariance: Array) -> Columns:
     if isinstance(covariance, np.ndarray):
         root = root_of(covariance)
         return Columns(root, np.ones(root.shape[1]))
-    return eliminated(jnp.asarray(covariance))
+    return eliminate(jnp.asarray(covariance))
 
 
 def columns_of_each(covariances: np.ndarray) -> Columns:
@@ -230,7 +230,7 @@ _precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default
 
 
 @contextmanager
-def computed_in(precision: type[np.floating[Any]]) -> Iterator[None]:
+def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
     """Take the rounding of a precision that is not the arrays' own: of a program that is written for a device."""
     token = _precision.set(precision)
     try:
@@ -286,7 +286,7 @@ def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
 
 
 def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
-    """Compute `eliminated` as a loop over the columns."""
+    """Compute `eliminate` as a loop over the columns."""
     n, whole = len(covariance), jnp.diagonal(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

@@ -18,12 +18,12 @@ from heliograph.factors.columns import (
     WRITTEN,
     Columns,
     below_diagonal,
-    decorrelated,
-    eliminated,
+    decorrelate,
+    eliminate,
+    factor_constant,
     inverse,
     is_positive,
-    joined,
-    known_factors,
+    join_columns,
     triangular,
     unit_lower,
     unit_of,
@@ -82,22 +82,22 @@ def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
 
 def of_matrix(mean: jax.Array, covariance: jax.Array) -> Gaussian:
     """Make a Gaussian of a covariance matrix that is a sum of squares, by elimination."""
-    factors = eliminated(covariance, len(covariance) * unit_of(covariance))
+    factors = eliminate(covariance, len(covariance) * unit_of(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
 def given(mean: Array, covariance: Array) -> Gaussian:
     """Make a Gaussian of a covariance matrix, the border to all that has one; each variance to n eps of itself."""
     if isinstance(covariance, np.ndarray):
-        factors: Any = (mean if is_traced(mean) else np.asarray(mean), *known_factors(covariance))
+        factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_constant(covariance))
         return Gaussian(*factors)
-    columns = eliminated(jnp.asarray(covariance), len(covariance) * unit_of(covariance))
+    columns = eliminate(jnp.asarray(covariance), len(covariance) * unit_of(covariance))
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 
 def move(x: Gaussian, matrix: Array, shift: Array, noise: Columns) -> Gaussian:
     """Move x to F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
-    return of_columns(jnp.asarray(matrix @ x.mean + shift), joined(Columns(matrix @ x.root, x.variances), noise))
+    return of_columns(jnp.asarray(matrix @ x.mean + shift), join_columns(Columns(matrix @ x.root, x.variances), noise))
 
 
 class Image(NamedTuple):
@@ -112,10 +112,10 @@ class Image(NamedTuple):
 
     def columns_from(self, x: Gaussian) -> Columns:
         """Return the covariance of f(x)."""
-        return joined(Columns(self.slopes, x.variances), self.curvature)
+        return join_columns(Columns(self.slopes, x.variances), self.curvature)
 
 
-def with_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns) -> Gaussian:
+def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns) -> Gaussian:
     """Law of (x, t) with t = mean + slopes xi + v, of the factors N diag(r) N' of Cov v: [[L, 0], [slopes, N]], (d, r).
 
     Shapes: mean (m,), slopes (m, n), noise (m, m).
@@ -180,7 +180,7 @@ def observe(
     rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = jnp.where(present[:, None], rows, 0.0)
     whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
-    rows, variance = decorrelated(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
+    rows, variance = decorrelate(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
     # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
     root, d = jnp.concatenate([x.root, rows[:, :n]]), x.variances
     news, values, totals = jnp.concatenate([x.mean, -rows[:, n]]), [], []
@@ -291,7 +291,7 @@ class Backwards(NamedTuple):
 
     def apart(self, rows: jax.Array) -> jax.Array:
         """L^-1 times rows (n, ...)."""
-        return decorrelated(unit_lower(self.lower), rows)
+        return decorrelate(unit_lower(self.lower), rows)
 
 
 def backwards(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) -> Backwards:
@@ -338,13 +338,13 @@ def _measure_parts(
     return root, d, lax.concatenate(gains, 1)
 
 
-def smoothed(back: Backwards, later: Gaussian) -> Gaussian:
+def smooth(back: Backwards, later: Gaussian) -> Gaussian:
     """Law of x given all data, from that of the next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+), J = K L^-1.
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     carried = Columns(back.gain @ back.apart(later.root), later.variances)
-    return of_columns(back.mean_given(later.mean), joined(carried, back.left.columns))
+    return of_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))
 
 
 def _stack_numbers(entries: list[jax.Array]) -> jax.Array:

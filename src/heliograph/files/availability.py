@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from typing_extensions import TypeAliasType
 
-from heliograph.files.fields import at, decoded, matches
-from heliograph.numerics.check import InputError, fail, shown
+from heliograph.files.fields import at, decode_json, matches
+from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.module import readable
 
 Words = TypeAliasType("Words", str | Sequence[str])
@@ -40,14 +40,16 @@ class Available:
 
     def __post_init__(self) -> None:
         if not isinstance(self.topic, str) or not self.topic or "#" in self.topic:
-            raise fail("Available, topic", "a topic, with + for what that of the values has there", shown(self.topic))
+            raise fail(
+                "Available, topic", "a topic, with + for what that of the values has there", show_value(self.topic)
+            )
         if not isinstance(self.path, str):
-            raise fail("Available, path", "a dotted path", shown(self.path))
+            raise fail("Available, path", "a dotted path", show_value(self.path))
         for name in ("online", "offline"):
             words = getattr(self, name)
             several = (words,) if isinstance(words, str) else words
             if not isinstance(several, Sequence) or not several or not all(isinstance(w, str) and w for w in several):
-                raise fail(f"Available, {name}", "a word, or a list of words", shown(words))
+                raise fail(f"Available, {name}", "a word, or a list of words", show_value(words))
             object.__setattr__(self, name, tuple(word.casefold() for word in several))
         if both := sorted(set(self.online) & set(self.offline)):
             raise fail("Available, offline", "other words than online", both[0])
@@ -67,7 +69,7 @@ class Available:
         """
         word = str(at(payload, self.path, where) if isinstance(payload, dict) else payload).strip().casefold()
         if word not in (*self.online, *self.offline):
-            raise fail(where, f"one of {', '.join((*self.online, *self.offline))}", shown(payload))
+            raise fail(where, f"one of {', '.join((*self.online, *self.offline))}", show_value(payload))
         return word in self.offline
 
 
@@ -151,6 +153,6 @@ def _decode_payload(payload: object, where: str) -> object:
     if not isinstance(payload, str):
         return payload
     try:
-        return decoded(payload, where)
+        return decode_json(payload, where)
     except InputError:
         return payload.strip()

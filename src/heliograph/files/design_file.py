@@ -141,7 +141,7 @@ def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...])
             raise fail(f"{where}, key {key!r}", f"one of {', '.join(known)}", f"an unknown key{hint}")
 
 
-def designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
+def write_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
     """Return Python source of the network with these powers; it loads the original from `source` in the same folder."""
     error = file.problem.criterion
     _, colon, name = file.reference.rpartition(":")

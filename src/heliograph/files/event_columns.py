@@ -138,7 +138,9 @@ def judge(
     return verdicts
 
 
-def counted(node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]) -> dict[int, dict[Verdict, int]]:
+def count_verdicts(
+    node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]
+) -> dict[int, dict[Verdict, int]]:
     """Count the verdicts of each node."""
     return {
         int(n): {verdict: int(np.sum(verdicts[node == n] == i)) for i, verdict in enumerate(VERDICTS)}
@@ -146,7 +148,7 @@ def counted(node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events
     }
 
 
-def lost(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
+def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
     """Count the gaps in a node's count, in the order of its times.
 
     After `period` messages the count begins at 0 again (0: it does not). A smaller count is a node that was restarted,

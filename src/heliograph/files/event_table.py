@@ -4,7 +4,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from heliograph.files.event_columns import SECOND, USED, Columns, Events, counted, judge, lost, order_within
+from heliograph.files.event_columns import (
+    SECOND,
+    USED,
+    Columns,
+    Events,
+    count_gaps,
+    count_verdicts,
+    judge,
+    order_within,
+)
 from heliograph.files.recording import Recording
 from heliograph.files.sources import Reading
 from heliograph.learning.losses.delays import Delays, learn_delays
@@ -251,12 +260,12 @@ class EventTable:
         """
         events, verdicts = self._judge_events(window, ahead)
         names = [*self.network.names, INPUTS]
-        counts = {names[node]: found for node, found in counted(events.node, verdicts).items()}
+        counts = {names[node]: found for node, found in count_verdicts(events.node, verdicts).items()}
         gaps = {}
         for node, name in enumerate(self.network.names):
             columns, mine = self.columns[name], events.of(events.node == node)
             if len(columns.time) and min(columns.sequence) >= 0:
-                gaps[name] = lost(mine.time, mine.sequence, columns.period)
+                gaps[name] = count_gaps(mine.time, mine.sequence, columns.period)
         return counts, gaps
 
     def recording(self, window: float = np.inf, ahead: float = AHEAD) -> Recording:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from heliograph.live.event import whole
-from heliograph.numerics.check import InputError, fail, shown
+from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.dates import UNITS, dates, instant
 
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
@@ -48,7 +48,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return fields
 
 
-def decoded(text: str | bytes, name: str) -> Any:
+def decode_json(text: str | bytes, name: str) -> Any:
     """Decode JSON, in which a bare nan or inf, as printf writes them, is null.
 
     Raises:
@@ -69,7 +69,7 @@ def decoded(text: str | bytes, name: str) -> Any:
     except DoubledFieldError as error:
         raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
     except (ValueError, RecursionError):  # also bytes that are no text
-        raise fail(name, "JSON", shown(text)) from None
+        raise fail(name, "JSON", show_value(text)) from None
 
 
 def matches(topic: str, pattern: str) -> bool:
@@ -120,17 +120,17 @@ def number(value: Any, name: str, quoted: bool = False) -> float:
     if value is None or value == "":
         return np.nan
     if quoted and isinstance(value, str):
-        value = unquoted(value)
+        value = parse_number(value)
     if not isinstance(value, bool | int | float | np.number | np.bool_):
-        raise fail(name, NUMBER, shown(value))
+        raise fail(name, NUMBER, show_value(value))
     try:
         numeric = float(value)
     except OverflowError:
-        raise fail(name, NUMBER, shown(value)) from None
+        raise fail(name, NUMBER, show_value(value)) from None
     return numeric if isfinite(numeric) else np.nan
 
 
-def unquoted(text: str) -> int | float | str:
+def parse_number(text: str) -> int | float | str:
     """Return the number that a text is, whole ones with every digit; a text that is none as it is."""
     words = text.strip()
     kind = int if words.lstrip("+-").isdecimal() else float
@@ -157,26 +157,26 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> 
             break
     # Dates, then numbers in their unit.
     if isinstance(value, str):
-        value = unquoted(value) if quoted else value
+        value = parse_number(value) if quoted else value
     if isinstance(value, str):
         try:
             instant(value)
         except ValueError:
-            raise fail(name, "a date of ISO 8601 with its zone", shown(value)) from None
+            raise fail(name, "a date of ISO 8601 with its zone", show_value(value)) from None
         return int(dates([value], name)[0].astype(np.int64))
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
-        raise fail(name, "a time: a date with its zone, a stamp, or a number", shown(value))
+        raise fail(name, "a time: a date with its zone, a stamp, or a number", show_value(value))
     if unit == "step":
         return count(value, name)
     # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
     whole_units = float(value).is_integer()
     stamp = int(value) * UNITS[unit] if whole_units else round(Decimal(repr(float(value))) * UNITS[unit])
     if not -(2**63) < stamp < 2**63:
-        raise fail(name, f"a time in {unit} since 1970", shown(value))
+        raise fail(name, f"a time in {unit} since 1970", show_value(value))
     return stamp
 
 
-def arrived(value: Any, name: str) -> int:
+def parse_arrival(value: Any, name: str) -> int:
     """Convert what a log says of an arrival, a date or seconds, also as a text, to nanoseconds since 1970."""
     return nanoseconds(value, "s", name, quoted=True)
 
@@ -184,7 +184,7 @@ def arrived(value: Any, name: str) -> int:
 def count(value: Any, name: str, quoted: bool = False) -> int:
     """Convert a running count, which columns of numbers have as a float."""
     if quoted and isinstance(value, str):
-        value = unquoted(value)
+        value = parse_number(value)
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return whole(name, value)
@@ -197,7 +197,7 @@ def name_of(value: Any, name: str) -> str:
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     if not isinstance(value, str):
-        raise fail(name, "a name", shown(value))
+        raise fail(name, "a name", show_value(value))
     return value
 
 
@@ -208,5 +208,5 @@ def _fields(value: object) -> str:
     elif hasattr(value, "__dataclass_fields__"):
         names = list(value.__dataclass_fields__)
     else:
-        return shown(value) if not isinstance(value, list | np.ndarray) else f"a list of {len(value)}"
+        return show_value(value) if not isinstance(value, list | np.ndarray) else f"a list of {len(value)}"
     return ", ".join(name for name in names if not re.match("__", name))[:200] or "an empty message"

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.bags.bag import OFTEN, Progress, fields_of, opened
+from heliograph.files.bags.bag import OFTEN, Progress, fields_of, open_bag
 from heliograph.files.bags.mcap_chunks import messages_of as bag_messages
-from heliograph.files.fields import TimeUnit, arrived, decoded, nanoseconds
+from heliograph.files.fields import TimeUnit, decode_json, nanoseconds, parse_arrival
 from heliograph.files.message_files import is_message_file, message_name, messages_of, payload_of
-from heliograph.numerics.check import InputError, fail, shown_error
+from heliograph.numerics.check import InputError, fail, show_error
 from heliograph.numerics.dates import UNITS, looks_like_date
 
 SECOND = 1e9  # nanoseconds
@@ -108,7 +108,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
     """
     topics: dict[str, Topic] = {}
     # Types first, then each message's times, of which a header is read without decoding the rest.
-    with opened(path) as (reader, cut):
+    with open_bag(path) as (reader, cut):
         for connection in reader.connections:
             fields = list(fields_of(reader, connection.msgtype))
             numbers = [name for name, kind in fields if kind not in NO_NUMBERS and not name.startswith("header.")]
@@ -125,14 +125,14 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
                 if progress is not None and done % OFTEN == 0:
                     progress(done, total)
         except Exception as error:  # whatever damage makes a reader do
-            return topics, str(fail(f"{path}, after message {done}", "a bag without damage", shown_error(error)))
+            return topics, str(fail(f"{path}, after message {done}", "a bag without damage", show_error(error)))
         return topics, cut
 
 
 def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:
     """Add a message of a broker to its topic; `arrival` is in nanoseconds since 1970."""
     try:
-        _note(topics, name, decoded(payload, name), "JSON", arrival)
+        _note(topics, name, decode_json(payload, name), "JSON", arrival)
     except InputError:
         _note(topics, name, None, "no JSON", arrival)
 
@@ -179,7 +179,7 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
         name = message.topic or message_name(path)
         came = None
         with suppress(InputError):
-            came = None if message.arrival is None else arrived(message.arrival, message.where)
+            came = None if message.arrival is None else parse_arrival(message.arrival, message.where)
         if message.topic is not None and isinstance(message.content, str) and came is not None:
             note(topics, name, message.content, came)
             continue

@@ -9,7 +9,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.files.availability import Available
 from heliograph.files.fields import TimeUnit, at, name_of
-from heliograph.numerics.check import TINY, fail, flag, scalar, shown
+from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike
 
@@ -225,15 +225,15 @@ def json_field(
     paths = _paths(path)
     outputs = () if output is None else _texts("output", output)
     if not paths or (outputs and len(outputs) != len(paths)):
-        raise fail("json_field, output", f"{max(len(paths), 1)} names, one for each path", shown(output))
+        raise fail("json_field, output", f"{max(len(paths), 1)} names, one for each path", show_value(output))
     if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
-        raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", shown(time_unit))
+        raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", show_value(time_unit))
     stamp = Stamp(time) if isinstance(time, str) else time
     if not isinstance(stamp, Stamp | None):
-        raise fail("json_field, time", "a text or hg.files.Stamp", shown(time))
+        raise fail("json_field, time", "a text or hg.files.Stamp", show_value(time))
     count = Count(sequence) if isinstance(sequence, str) else sequence
     if not isinstance(count, Count | None):
-        raise fail("json_field, sequence", "a text or hg.files.Count", shown(sequence))
+        raise fail("json_field, sequence", "a text or hg.files.Count", show_value(sequence))
     whose, of = _check_name("node", node), Field(plant) if isinstance(plant, str) else plant
     seconds = None if step is None else float(scalar("json_field, step", step, TINY))
     if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.offset)):
@@ -341,14 +341,14 @@ def _below(prefix: str, path: Paths) -> Paths:
 def _paths(value: object) -> tuple[str | Yaw, ...]:
     items = [value] if isinstance(value, str | Yaw) else value
     if not isinstance(items, Sequence) or not all(isinstance(path, str | Yaw) for path in items):
-        raise fail("json_field, path", "a dotted path, hg.files.Yaw, or a list of these", shown(value))
+        raise fail("json_field, path", "a dotted path, hg.files.Yaw, or a list of these", show_value(value))
     return tuple(items)
 
 
 def _check_name(name: str, value: object) -> Any:
     """Check what names a node or a plant."""
     if not isinstance(value, str | Level | Field):
-        raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", shown(value))
+        raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", show_value(value))
     return value
 
 
@@ -361,15 +361,15 @@ def _conditions(where: object) -> tuple[Containers, tuple[Available, ...]]:
         if isinstance(single, Available):
             continue
         if not isinstance(single, Mapping) or not all(isinstance(path, str) for path in single):
-            raise fail("json_field, where", "a dictionary of paths with their values, or Available", shown(where))
+            raise fail("json_field, where", "a dictionary of paths with their values, or Available", show_value(where))
         pairs += single.items()
     plain, values = (str, int, float, bool, type(None)), dict[str, Container[object]]()
     for path, value in pairs:
         if path in values:
-            raise fail("json_field, where", "each path once", shown(path))
+            raise fail("json_field, where", "each path once", show_value(path))
         allowed = (value,) if isinstance(value, plain) else value
         if not isinstance(allowed, Container):
-            raise fail(f"json_field, where, {path!r}", "a value, or a list, set or range of them", shown(allowed))
+            raise fail(f"json_field, where, {path!r}", "a value, or a list, set or range of them", show_value(allowed))
         values[path] = allowed
     return values, available
 
@@ -377,7 +377,7 @@ def _conditions(where: object) -> tuple[Containers, tuple[Available, ...]]:
 def _texts(name: str, value: object) -> tuple[str, ...]:
     items = [value] if isinstance(value, str) else value
     if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
-        raise fail(f"json_field, {name}", "a text, or a list of texts", shown(value))
+        raise fail(f"json_field, {name}", "a text, or a list of texts", show_value(value))
     return tuple(items)
 
 
@@ -386,8 +386,8 @@ def _broadcast_to_paths(name: str, value: ArrayLike, count: int) -> tuple[float,
     try:
         values = np.atleast_1d(np.asarray(value, dtype=object))
     except (TypeError, ValueError):  # a set of arrays, a key
-        raise fail(f"json_field, {name}", f"1 number, or {count}", shown(value)) from None
+        raise fail(f"json_field, {name}", f"1 number, or {count}", show_value(value)) from None
     if values.ndim != 1 or len(values) not in (1, count):
-        raise fail(f"json_field, {name}", f"1 number, or {count}", shown(value))
+        raise fail(f"json_field, {name}", f"1 number, or {count}", show_value(value))
     numbers = [float(scalar(f"json_field, {name}", single)) for single in values]
     return tuple(numbers * (count if len(numbers) == 1 else 1))

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from heliograph.files.fields import decoded, unquoted
-from heliograph.files.table import check_separators, csv_header, csv_lines, kind_of, opened_text
-from heliograph.numerics.check import InputError, fail, shown
+from heliograph.files.fields import decode_json, parse_number
+from heliograph.files.table import check_separators, csv_header, csv_lines, kind_of, open_text
+from heliograph.numerics.check import InputError, fail, show_value
 
 TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
 ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second
@@ -104,7 +104,7 @@ def _convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
 
 
 def _lines(path: Path) -> Iterator[FileMessage | InputError]:
-    with opened_text(path) as file:
+    with open_text(path) as file:
         if kind_of(path) == ".json":  # one document, of any number of lines, or one a line
             text = file.read()
             try:
@@ -129,7 +129,7 @@ def _flat(content: object) -> Iterator[object]:
 
 def _convert_line(where: str, line: str) -> FileMessage | InputError:
     try:
-        return _convert_object(where, decoded(line, where))
+        return _convert_object(where, decode_json(line, where))
     except InputError as error:
         parts = log_line(line)
         return error if parts is None else FileMessage(where, *parts)
@@ -195,7 +195,7 @@ def _iso(nanoseconds: int) -> str:
 
 def _cell(cell: str) -> float | int | str | None:
     """Convert a cell to a number where it is one; whole numbers keep every digit."""
-    return unquoted(cell) if cell else None
+    return parse_number(cell) if cell else None
 
 
 def payload_of(message: FileMessage) -> object:
@@ -207,6 +207,6 @@ def payload_of(message: FileMessage) -> object:
     if not isinstance(message.content, str):
         return message.content
     try:
-        return decoded(message.content, f"{message.where}, {PAYLOAD}")
+        return decode_json(message.content, f"{message.where}, {PAYLOAD}")
     except InputError:
-        raise fail(f"{message.where}, {PAYLOAD!r}", "JSON", shown(message.content)) from None
+        raise fail(f"{message.where}, {PAYLOAD!r}", "JSON", show_value(message.content)) from None

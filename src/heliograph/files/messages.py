@@ -5,7 +5,7 @@ from pathlib import Path
 
 from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
-from heliograph.files.fields import arrived
+from heliograph.files.fields import parse_arrival
 from heliograph.files.message_files import (
     FileMessage,
     is_message_file,
@@ -123,7 +123,7 @@ def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable
             return
         # The payload of a topic that nobody asks for may be anything.
         content = payload_of(message) if sources.of(topic) else None
-        came = None if message.arrival is None else arrived(message.arrival, f"{message.where}, arrival")
+        came = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
         for reading in sources.read(topic, content, message.where):
             arrival = reading.time if came is None else came
             if arrival is None:

@@ -13,7 +13,7 @@ from heliograph.files.sources import Reading
 from heliograph.files.table import csv_header, kind_of
 from heliograph.live.event import INPUTS, OF_STEPS, whole
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import InputError, fail, shown
+from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.dates import looks_like_date, moment_of
 from heliograph.simulation.network import Network
 
@@ -97,7 +97,7 @@ class OwnMessages:
         self._check_columns(where, row)
         node = row[NODE]
         if node not in self.components:
-            raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", shown(node))
+            raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
         values = _read_values(row, self.components[node], where, node in self._numbered)
         sequence = _whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
         time, dated = self._moment(row[TIME], f"{where}, column {TIME!r}")
@@ -132,15 +132,15 @@ class OwnMessages:
         expected = "a number"
         if self._table is not None and dated != (not self._table.numbers):
             expected = "a number, as the times before" if dated else "a date, as the times before"
-            raise fail(name, expected, shown(cell))
+            raise fail(name, expected, show_value(cell))
         if not dated:
             return self._number(cell, name), False
         if self.steps:
-            raise fail(name, "a step, a whole number from 0", f"{shown(cell)} ({OF_STEPS})")
+            raise fail(name, "a step, a whole number from 0", f"{show_value(cell)} ({OF_STEPS})")
         moment, zoned = moment_of(cell, name)
         self._zoned = zoned if self._zoned is None else self._zoned
         if zoned != self._zoned:
-            raise fail(name, "a zone with every date or with none", shown(cell))
+            raise fail(name, "a zone with every date or with none", show_value(cell))
         return moment, True
 
     def _number(self, cell: Any, name: str) -> float:
@@ -166,7 +166,7 @@ def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbe
         if numbered and len(parts) == len(names) - 1:
             parts.append("nan" if isinstance(cell, str) else np.nan)
         if len(parts) != len(names):
-            raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", shown(cell))
+            raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", show_value(cell))
         from_text = isinstance(cell, str)
         return np.array([_number(word, f"{where}, column {VALUES!r}", True, from_text) for word in parts])
     return np.array([_number(row.get(name), f"{where}, column {name!r}", True) for name in names])
@@ -191,7 +191,7 @@ def _number(cell: Any, name: str, empty: bool = False, text: bool = False) -> fl
         return np.nan
     expected = "a number or an empty cell" if empty else "a number"
     if isinstance(cell, str) and not text:
-        raise fail(name, expected, f"text, {shown(cell)}")
+        raise fail(name, expected, f"text, {show_value(cell)}")
     try:
         if isinstance(cell, str) and "_" in cell:  # Python's own way to write a number, and nobody else's
             raise ValueError
@@ -199,5 +199,5 @@ def _number(cell: Any, name: str, empty: bool = False, text: bool = False) -> fl
     except (TypeError, ValueError, OverflowError):
         number = np.inf
     if np.isinf(number) or (np.isnan(number) and not empty):
-        raise fail(name, expected, "an empty cell" if cell is None else shown(cell))
+        raise fail(name, expected, "an empty cell" if cell is None else show_value(cell))
     return number

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.table import TIME, as_read, columns_of, write_table
+from heliograph.files.table import TIME, columns_of, read_back_name, write_table
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.inputs import time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import backwards, backwards_text, fail, flag, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import with_unit
+from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
@@ -102,11 +102,15 @@ def _headers(network: Network) -> dict[str, str]:
     """
     received = {node: receiver.received_names for node, receiver in network.nodes.items()}
     names = [*network.states, *network.inputs, *(name for of in received.values() for name in of)]
-    headers = {with_unit(name): str(name) for name in names}
-    headers |= {f"truth.{with_unit(name)}": f"truth.{name}" for name in network.states}
-    headers |= {f"{node}.{with_unit(name)}": f"{node}.{name}" for node, of in received.items() for name in of}
+    headers = {append_unit(name): str(name) for name in names}
+    headers |= {f"truth.{append_unit(name)}": f"truth.{name}" for name in network.states}
+    headers |= {f"{node}.{append_unit(name)}": f"{node}.{name}" for node, of in received.items() for name in of}
     plain = [TIME, *headers.values()]
-    return {as_read(header): name for header, name in headers.items()} | headers | dict(zip(plain, plain, strict=True))
+    return (
+        {read_back_name(header): name for header, name in headers.items()}
+        | headers
+        | dict(zip(plain, plain, strict=True))
+    )
 
 
 def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:

@@ -12,7 +12,7 @@ from heliograph.files.fields import MissingFieldError, at, count, matches, nanos
 from heliograph.files.json_field import Source, Yaw
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
@@ -79,7 +79,7 @@ class Sources:
         self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
-            raise fail("sources", "a dictionary of topics, each with json_field or a list of them", shown(table))
+            raise fail("sources", "a dictionary of topics, each with json_field or a list of them", show_value(table))
         self._table = {topic: self._check_sources(topic, items) for topic, items in table.items()}
         self._known: dict[str, list[Mapped]] = {}
         mapped = [single for several in self._table.values() for single in several]
@@ -244,10 +244,10 @@ class Sources:
     def _check_sources(self, topic: object, items: object) -> list[Mapped]:
         """Check the sources of a topic, and look up where their values are in the measurement of each node."""
         if not isinstance(topic, str) or not topic:
-            raise fail("sources", "topics that are text", shown(topic))
+            raise fail("sources", "topics that are text", show_value(topic))
         sources = [items] if isinstance(items, Source) else items
         if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
-            raise fail(f"sources, {topic!r}", "json_field, or a list of them", shown(items))
+            raise fail(f"sources, {topic!r}", "json_field, or a list of them", show_value(items))
         return [Mapped(source, topic, self._places(topic, source)) for source in sources]
 
     def _places(self, topic: str, source: Source) -> dict[str, np.ndarray]:
@@ -269,7 +269,7 @@ class Sources:
             ]
             found = {able_one: self._columns(name, source, able_one) for able_one in able if able_one != INPUTS}
             if not found:
-                raise fail(f"{name}, output", "outputs of a node", shown(source.outputs or len(source.paths)))
+                raise fail(f"{name}, output", "outputs of a node", show_value(source.outputs or len(source.paths)))
         for condition in source.available if "#" not in topic else ():
             condition.of(topic)
         # Either all times are moments, or all are steps.
@@ -280,7 +280,9 @@ class Sources:
                 if self.steps
                 else "a time that is no step, since the network's time is continuous"
             )
-            raise fail(f"{name}, time", expected, f"{shown(source.time and source.time.path)} in {source.time_unit}")
+            raise fail(
+                f"{name}, time", expected, f"{show_value(source.time and source.time.path)} in {source.time_unit}"
+            )
         return found
 
     def _columns(self, name: str, source: Source, node: str) -> np.ndarray:

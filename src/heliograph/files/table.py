@@ -12,11 +12,11 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from heliograph.disk.quoting import from_cell, in_cell
+from heliograph.disk.quoting import quote_for_cell, unquote_cell
 from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
-from heliograph.numerics.check import InputError, fail, file_path, shown, table
-from heliograph.numerics.dates import dates, in_iso, looks_like_date
-from heliograph.numerics.masked import is_absent, unmasked
+from heliograph.numerics.check import InputError, fail, file_path, show_value, table
+from heliograph.numerics.dates import dates, format_dates, looks_like_date
+from heliograph.numerics.masked import fill_masked, is_absent
 from heliograph.numerics.types import Shaped
 
 TIME = "time"
@@ -41,10 +41,10 @@ def columns_of(table: object, name: str = "table", only: Container[str] | None =
         named = {TIME: index} if getattr(index, "name", None) == TIME and TIME not in header else {}
         named |= {column: frame[column] for column in header}
     else:
-        raise fail(name, "a file, a DataFrame, or a dictionary of columns", shown(table))
+        raise fail(name, "a file, a DataFrame, or a dictionary of columns", show_value(table))
     for column in named:
         if not isinstance(column, str):
-            raise fail(f"{name}, columns", "names that are text", shown(column))
+            raise fail(f"{name}, columns", "names that are text", show_value(column))
     kept = {column: values for column, values in named.items() if only is None or column in only}
     return {column: _values(values, f"{name}, column {column!r}") for column, values in kept.items()}
 
@@ -54,9 +54,9 @@ def _values(values: Any, name: str) -> np.ndarray:
     missing = values.isna() if hasattr(values, "isna") else None
     if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
         return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
-    column = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(unmasked(values))
+    column = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(fill_masked(values))
     if column.dtype.kind == "M":
-        return in_nanoseconds(column, name)
+        return convert_to_nanoseconds(column, name)
     if column.dtype.kind in "fiub":
         return numbers_of(column)
     if column.dtype.kind in "OUT":
@@ -70,7 +70,7 @@ def numbers_of(column: np.ndarray) -> np.ndarray:
     return np.asarray(column, dtype=np.int64 if whole and column.dtype != np.uint64 else np.float64)
 
 
-def in_nanoseconds(column: np.ndarray, name: str) -> np.ndarray:
+def convert_to_nanoseconds(column: np.ndarray, name: str) -> np.ndarray:
     """Return dates as datetime64[ns].
 
     Raises:
@@ -100,7 +100,7 @@ def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
         return np.array([np.nan if value is None else float(value) for value in column])
     except (TypeError, ValueError, OverflowError):
         raise fail(
-            name, "numbers or dates", shown(str(texts[0]) if texts and isinstance(texts[0], str) else some)
+            name, "numbers or dates", show_value(str(texts[0]) if texts and isinstance(texts[0], str) else some)
         ) from None
 
 
@@ -166,7 +166,7 @@ def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
     named = table("columns of a table", columns, "arrays")
     for name, column in named.items():
         if not isinstance(column, np.ndarray) or column.ndim != 1 or column.dtype.kind not in "fiubM":
-            raise fail(f"column {name!r}", "an array of numbers or dates", shown(column))
+            raise fail(f"column {name!r}", "an array of numbers or dates", show_value(column))
     lengths = {name: len(column) for name, column in named.items()}
     if len(set(lengths.values())) != 1:
         raise fail("columns of a table", "at least one, all of one length", lengths)
@@ -184,7 +184,7 @@ def kind_of(path: Path) -> str:
 
 
 @contextmanager
-def opened_text(path: Path) -> Iterator[TextIO]:
+def open_text(path: Path) -> Iterator[TextIO]:
     """Open a file of text in UTF-8, packed or not; ValueError for what is none."""
     try:
         if path.suffix.lower() == PACKED:
@@ -201,7 +201,7 @@ def opened_text(path: Path) -> Iterator[TextIO]:
 def csv_lines(path: Path) -> Iterator[Iterator[list[str]]]:
     """Lines of a CSV file that are not empty; ValueError for text that is no CSV in UTF-8."""
     try:
-        with opened_text(path) as file:
+        with open_text(path) as file:
             yield (line for line in csv.reader(file, strict=True) if line)
     except csv.Error as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
@@ -219,7 +219,7 @@ def csv_header(path: Path) -> list[str]:
 def _read_csv(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
     # Cells as text; every row must have as many as the header.
     with csv_lines(path) as lines:
-        header = [from_cell(name.strip()) for name in next(lines, [])]
+        header = [unquote_cell(name.strip()) for name in next(lines, [])]
         _check_header(path, header)
         rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
     if only is not None:
@@ -247,7 +247,9 @@ def _exact(values: np.ndarray, cells: Sequence[str]) -> np.ndarray:
 
 def _cells(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
     if line[0].lstrip().startswith("#"):
-        raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: {_rewriting(path, comment='#')}")
+        raise fail(
+            f"{path}, row {number}", "numbers", f"a comment, {show_value(line[0])}: {_rewriting(path, comment='#')}"
+        )
     if len(line) != len(header):
         hint = ": numbers have a decimal point" if len(line) > len(header) else ""
         raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
@@ -270,14 +272,14 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
         if cell.lower() in MISSING:
             hint = ": a cell is empty where nothing arrived"
         expected = "a number or an empty cell"
-        raise fail(f"{path}, row {number}, column {name!r}", expected, f"{shown(cell)}{hint}") from None
+        raise fail(f"{path}, row {number}, column {name!r}", expected, f"{show_value(cell)}{hint}") from None
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
     line = ",".join(header)
     if line.startswith(COMMENTS):
         raise fail(
-            f"{path}, header", "names of columns", f"a comment, {shown(line)}: {_suggest_without_comments(path)}"
+            f"{path}, header", "names of columns", f"a comment, {show_value(line)}: {_suggest_without_comments(path)}"
         )
     check_separators(path, header)
     _check_distinct(f"{path}, header", header)
@@ -288,15 +290,15 @@ def check_separators(path: Path, header: Sequence[str]) -> None:
     line = ",".join(header)
     for mark, name in SEPARATORS.items() if len(header) == 1 else ():
         if mark in line:
-            with opened_text(path) as file:
+            with open_text(path) as file:
                 commas = re.search(r"\d,\d", file.read(10_000))
             remedy = _rewriting(path, sep=mark, decimal=",") if commas else _rewriting(path, sep=mark)
-            raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}: {remedy}")
+            raise fail(f"{path}, header", "names separated by commas", f"{name} in {show_value(line)}: {remedy}")
 
 
 def _suggest_without_comments(path: Path) -> str:
     """Return the pandas call that converts a table whose first lines are comments, the last maybe its header."""
-    with opened_text(path) as file:
+    with open_text(path) as file:
         lines = [line.strip() for line in file.read(100_000).splitlines() if line.strip()]
     comments = next((i for i, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
     following = lines[comments] if comments < len(lines) else "0"
@@ -334,10 +336,10 @@ def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarr
         kind = column.type
         if pa.types.is_timestamp(kind):
             moments = np.array(column.cast(pa.timestamp(kind.unit)).to_numpy(), dtype=f"datetime64[{kind.unit}]")
-            columns[name] = in_nanoseconds(moments, f"{path}, column {name!r}")
+            columns[name] = convert_to_nanoseconds(moments, f"{path}, column {name!r}")
             continue
         if pa.types.is_date(kind):
-            columns[name] = in_nanoseconds(column.cast(pa.date32()).to_numpy(), f"{path}, column {name!r}")
+            columns[name] = convert_to_nanoseconds(column.cast(pa.date32()).to_numpy(), f"{path}, column {name!r}")
             continue
         if pa.types.is_integer(kind) and not column.null_count:
             columns[name] = numbers_of(column.to_numpy())
@@ -350,21 +352,21 @@ def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarr
 
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
-        _check_distinct(f"columns of {path}", [as_read(name) for name in columns])
-        csv.writer(file).writerow(map(in_cell, columns))
+        _check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
+        csv.writer(file).writerow(map(quote_for_cell, columns))
         # Numbers and dates need no quotes, and are joined in two thirds of the time of a writer of cells.
         cells = (map(str, _plain(column).tolist()) for column in columns.values())
         file.writelines(f"{','.join(row)}\r\n" for row in zip(*cells, strict=True))
 
 
-def as_read(name: str) -> str:
+def read_back_name(name: str) -> str:
     """Return the name of a column as it reads from a CSV file to which it was written: in one line, without margins."""
-    return from_cell(in_cell(name).strip())
+    return unquote_cell(quote_for_cell(name).strip())
 
 
 def _plain(column: np.ndarray) -> np.ndarray:
     if column.dtype.kind == "M":
-        return in_iso(column)
+        return format_dates(column)
     return column.astype(np.int64) if column.dtype == np.bool_ else column  # true is 1 in a CSV file
 
 

@@ -10,26 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.rows import Filtered, filtered
-from heliograph.filters.smoother_step import SmootherStep, StepTrace, with_nis
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
 from heliograph.model.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.masked import unmasked
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
-    "AbstractFilter", "AbstractSizedFilter", "Step", "believes", "corrects", "estimates", "given", "in_float64",
-    "measured", "predicts", "step_number",
+    "AbstractFilter", "AbstractSizedFilter", "Step", "believes", "check_input", "check_measurement",
+    "corrects", "estimates", "in_float64", "predicts", "step_number",
 ]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
@@ -120,7 +120,7 @@ class AbstractFilter(Module):
             ValueError: a state of another form than the filter's; z, u or k of another size; infinite values; an input
                 that is NaN.
         """
-        z, u = measured(self, z), given(self, u)
+        z, u = check_measurement(self, z), check_input(self, u)
         return _call_with_state(self, state, _step, z, u, step_number(self, k))
 
     def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
@@ -147,7 +147,7 @@ class AbstractFilter(Module):
         Raises:
             ValueError: what `step` refuses.
         """
-        z, u = measured(self, z), given(self, u)
+        z, u = check_measurement(self, z), check_input(self, u)
         return _call_with_state(self, state, step_with_judgement, z, u, step_number(self, k))[:3]
 
     def step_with_smoother(
@@ -158,7 +158,7 @@ class AbstractFilter(Module):
         Raises:
             ValueError: what `step` refuses; a filter that cannot be smoothed.
         """
-        z, u = measured(self, z), given(self, u)
+        z, u = check_measurement(self, z), check_input(self, u)
         return _call_with_state(self, state, _step_with_smoother, z, u, step_number(self, k))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -244,7 +244,7 @@ class HasStates(Protocol):
         """Names of the inputs."""
 
 
-def sized(claim: Claim, like: HasStates, received: int) -> Sizes:
+def make_sizes(claim: Claim, like: HasStates, received: int) -> Sizes:
     """Claim, and the sizes of a filter of the states and inputs of a plant, which receives so many numbers."""
     return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
 
@@ -257,7 +257,7 @@ def _call_with_state(filter: AbstractFilter, state: PyTree, function: Callable[.
         # A user's call says it, of the state that was given; those within its trace only fail.
         if is_traced(state) or _form(state) == _form(filter.init()):
             raise
-        raise fail("state", "one of the filter's, as its init() returns", shown(state)) from None
+        raise fail("state", "one of the filter's, as its init() returns", show_value(state)) from None
 
 
 def _form(state: PyTree) -> PyTree:
@@ -265,13 +265,13 @@ def _form(state: PyTree) -> PyTree:
     return jax.tree.structure(state), [np.shape(leaf) for leaf in jax.tree.leaves(state)]
 
 
-@compiled
+@compile_on_call
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
     after, _ = filter.correct(filter.predict(state, u, k), z, k)
     return after, filter.after_step(after, k)
 
 
-@compiled
+@compile_on_call
 def step_with_judgement(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, Estimate, Judgement, Innovation]:
@@ -285,13 +285,13 @@ def step_with_judgement(
     return after, estimate, judgement, innovation
 
 
-@compiled
+@compile_on_call
 def _step_with_smoother(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, SmootherStep]:
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
-    return after, with_nis(filter.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)
+    return after, add_nis(filter.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
@@ -300,7 +300,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(predict, given)
+    return _check_calls(predict, check_input)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
@@ -309,7 +309,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(correct, measured)
+    return _check_calls(correct, check_measurement)
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
@@ -330,7 +330,7 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 def _check_calls(
     function: Callable[P, R], check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]]
 ) -> Callable[P, R]:
-    run = cast(Callable[..., R], compiled(function))
+    run = cast(Callable[..., R], compile_on_call(function))
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
@@ -339,7 +339,7 @@ def _check_calls(
     return cast(Callable[P, R], call)
 
 
-def measured(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
+def check_measurement(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
     """Return z as a measurement of the filter's length, NaN where a component did not arrive.
 
     Empty for a filter that uses no measurements.
@@ -350,7 +350,7 @@ def measured(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
     return values if filter.received else values[:0]
 
 
-def given(filter: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
+def check_input(filter: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
     """Return u as an input of the filter's length."""
     values = _numbers(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
     if isinstance(values, np.ndarray) and not np.isfinite(values).all():
@@ -369,7 +369,7 @@ def step_number(filter: AbstractFilter, k: Step) -> Step:
         or np.shape(k)
         or np.asarray(k).dtype.kind not in "iu"
     ):
-        raise fail("step", "a whole number from 0", shown(k))
+        raise fail("step", "a whole number from 0", show_value(k))
     values = np.asarray(k)
     if values < 0:
         raise fail("step", "a whole number from 0", k)
@@ -382,15 +382,15 @@ def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " 
     """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one."""
     expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
     try:
-        numbers: Array = np.asarray(unmasked(value))
+        numbers: Array = np.asarray(fill_masked(value))
     except jax.errors.TracerArrayConversionError:
         numbers = jnp.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):  # rows of different lengths, a set of arrays, a key
-        raise fail(name, expected, shown(value)) from None
+        raise fail(name, expected, show_value(value)) from None
     # Concrete values: real numbers only, in double precision.
     if isinstance(numbers, np.ndarray):
         if numbers.dtype.kind not in "fiub":
-            raise fail(name, expected, shown(value))
+            raise fail(name, expected, show_value(value))
         numbers = numbers.astype(np.float64)
     # A scalar stands for a vector of length one.
     numbers = numbers[None] if numbers.ndim == 0 and length in (1, None) else numbers

@@ -77,7 +77,7 @@ class Judgement(NamedTuple):
         return self.reason > 0
 
 
-def in_words(reason: float, distance: float) -> str:
+def describe(reason: float, distance: float) -> str:
     """Describe in words why something is implausible, with the bound of the precision that the distance has."""
     if Reason(int(reason)) != Reason.FAR:
         return WORDS[Reason(int(reason))]
@@ -98,7 +98,7 @@ def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
     if not bad.any() or (~bad & ~np.isnan(distance)).any():
         return None
     worst = int(np.argmax(bad))
-    return in_words(reason[worst], distance[worst])
+    return describe(reason[worst], distance[worst])
 
 
 def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:

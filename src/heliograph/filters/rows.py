@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.float64 import quickly_compiled
-from heliograph.numerics.masked import unmasked
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
@@ -100,7 +100,7 @@ def over_rows(
 
 def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
     """Run a filter over rows of data, by native code where it supports the filter."""
-    mean, covariance, innovation = computed(_results, _by_xla, (filter, *data_of(filter, z, u)))
+    mean, covariance, innovation = compute_once(_results, _by_xla, (filter, *data_of(filter, z, u)))
     lost = ~np.isfinite(mean).all(axis=1)
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
@@ -145,9 +145,9 @@ def rows(
     if value is None:
         raise fail(name, f"shape ({steps}, {length})", "none")
     try:
-        values = np.asarray(unmasked(value), dtype=np.float64)
+        values = np.asarray(fill_masked(value), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise fail(name, "an array of numbers", shown(value)) from None
+        raise fail(name, "an array of numbers", show_value(value)) from None
     values = values[:, None] if values.ndim == 1 and length in (1, None) else values
     table: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
     return table

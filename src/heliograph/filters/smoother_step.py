@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelated, joined, triangular, unit_lower
-from heliograph.factors.gaussian import Backwards, Gaussian, backwards, of_columns, smoothed
+from heliograph.factors.columns import Columns, decorrelate, join_columns, triangular, unit_lower
+from heliograph.factors.gaussian import Backwards, Gaussian, backwards, of_columns, smooth
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.numerics.angle import Angles, wrapped
+from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
@@ -45,7 +45,7 @@ class Point(NamedTuple):
 
     def through(self, rows: jax.Array) -> jax.Array:
         """M L^-1 times rows (N, ...)."""
-        return self.link @ decorrelated(unit_lower(self.lower), rows)
+        return self.link @ decorrelate(unit_lower(self.lower), rows)
 
 
 class SmootherStep(Module):
@@ -85,7 +85,7 @@ class SmootherStep(Module):
 
     def back(self, later: Gaussian) -> Gaussian:
         """Law of the filter's state before the step, from that after the step, both given the same later data."""
-        return smoothed(self.before, later)
+        return smooth(self.before, later)
 
     def start(self) -> Point:
         """Return the state after this step as a point to be carried ahead."""
@@ -99,13 +99,15 @@ class SmootherStep(Module):
         """
         before = self.before
         noise = Columns(point.through(before.left.root), before.left.variances)
-        after = Point(point.mean, point.through(before.gain), before.lower, triangular(joined(point.noise, noise)))
+        after = Point(
+            point.mean, point.through(before.gain), before.lower, triangular(join_columns(point.noise, noise))
+        )
         return after._replace(mean=point.mean + after.through((self.after.mean - before.ahead)[:, None])[:, 0])
 
     def reached(self, point: Point) -> Gaussian:
         """Law of an earlier state that was carried to this step."""
         now = Columns(point.through(self.after.root), self.after.variances)
-        return of_columns(point.mean, joined(now, point.noise))
+        return of_columns(point.mean, join_columns(now, point.noise))
 
     def with_data(self, mean_before: jax.Array, mean_prior: jax.Array, mean_after: jax.Array) -> Self:
         """Return the same step with other data of the same arrivals: other means."""
@@ -118,7 +120,7 @@ class SmootherStep(Module):
         if self.projection is not None:
             mean, columns = self.projection @ mean, columns.through(self.projection)
         mean = mean if self.shift is None else mean + self.shift
-        return Estimate(wrapped(mean, self.angles), columns.covariance, self.claim)
+        return Estimate(wrap_angles(mean, self.angles), columns.covariance, self.claim)
 
 
 class Believed(Protocol):
@@ -167,7 +169,7 @@ def smoother_step_of(
     )
 
 
-def with_nis(step: SmootherStep, innovation: Innovation) -> SmootherStep:
+def add_nis(step: SmootherStep, innovation: Innovation) -> SmootherStep:
     """Return the step with the normalised innovation squared, e' S^-1 e."""
     nis, count = innovation_distance(innovation)
     return replace(step, nis=nis, received=count)

@@ -71,8 +71,8 @@ class AllReports(AbstractInformedFusion):
     def use(self, state: Knowledge, happened: Happened, means: Means) -> tuple[Knowledge, Fused]:
         """Move the plant and all errors, then use the reports; one that is NaN did not arrive."""
         nodes, n = means.shape
-        after, _ = receive_reports(moved(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
-        return after, fused_estimate(after, n)
+        after, _ = receive_reports(propagate_errors(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
+        return after, estimate_state(after, n)
 
 
 def faithful(nodes: int, n: int) -> Links:
@@ -94,7 +94,7 @@ def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowle
     return Knowledge(mean, covariance, past, jnp.zeros_like(covariance) if quantized else None)
 
 
-def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
+def propagate_errors(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
     """Predict x- = A x + b + w and e+ = T e + G x + g + B w - K nu together; then each node sends x- - e+."""
     motion, step, noise, _ = happened
     nodes, n, _ = step.transition.shape
@@ -158,7 +158,7 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     return Knowledge(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
 
 
-def fused_estimate(state: Knowledge, n: int) -> Fused:
+def estimate_state(state: Knowledge, n: int) -> Fused:
     """Estimate of x, with the covariance of its error or a bound on it."""
     covariance = state.covariance[:n, :n]
     return state.mean[:n], covariance if state.spill is None else _sum(covariance, state.spill[:n, :n])

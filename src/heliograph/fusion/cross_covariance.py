@@ -90,7 +90,7 @@ def error_step(filters: LinearStep, motion: Motion, observation: Observation) ->
     )
 
 
-def moved_state(
+def propagate_state(
     mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"], motion: Motion
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """E x and Cov x after the step."""
@@ -101,7 +101,7 @@ def moved_state(
 def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Errors:
     """Propagate all pairs: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', plus the terms of a wrong model."""
     nodes, n = errors.bias.shape
-    mean, covariance = moved_state(errors.mean, errors.covariance, motion)
+    mean, covariance = propagate_state(errors.mean, errors.covariance, motion)
     bias = _times(step.transition, errors.bias) + step.of_state @ errors.mean + step.drift
     # Cov(e+, x+): the errors depend on x where a filter's model is wrong.
     carried = step.transition @ errors.with_state  # Cov(T e, x)
@@ -179,7 +179,7 @@ def joint_of(shared: Array, independent: Array) -> Float[Array, "node n node n"]
     return (flat @ flat.T).reshape(count, n, count, n) + apart
 
 
-def weighted_sources(weights: Array, shared: Array, independent: Array) -> tuple[Array, Array]:
+def weigh_sources(weights: Array, shared: Array, independent: Array) -> tuple[Array, Array]:
     """Sources (n, sources) of a weighted sum of the errors, and the covariance (n, n) of its independent part."""
     jnp = library(weights, shared, independent)
     return jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, independent, weights)

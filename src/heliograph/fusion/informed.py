@@ -11,15 +11,15 @@ from heliograph.fusion.mesh.gains import Believed, Weights
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import (
     SHORT,
-    arrived_scalar_weights,
-    arrived_weights,
-    arrived_weights_by_component,
     component_weights,
     diagonal_weights,
     matrix_weights,
     scalar_weights,
-    weighted,
-    weighted_by_component,
+    solve_arrived_scalar_weights,
+    solve_arrived_weights,
+    solve_arrived_weights_by_component,
+    weigh_covariance,
+    weigh_covariance_by_component,
 )
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
@@ -102,7 +102,7 @@ class AbstractWeights(AbstractInformedFusion):
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
         chosen = self.arrived(believed.joint, believed.present)
-        return Weights(jnp.eye(len(chosen)), jnp.swapaxes(chosen, 0, 1), weighted(chosen, believed.joint))
+        return Weights(jnp.eye(len(chosen)), jnp.swapaxes(chosen, 0, 1), weigh_covariance(chosen, believed.joint))
 
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
         """Weight the present estimates."""
@@ -110,14 +110,14 @@ class AbstractWeights(AbstractInformedFusion):
         unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
             unbiased = jnp.concatenate([unbiased, errors.mean[None]])
-            joint = with_mean(errors)
+            joint = append_mean_error(errors)
         chosen = self.weights(joint)
         # W sums to I: of differences, since digits that W lacks would count against the size of the means.
         mean = unbiased[0] + jnp.einsum("aib,ib->a", chosen, unbiased - unbiased[0])
-        return state, (mean, weighted(chosen, joint))
+        return state, (mean, weigh_covariance(chosen, joint))
 
 
-def with_mean(errors: Errors) -> Joint:
+def append_mean_error(errors: Errors) -> Joint:
     """Joint covariance of the errors and of x - E x, the error of the plant's mean."""
     column = errors.with_state[:, :, None, :]
     last = jnp.concatenate([jnp.moveaxis(errors.with_state, 2, 0), errors.covariance[:, None, :]], axis=1)
@@ -145,7 +145,7 @@ class MatrixWeights(AbstractWeights):
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Weights of those that are present."""
-        return arrived_weights(joint, present)
+        return solve_arrived_weights(joint, present)
 
 
 class DiagonalWeights(AbstractWeights):
@@ -167,7 +167,7 @@ class DiagonalWeights(AbstractWeights):
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Weights of those that are present."""
-        return arrived_weights_by_component(joint, present)
+        return solve_arrived_weights_by_component(joint, present)
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
@@ -175,7 +175,7 @@ class DiagonalWeights(AbstractWeights):
             return super().neighbour_weights(believed)
         chosen = component_weights(believed.joint, believed.present)
         identity = jnp.eye(chosen.shape[1])
-        return Weights(identity, chosen, weighted_by_component(chosen, believed.joint))
+        return Weights(identity, chosen, weigh_covariance_by_component(chosen, believed.joint))
 
 
 class ScalarWeights(AbstractWeights):
@@ -199,4 +199,4 @@ class ScalarWeights(AbstractWeights):
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Weights of those that are present."""
-        return arrived_scalar_weights(joint, present)
+        return solve_arrived_scalar_weights(joint, present)

@@ -184,7 +184,7 @@ def intersect_inversely(
     covariance, common = fused(w)
     # The two factors sum to the fused information: of differences, as above.
     mean = a + covariance @ ((q_information - (1 - w) * common) @ (b - a))
-    return with_known(mean, symmetric(covariance), jnp.stack([a, b]), both)
+    return replace_known(mean, symmetric(covariance), jnp.stack([a, b]), both)
 
 
 @runs_last_of(jnp.shape)
@@ -214,7 +214,7 @@ def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
     return inverse(a + diagonal(none * least))
 
 
-def with_known(
+def replace_known(
     mean: Float[jax.Array, "n"],
     covariance: Float[jax.Array, "n n"],
     means: Float[jax.Array, "count n"],
@@ -237,7 +237,7 @@ Shared = tuple[Float[jax.Array, " degree"], Float[jax.Array, "n n"]]  # shares p
 def equal_shares(believed: Believed) -> Shared:
     """Return one share for each estimate that arrived."""
     present = believed.present.astype(believed.traces.dtype)
-    return intersected(believed, present / present.sum())
+    return intersect_shares(believed, present / present.sum())
 
 
 def trace_shares(believed: Believed, power: float, improvements: int) -> Shared:
@@ -252,19 +252,19 @@ def trace_shares(believed: Believed, power: float, improvements: int) -> Shared:
     least = jnp.min(jnp.where(believed.present, believed.traces, jnp.inf))
     powers = jnp.where(believed.present, (least / believed.traces) ** power, 0.0)
     equal = equal_shares(believed)
-    best = _smaller_trace(intersected(believed, powers / powers.sum()), equal)
+    best = _smaller_trace(intersect_shares(believed, powers / powers.sum()), equal)
     # A share of zero stays zero, so start inside.
     shares = (best[0] + equal[0]) / 2
     for _ in range(improvements):
-        covariance = intersected(believed, shares)[1]
+        covariance = intersect_shares(believed, shares)[1]
         push = jnp.einsum("ab,jbc,ca->j", covariance, believed.information, covariance) / jnp.trace(covariance)
         shares = shares * jnp.sqrt(jnp.maximum(push, 0.0))
         shares = shares / shares.sum()
-        best = _smaller_trace(best, intersected(believed, shares))
+        best = _smaller_trace(best, intersect_shares(believed, shares))
     return best
 
 
-def intersected(believed: Believed, shares: Float[jax.Array, " degree"]) -> Shared:
+def intersect_shares(believed: Believed, shares: Float[jax.Array, " degree"]) -> Shared:
     """Return the shares with the covariance (sum_j pi_j P_j^-1)^-1 of their intersection."""
     return shares, inverse(jnp.einsum("j,jab->ab", shares, believed.information))
 

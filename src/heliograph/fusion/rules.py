@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.fusion.intersection import (
     equal_shares,
     intersect,
     intersect_inversely,
     intersection_weights,
     inverses,
+    replace_known,
     trace_optimal_weights,
     trace_shares,
-    with_known,
 )
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
 from heliograph.fusion.mesh.graph import Graph, Neighbours, neighbours_of
@@ -26,8 +26,17 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.model.plant import AnyPlant, angles_among
-from heliograph.numerics.angle import nearest, wrapped
-from heliograph.numerics.check import array, check_count, fail, instance, items, of_each, probabilities, scalar
+from heliograph.numerics.angle import nearest, wrap_angles
+from heliograph.numerics.check import (
+    array,
+    check_count,
+    fail,
+    instance,
+    items,
+    probabilities,
+    scalar,
+    spread_over_names,
+)
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -115,10 +124,10 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
     # The rule, over all leading axes; the claim from those of the inputs.
     covariances = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)
     mean, covariance = _combine_all(rule, means, covariances)
-    return Estimate(wrapped(np.asarray(mean), which), covariance, rule.claim([e.claim for e in estimates]))
+    return Estimate(wrap_angles(np.asarray(mean), which), covariance, rule.claim([e.claim for e in estimates]))
 
 
-@compiled
+@compile_on_call
 def _combine_all(
     rule: AbstractFusion, means: Float[Array, "*batch count n"], covariances: Float[Array, "*batch count n n"]
 ) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n n"]]:
@@ -143,7 +152,7 @@ class AbstractIntersection(AbstractFusion):
         """Find the weights and intersect."""
         information = inverses(covariances)
         mean, covariance = intersect(means, information, self.weights_of(covariances, information))
-        return with_known(mean, covariance, means, covariances)
+        return replace_known(mean, covariance, means, covariances)
 
 
 class CovarianceIntersection(AbstractIntersection):
@@ -369,7 +378,7 @@ class Fusion(Module):
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
         """Report links of these nodes."""
-        return of_each("report links", ReportLink() if self.uplink is None else self.uplink, nodes)
+        return spread_over_names("report links", ReportLink() if self.uplink is None else self.uplink, nodes)
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
         """Quantizers of these nodes' reports, which do not vary over time; an empty list without."""
@@ -392,4 +401,4 @@ class Fusion(Module):
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
-        return [] if self.quantizer is None else of_each("quantizers", self.quantizer, nodes)
+        return [] if self.quantizer is None else spread_over_names("quantizers", self.quantizer, nodes)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.rules import AbstractIntersection, Covariances, Fused, Means
-from heliograph.fusion.weights import matrix_weights, weighted
+from heliograph.fusion.weights import matrix_weights, weigh_covariance
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -83,5 +83,5 @@ class SplitIntersection(AbstractIntersection):
         weights = matrix_weights(joint)
         # W x and W P(w) W'; NaN if some P^b_i is no covariance.
         sound = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))
-        mean, covariance = jnp.einsum("aib,ib->a", weights, means), weighted(weights, joint)
+        mean, covariance = jnp.einsum("aib,ib->a", weights, means), weigh_covariance(weights, joint)
         return mean, jnp.where(sound, covariance, jnp.nan)

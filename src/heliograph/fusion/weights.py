@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.fusion.intersection import inverse
-from heliograph.numerics.check import array, fail, probabilities, shown
+from heliograph.numerics.check import array, fail, probabilities, show_value
 from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import add, diagonal_of, identity, psd_solve, rounding, solve, symmetric, symmetrize
 from heliograph.numerics.over_runs import runs_last
@@ -31,14 +31,14 @@ def _check_joint(weights: Weights) -> Weights:
     def call(joint: Array, *rest: Array) -> Any:
         shape = np.shape(joint) if isinstance(joint, np.ndarray | jax.Array) else ()
         if len(shape) != 4 or shape[:2] != shape[2:]:
-            raise fail("joint covariance", "an array of shape (nodes, n, nodes, n)", shape or shown(joint))
+            raise fail("joint covariance", "an array of shape (nodes, n, nodes, n)", shape or show_value(joint))
         return weights(joint, *rest)
 
     return call
 
 
 @_check_joint
-@compiled
+@compile_on_call
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute matrix weights: W_i with sum_i W_i = I that minimise W P W', for `joint` P (node, n, node, n).
 
@@ -65,8 +65,8 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
 
-@compiled
-def factored_weights(
+@compile_on_call
+def solve_factored_weights(
     shared: Float[Array, "node n sources"], independent: Float[Array, "node n n"]
 ) -> Float[jax.Array, "n node n"]:
     """Compute matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
@@ -92,7 +92,7 @@ def factored_weights(
 
 
 @_check_joint
-@compiled
+@compile_on_call
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n).
 
@@ -103,7 +103,7 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
 
 
 @_check_joint
-@compiled
+@compile_on_call
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute scalar weights: one number per node, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n).
 
@@ -128,7 +128,9 @@ def _weigh_by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) ->
     return jnp.einsum("i,ab->aib", weigh(traces.reshape(nodes, 1, nodes, 1))[0, :, 0], jnp.eye(n))
 
 
-def weighted(weights: Float[Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:
+def weigh_covariance(
+    weights: Float[Array, "n node n"], joint: Float[Array, "node n node n"]
+) -> Float[jax.Array, "n n"]:
     """Return the covariance W P W' of the weighted sum of the errors."""
     return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))
 
@@ -222,7 +224,7 @@ def _levels_and_weights(levels: ArrayLike, weights: ArrayLike) -> tuple[Float[np
     return gamma, probabilities("fusion weights", weights, len(gamma))
 
 
-def arrived_weights(
+def solve_arrived_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """Weights C (n, degree, n), sum_j C_j = I, of least C P C' for those that are `present`, zero for the others.
@@ -246,14 +248,14 @@ def arrived_weights(
     return unit[:, None, None] * weights / unit
 
 
-def arrived_weights_by_component(
+def solve_arrived_weights_by_component(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """Diagonal weights of those that are present: the best for each component of the state by itself."""
     degree, n = joint.shape[:2]
     if degree <= SHORT:
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
-    return _weigh_components(partial(arrived_weights, present=present), joint)
+    return _weigh_components(partial(solve_arrived_weights, present=present), joint)
 
 
 @runs_last
@@ -262,7 +264,7 @@ def component_weights(
 ) -> Float[jax.Array, "degree n *#runs"]:
     """Diagonals c_i of the weights of each component by itself.
 
-    Of one component, c = U^-1 1 / 1' U^-1 1 over those that are present, by the factor of U, as `arrived_weights`.
+    Of one component, c = U^-1 1 / 1' U^-1 1 over those that are present, by the factor of U.
     """
     degree, n = joint.shape[:2]
     there = present.astype(joint.dtype)[:, None]
@@ -277,7 +279,7 @@ def component_weights(
 
 
 @runs_last
-def weighted_by_component(
+def weigh_covariance_by_component(
     weights: Float[jax.Array, "degree n *#runs"], joint: Float[jax.Array, "degree n degree n *#runs"]
 ) -> Float[jax.Array, "n n *#runs"]:
     """Covariance C P C' of diagonal weights, a sum over senders at a time."""
@@ -285,8 +287,8 @@ def weighted_by_component(
     return symmetric(add([w[:, None] * s for w, s in zip(weights, sums, strict=True)]))
 
 
-def arrived_scalar_weights(
+def solve_arrived_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """One number for each of those that are present, of least trace."""
-    return _weigh_by_trace(partial(arrived_weights, present=present), joint)
+    return _weigh_by_trace(partial(solve_arrived_weights, present=present), joint)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.system import GrowthSystem
 from heliograph.model.estimate import Estimate, Innovation
@@ -125,5 +125,5 @@ def h_infinity_filter(
         gains=OverTime(design.gains),
         expected_gain=OverTime(expected),
         initial_mean=mean,
-        **sized("none", start, system.received),
+        **make_sizes("none", start, system.received),
     )

@@ -10,9 +10,9 @@ import scipy
 from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
-from heliograph.numerics.check import array, check_seed, fail, flag, scalar, shown_error
+from heliograph.numerics.check import array, check_seed, fail, flag, scalar, show_error
 from heliograph.numerics.check import function as check_callable
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -176,7 +176,7 @@ def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
         with jax.enable_x64(True):
             axes = len(jax.eval_shape(lambda x: jnp.atleast_1d(function(x)), point).shape)
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-        raise fail("function", expected, shown_error(error)) from error
+        raise fail("function", expected, show_error(error)) from error
     if axes != 1:
         raise fail("function", expected, f"{axes} axes")
 
@@ -224,7 +224,7 @@ class _Tools:
 
 def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
     """Compile a function of points for as many at a time as a climb tries, so that it is one program."""
-    compute = compiled(function)
+    compute = compile_in_float64(function)
 
     def call(points: np.ndarray) -> np.ndarray:
         size = CLIMBERS * TRIALS

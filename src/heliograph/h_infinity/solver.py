@@ -17,7 +17,7 @@ from heliograph.h_infinity.step import (
     independent_parts,
     linear_forms,
 )
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.extras import how_to_install
 from heliograph.numerics.types import Float
 
@@ -46,7 +46,7 @@ def check_choice(name: str, value: str, choices: Any) -> None:
     """Raise ValueError unless `value` is among the choices of an alias of a Literal."""
     known = get_args(choices.__value__)
     if not isinstance(value, str) or value not in known:
-        raise fail(name, f"one of {', '.join(known)}", shown(value))
+        raise fail(name, f"one of {', '.join(known)}", show_value(value))
 
 
 def run_solver(problem: "Problem", solver: Solver) -> str:

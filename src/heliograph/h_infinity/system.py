@@ -11,7 +11,7 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, rank, scalar, standard_deviations
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, fold
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps, fold
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.superposed import Superposed
 
@@ -57,7 +57,7 @@ class DisturbedGain(NamedTuple):
         return factors
 
 
-def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
+def disturb_gain(channel: AbstractRandomAffine) -> DisturbedGain:
     """Joint moments of a channel's gain and of the gains of its noise sources, in the order of the signal's way.
 
     A noise of covariance R counts as rank(R) sources of unit size, and its mean as their disturbance: a mean that they
@@ -68,7 +68,7 @@ def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
         Series: lambda _, parts: reduce(_compose, parts),
         Mixture: lambda mixture, parts: _disturb_mixture(mixture, parts),
         Stack: lambda stack, parts: _stack(parts, stack.inputs),
-        Superposed: lambda channel, _: disturbed_gain(channel.as_stack),
+        Superposed: lambda channel, _: disturb_gain(channel.as_stack),
     }, "channel", "hops, series, mixtures, stacks and sums of them")  # fmt: skip
     return gain
 
@@ -274,17 +274,17 @@ def _repeat_over(
 
 
 def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
-    as_maps("channel", [first(channel)])
+    check_maps("channel", [first(channel)])
     if first(channel).remembers:
         expected = (
             "links that forget: its level is proved step by step, with gains that are independent of the steps before"
         )
         raise fail("channel of an H-infinity design", expected, "one that remembers")
     if not isinstance(channel, OverTime):
-        return (disturbed_gain(channel),) * steps
+        return (disturb_gain(channel),) * steps
     if channel.steps < steps:
         raise fail("channel over time", f"at least {steps} steps", channel.steps)
-    links = tuple(disturbed_gain(c) for c in unstack(channel)[:steps])
+    links = tuple(disturb_gain(c) for c in unstack(channel)[:steps])
     if len({(link.mean.shape, link.inputs) for link in links}) != 1:
         raise fail("channel over time", "the same noise sources at each step", [link.disturbances for link in links])
     return links

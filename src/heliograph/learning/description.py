@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.learning.likelihood.transforms import to_line
+from heliograph.learning.likelihood.transforms import map_to_line
 from heliograph.learning.parameters import Parameter, Parameters, plain_number
 from heliograph.numerics.check import (
     COVARIANCE,
@@ -25,10 +25,10 @@ from heliograph.numerics.check import (
     fail,
     function,
     instance,
-    marked,
+    mark_checked,
     rank,
-    shown,
-    shown_error,
+    show_error,
+    show_value,
 )
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -65,9 +65,9 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
         ValueError: a start that is no number, or an unknown kind.
     """
     if kind is not None and not (isinstance(kind, str) and kind in get_args(Kind)):
-        raise fail("kind of a free number", f"one of {', '.join(get_args(Kind))}", shown(kind))
+        raise fail("kind of a free number", f"one of {', '.join(get_args(Kind))}", show_value(kind))
     if name is not None and (not isinstance(name, str) or not name):
-        raise fail("name of a free number", "a text", shown(name))
+        raise fail("name of a free number", "a text", show_value(name))
     what = "free number" if name is None else name
     value = array(f"start of {what}", start, (None,) * rank(f"start of {what}", start))
     reader = _reader.get()
@@ -127,9 +127,9 @@ class Asking:
                     raise fail(
                         f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
                     )
-                return marked(start, mark.report)
+                return mark_checked(start, mark.report)
         self.marks.append(_Mark(start, name, kind))
-        return marked(start, self.marks[-1].report)
+        return mark_checked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
         """Collect all marks as parameters; one without a name is called after its place."""
@@ -140,7 +140,7 @@ class Asking:
             taken.add(name)
             domain = REAL if mark.domain is None else mark.domain
             parameter = Parameter(name, mark.start, domain)
-            to_line(name, domain, mark.start)
+            map_to_line(name, domain, mark.start)
             results.append(parameter)
         return Parameters(tuple(results))
 
@@ -191,10 +191,10 @@ class Description:
         """
         with reading(Given(self.parameters, self.named, values)), jax.enable_x64(True):
             try:
-                return checked(self.build())
+                return check_network(self.build())
             except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
                 expected = "free numbers that only jax.numpy computes with, so that derivatives pass"
-                got = f"one that is read: {shown_error(error)}"
+                got = f"one that is read: {show_error(error)}"
                 raise fail("network to be learned", expected, got) from error
 
     @cached_property
@@ -226,13 +226,13 @@ def describe(network: Build) -> Description:
         raise fail("network to be learned", "a function without arguments", str(error)) from None
     asking = Asking()
     with reading(asking), jax.enable_x64(True):
-        checked(network())
+        check_network(network())
     if not asking.marks:
         raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
     parameters = asking.parameters()
     return Description(network, parameters, tuple(mark.given is not None for mark in asking.marks))
 
 
-def checked(network: object) -> Network:
+def check_network(network: object) -> Network:
     """Check that a function returned a network, and return it."""
     return instance("network to be learned", network, Network, "a function that returns a Network")

@@ -8,9 +8,9 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.learning.description import Build, Description, describe
-from heliograph.learning.identification import Identifiability, identified_by
+from heliograph.learning.identification import Identifiability, identify_by_recording
 from heliograph.learning.intervals import LEVEL, METHODS, Method
-from heliograph.learning.likelihood.data import gathered
+from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.maximise import Maximum
 from heliograph.learning.likelihood.objective import Form, objectives
 from heliograph.learning.likelihood.search import AWAY, SPREAD, Search
@@ -18,7 +18,7 @@ from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
-from heliograph.numerics.check import check_count, check_progress, check_seed, fail, scalar, shown
+from heliograph.numerics.check import check_count, check_progress, check_seed, fail, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
@@ -99,10 +99,10 @@ class Fit:
             ValueError: an unknown method, a level that is not between 0.5 and 1, or a form that was not fitted.
         """
         if method not in METHODS:
-            raise fail("method of intervals", f"one of {', '.join(METHODS)}", shown(method))
+            raise fail("method of intervals", f"one of {', '.join(METHODS)}", show_value(method))
         known = {solution.form: solution for solution in self.solutions}
         if form is not None and form not in known:
-            raise fail("form", f"one of {', '.join(known)}", shown(form))
+            raise fail("form", f"one of {', '.join(known)}", show_value(form))
         probability = scalar("level of intervals", level, 0.5, 1.0)
         if probability in (0.5, 1.0):
             raise fail("level of intervals", "a probability between 0.5 and 1", level)
@@ -188,11 +188,11 @@ def fit(
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
         return replace(fit_sender(description, recording, inputs, starts, check_seed("seed", seed)), delays=delays)
-    data = gathered(description.start, recording, inputs, description.parameters.size, truth)
+    data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
     surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
     points = _starts(surfaces[0], starts, check_seed("seed", seed))
-    identified = identified_by(surfaces[-1], points[0], seed)
+    identified = identify_by_recording(surfaces[-1], points[0], seed)
     solutions, ends, stopped = _search_forms(surfaces, points, seed, identified.ridges, progress or (lambda line: None))
     try:
         identified = identified.at(solutions[-1])

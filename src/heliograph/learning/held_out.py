@@ -100,7 +100,9 @@ def changes(
             )
             received = ~np.all(np.isnan(single.white), axis=1)
             gain = (
-                compared((other.log_likelihood - single.log_likelihood)[received]) if received.sum() >= LAGS else None
+                compare_mean((other.log_likelihood - single.log_likelihood)[received])
+                if received.sum() >= LAGS
+                else None
             )
             results.append(Change(name, key, single, other, gain))
     return results
@@ -158,10 +160,10 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
     received = ~np.all(np.isnan(a.pit), axis=1)
     if received.sum() < 10:
         raise fail("recording", "at least 10 steps with a measurement", int(received.sum()))
-    return compared((a.log_likelihood - b.log_likelihood)[received])
+    return compare_mean((a.log_likelihood - b.log_likelihood)[received])
 
 
-def compared(differences: Float[np.ndarray, " steps"]) -> Comparison:
+def compare_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
     """Test a mean difference (steps,) against zero."""
     mean, error = mean_and_error(differences)
     z = mean / error if error > 0 else 0.0

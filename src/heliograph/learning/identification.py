@@ -13,7 +13,7 @@ from heliograph.learning.likelihood.data import Data
 from heliograph.learning.likelihood.objective import Objective, joint_world, objectives
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
-from heliograph.learning.unidentified import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
+from heliograph.learning.unidentified import WEAK, Confounded, Rank, find_confounded, product_text, rank_of, sum_text
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import quickly_compiled
@@ -94,7 +94,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     return _judge_identifiability(description.parameters, points, ranks)
 
 
-def identified_by(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
+def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
     """Identifiability by a recording, at three points around a start."""
     points = _points(start, seed)
     late = surface.evaluations(np.stack(points)).late
@@ -113,7 +113,7 @@ def _points(start: np.ndarray, seed: int) -> list[np.ndarray]:
 
 
 def _judge_identifiability(parameters: Parameters, points: list[np.ndarray], ranks: list[Rank]) -> Identifiability:
-    groups = tuple(confounded(parameters, points, ranks))
+    groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
     identifiability = Identifiability(parameters, groups, ridges, weakest, ())

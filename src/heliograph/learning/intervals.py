@@ -40,7 +40,7 @@ def waves(steps: int) -> int:
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
 
-def told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
+def find_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
     """Numbers (k,) whose information lies in a few of the nu stretches of the data.
 
     (sum_b V_b)^2 / sum_b V_b^2, of V_b in stretch b, is the number of stretches if all tell the same, and 1 if one

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.learning.likelihood.transforms import from_line, size, slope, to_line, unlink_slope
+from heliograph.learning.likelihood.transforms import map_from_line, map_to_line, size, slope, unlink_slope
 from heliograph.numerics.check import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float
@@ -53,7 +53,7 @@ class Parameter:
             return np.asarray(jax.jacfwd(self._read_at)(jnp.asarray(x)))
 
     def _read_at(self, x: Array) -> Array:
-        return self.read(from_line(self.domain, self.start.shape, x))
+        return self.read(map_from_line(self.domain, self.start.shape, x))
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
@@ -92,7 +92,9 @@ class Parameters:
     @property
     def start(self) -> Float[np.ndarray, " p"]:
         """The starts on the line."""
-        return np.concatenate([to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every])
+        return np.concatenate(
+            [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
+        )
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -118,7 +120,7 @@ class Parameters:
         """Numbers at a point of the line, by name."""
         ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
         return {
-            parameter.name: from_line(parameter.domain, parameter.start.shape, x[a:b])
+            parameter.name: map_from_line(parameter.domain, parameter.start.shape, x[a:b])
             for parameter, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
         }
 

@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
 from heliograph.learning.description import Description
 from heliograph.learning.intervals import LEVEL, fall
-from heliograph.learning.likelihood.data import gathered
+from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.losses.delays import DelaysByNode
 from heliograph.learning.solution import Row
 from heliograph.numerics.check import fail
@@ -117,7 +117,7 @@ def fit_sender(
             "free numbers of a sender that decides", "numbers with limits of their own", "a simplex or covariance"
         )
     # The likelihood of all recordings at a point of the line.
-    data = gathered(description.start, recording, inputs, parameters.size)
+    data = gather_data(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
         filter = filter_at(description.at_point(x))

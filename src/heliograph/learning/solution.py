@@ -13,11 +13,11 @@ from heliograph.learning.intervals import (
     Scores,
     block_sums,
     fall,
+    find_told_by_few,
     long_run,
     of_model,
     quantile,
     sandwich,
-    told_by_few,
 )
 from heliograph.learning.likelihood.objective import Form
 from heliograph.learning.likelihood.search import FURTHER, Top
@@ -63,7 +63,7 @@ class Row(NamedTuple):
         """Interval in words, with two digits of its own width: "0.12 to 0.31", "below 0.3", "not identified"."""
         if not self.identified:
             return "not identified"
-        low, high = (rounded(end, self.high - self.low) for end in (self.low, self.high))
+        low, high = (round_to_width(end, self.high - self.low) for end in (self.low, self.high))
         if self.boundary:
             return f"below {high}" if self.high > self.estimate else f"above {low}"
         return f"{low} to {high}"
@@ -71,10 +71,10 @@ class Row(NamedTuple):
     @property
     def value(self) -> str:
         """Estimate in words, with two digits of the interval's width."""
-        return rounded(self.estimate, self.high - self.low)
+        return round_to_width(self.estimate, self.high - self.low)
 
 
-def rounded(value: float, width: float) -> str:
+def round_to_width(value: float, width: float) -> str:
     """Write a number to two digits of a width, at most eight of its own; to four of its own where there is no width.
 
     An end that is far smaller than the width keeps two digits of its own.
@@ -178,7 +178,7 @@ class Solution:
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
-            few[places] = told_by_few(self.surface.information_by_row(self.top.x, places))
+            few[places] = find_told_by_few(self.surface.information_by_row(self.top.x, places))
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:

@@ -10,13 +10,13 @@ import scipy
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
 from heliograph.learning.intervals import long_run_deviation
-from heliograph.learning.likelihood.predictive_density import NODES, Parts, expected_signals, of_signals
+from heliograph.learning.likelihood.predictive_density import NODES, Parts, expect_signals, score_signals
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import readable, same
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.erasure import arrived
+from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -138,15 +138,15 @@ def _ratios(
     u = np.zeros((count, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     said = []
     for channel in (true, other):
-        received = arrived(channel)
+        received = condition_on_arrival(channel)
         filter, parts = cubature_filter(network.plant, node.sensor, received), Parts.of(received, nodes)
         y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in _side_by_side(filter, z, u))
-        said.append(of_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
+        said.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
     return np.asarray(said[0] - said[1])
 
 
-@compiled
+@compile_in_float64
 def _side_by_side(
     filter: GaussianFilter, z: Float[Array, "runs steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return jax.vmap(lambda single: expected_signals(filter, single, u))(jnp.asarray(z))
+    return jax.vmap(lambda single: expect_signals(filter, single, u))(jnp.asarray(z))

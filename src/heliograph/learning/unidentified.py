@@ -54,7 +54,9 @@ def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
     return Rank(vectors[:, none], vectors[:, ~none], unit, weakest)
 
 
-def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]) -> list[Confounded]:
+def find_confounded(
+    parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]
+) -> list[Confounded]:
     """Groups of coordinates that the data do not separate at any of the points, with what they identify."""
     count = min(rank.flat.shape[1] for rank in ranks)
     if not count:

@@ -22,14 +22,14 @@ from heliograph.numerics.types import Array, Float, Int
 Maps = Callable[[Any], Any]  # of several symmetric matrices at once, along a first axis
 
 
-def mixed(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
+def mix_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
     """Return Y_j = sum_i T_ij X_i."""
     *axes, modes, n, _ = moments.shape
     sums = chain[..., :modes, :].swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
     return sums.reshape(*axes, -1, n, n)
 
 
-def moved(maps: Float[Array, "..."], moments: Float[Array, "..."], added: Array | float) -> Any:
+def propagate(maps: Float[Array, "..."], moments: Float[Array, "..."], added: Array | float) -> Any:
     """Return F X F' + S, of each mode."""
     return maps @ moments @ maps.swapaxes(-1, -2) + added
 
@@ -45,7 +45,7 @@ class JumpSystem(NamedTuple):
         """Propagate X from before the first step: X after each step."""
         steps = []
         for chain, maps, added in zip(*self, strict=True):
-            moments = moved(maps, mixed(chain, moments), added)
+            moments = propagate(maps, mix_modes(chain, moments), added)
             steps.append(moments)
         return steps
 
@@ -57,7 +57,7 @@ class JumpSystem(NamedTuple):
 
     def operator(self) -> Float[np.ndarray, "e e"]:
         """Return the matrix of X -> X over all steps, without noise, on the entries of upper triangles."""
-        return np.asarray(on_entries(self._replace(added=0.0 * self.added)._around, self.shape))
+        return np.asarray(make_entry_matrix(self._replace(added=0.0 * self.added)._around, self.shape))
 
     def radius(self) -> float:
         """Return the spectral radius of the operator: below 1, X stays bounded over steps that repeat for ever."""
@@ -65,7 +65,7 @@ class JumpSystem(NamedTuple):
 
     def steady(self) -> Float[np.ndarray, "time M n n"]:
         """Solve for X after each of steps that repeat for ever, of a radius below 1."""
-        start = fixed_point(self._replace(added=0.0 * self.added)._around, self._around(np.zeros(self.shape)))
+        start = solve_fixed_point(self._replace(added=0.0 * self.added)._around, self._around(np.zeros(self.shape)))
         after = np.array(self.after(start))
         return np.asarray(after + after.swapaxes(-1, -2)) / 2
 
@@ -80,12 +80,12 @@ class JumpSystem(NamedTuple):
             ahead = []
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
                 ahead.append(weight + behind)
-                behind = mixed(chain.T, moved(maps.swapaxes(-1, -2), ahead[-1], 0.0))
+                behind = mix_modes(chain.T, propagate(maps.swapaxes(-1, -2), ahead[-1], 0.0))
             return behind[..., : shape[0], :, :], ahead[::-1]
 
         behind = np.zeros(shape)
         if forever:
-            behind = fixed_point(lambda later: back(later, 0.0 * weights)[0], back(behind, weights)[0])
+            behind = solve_fixed_point(lambda later: back(later, 0.0 * weights)[0], back(behind, weights)[0])
         ahead = np.array([np.broadcast_to(value, self.maps.shape[1:]) for value in back(behind, weights)[1]])
         return np.asarray(ahead + ahead.swapaxes(-1, -2)) / 2
 
@@ -95,21 +95,21 @@ class JumpSystem(NamedTuple):
         return np.asarray(last if moments.shape[-3] == last.shape[-3] else last.sum(axis=-3, keepdims=True))
 
 
-def on_entries(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
+def make_entry_matrix(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
     """Return the matrix of a linear map of symmetric matrices (..., n, n) on the entries of their upper triangles."""
     _, where, basis = _triangles(shape)
     matrix: Array = linear(basis)[:, *where].T
     return matrix
 
 
-def fixed_point(linear: Maps, constant: Array) -> Any:
+def solve_fixed_point(linear: Maps, constant: Array) -> Any:
     """Solve X = L(X) + C for a linear map of symmetric matrices (..., n, n), and a constant of their shape."""
-    matrix, where = on_entries(linear, constant.shape), _triangles(constant.shape)[1]
+    matrix, where = make_entry_matrix(linear, constant.shape), _triangles(constant.shape)[1]
     solution = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[where])
-    return from_entries(solution, constant.shape)
+    return unpack_entries(solution, constant.shape)
 
 
-def from_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
+def unpack_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
     """Return symmetric matrices with these entries in their upper triangles."""
     return entries[_triangles(shape)[0]]
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.jump_system import JumpSystem, from_entries, mixed, moved
+from heliograph.linear.jump_system import JumpSystem, mix_modes, propagate, unpack_entries
 from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import pseudo_solve, spectral_radius
 from heliograph.numerics.types import Float, Int
@@ -57,11 +57,11 @@ class KnownLossSystem(NamedTuple):
 
     def bound(self, gains: KindGains) -> Parts:
         """Return the steady U under gains of a radius below 1."""
-        bound: Parts = mixed(self.chain, self.closed(gains).steady()[0])
+        bound: Parts = mix_modes(self.chain, self.closed(gains).steady()[0])
         return bound
 
 
-def certified_radius(system: KnownLossSystem, gains: KindGains) -> float:
+def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
     """The spectral radius of the operator under any gains, wherever they come from; infinite without a witness.
 
     Below 1, E P stays bounded under these gains, hence under the best. The witness is V > 0 with V - V+ > 0 without
@@ -75,7 +75,7 @@ def certified_radius(system: KnownLossSystem, gains: KindGains) -> float:
         return radius
     unit = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
     (witness,) = jumps._replace(added=unit).steady()
-    left: Parts = witness - moved(jumps.maps[0], mixed(system.chain, witness), 0.0)
+    left: Parts = witness - propagate(jumps.maps[0], mix_modes(system.chain, witness), 0.0)
     return radius if min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness).min()) > 0 else float("inf")
 
 
@@ -131,14 +131,14 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
 
 def _fastest(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
     """The covariances that grow by the spectral radius: a positive map has such an eigenvector."""
-    parts = from_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
+    parts = unpack_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
     return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
 
 def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
     """Gains that are best for U of the V given, of all modes together if V is."""
     results: list[np.ndarray] = []
-    before: Parts = mixed(system.chain, parts)
+    before: Parts = mix_modes(system.chain, parts)
     for s, c in enumerate(system.outputs):
         modes = np.flatnonzero(system.known == s)
         v = before[modes].sum(axis=0)
@@ -225,7 +225,7 @@ def _kernel(output: np.ndarray, space: np.ndarray) -> np.ndarray:
     return np.asarray(space @ right.conj().T[:, rank:])
 
 
-def reached(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
+def is_reached(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
     """Return whether a noise reaches every one of these directions within n steps (the controllable subspace)."""
     basis, columns = np.zeros((len(matrix), 0)), noise
     for _ in range(len(matrix)):

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 import numpy as np
 
-from heliograph.linear.system import LinearSystem, Steps, over_horizon
+from heliograph.linear.system import LinearSystem, Steps, repeat_last
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
@@ -61,7 +61,7 @@ class SteadyMoments:
         return bool(np.all(np.abs(moments - before) <= self._tolerance * scale))
 
 
-def lifted_modes(
+def lift_modes(
     plants: Sequence[GainAndNoise],
     measurements: Sequence[JointModes],
     degree: int,
@@ -109,8 +109,8 @@ def lifted_modes(
         step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
         rounding.append(EPS * np.kron(law, np.diag(after)))
         before, rows = after, np.asarray(measurement.transition)
-    steps = Steps(*(over_horizon(values, len(plants)) for values in zip(*step_matrices, strict=True)))
-    return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), over_horizon(rounding, len(plants)))
+    steps = Steps(*(repeat_last(values, len(plants)) for values in zip(*step_matrices, strict=True)))
+    return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), repeat_last(rounding, len(plants)))
 
 
 def _mean_noise(
@@ -158,7 +158,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         plant: linear plant without inputs.
         sensor: linear sensor.
         channel: its channel; behind links with memory the monomials are states for each of their modes
-            (`lifted_modes`).
+            (`lift_modes`).
         degree: 1 gives the best linear filter, 2 the quadratic one.
         horizon: number of steps.
 
@@ -179,7 +179,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         modes = {identity: joint_modes(measurement, order=degree) for identity, measurement in distinct.items()}
         chains = [modes[id(r.measurement)] for r in routes]
         refuse_lift(degree, n, m, horizon, max(len(mode.initial) for mode in modes.values()))
-        of_modes = lifted_modes([r.plant for r in routes], chains, degree, moments, projection)
+        of_modes = lift_modes([r.plant for r in routes], chains, degree, moments, projection)
         return believing(of_modes, Premise(plant, sensor, channel, order=2 * degree))
     # Start of the lifted state: E Y_0 and Cov Y_0.
     before = second_moments(moments, n + 1, degree)
@@ -217,8 +217,8 @@ def _lift_steps(
         noise, noise_lost = listen.conditional_spread(moments)
         parts.append((*affine(move.matrix), process, *affine(listen.matrix), noise))
         lost.append((process_lost, noise_lost))
-    steps = Steps(*(over_horizon(values, len(routes)) for values in zip(*parts, strict=True)))
-    process_rounding, received_rounding = (over_horizon(values, len(routes)) for values in zip(*lost, strict=True))
+    steps = Steps(*(repeat_last(values, len(routes)) for values in zip(*parts, strict=True)))
+    process_rounding, received_rounding = (repeat_last(values, len(routes)) for values in zip(*lost, strict=True))
     return steps, process_rounding, received_rounding
 
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from heliograph.linear.jump_system import mixed, moved
+from heliograph.linear.jump_system import mix_modes, propagate
 from heliograph.linear.lift import each_step
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import as_maps, memories
+from heliograph.random_affine.base import check_maps, memories
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.erasure import second_moments
@@ -48,7 +48,7 @@ def modal_system(
             closed), fewer steps than the horizon.
     """
     for what, affine in (("move", move), ("measure", measure)):
-        as_maps(what, [first(affine)])
+        check_maps(what, [first(affine)])
     n = first(move).inputs
     sizes = {"outputs of the move": first(move).outputs, "inputs of the measurement": first(measure).inputs}
     for name, size in sizes.items():
@@ -93,10 +93,10 @@ def _propagate_modes(
     mean, spread = move
     modes, size = len(moments), moments.shape[-1]
     whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
-    before = mixed(rows, moments)
+    before = mix_modes(rows, moments)
     added = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
     chosen = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
     apart = np.einsum("ijl,jac,icd,lbd->jalb", chosen, whole, moments, whole)
     apart[np.arange(modes), :, np.arange(modes), :] += added
     transition = np.einsum("ij,jab->jaib", rows, whole).reshape(modes * size, modes * size)
-    return transition, apart.reshape(modes * size, modes * size), moved(whole, before, added)
+    return transition, apart.reshape(modes * size, modes * size), propagate(whole, before, added)

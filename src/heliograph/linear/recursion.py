@@ -7,8 +7,8 @@ import numpy as np
 
 from heliograph.factors.columns import rounding_of
 from heliograph.factors.roots import observe_root, roots_of, square
-from heliograph.linear.jump_system import moved
-from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, over_horizon
+from heliograph.linear.jump_system import propagate
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.premise import believing
 from heliograph.numerics.check import fail, instance
@@ -111,7 +111,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         error = np.diag(projection @ rounding @ projection.T)
         share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
         worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
-    gains = Gains(*(over_horizon(values, system.horizon) for values in zip(*parts, strict=True)))
+    gains = Gains(*(repeat_last(values, system.horizon) for values in zip(*parts, strict=True)))
     return believing(Schedule(gains, system.mean, _support_claim(claim, worst, when)), system.kept.premise)
 
 
@@ -176,7 +176,7 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
         maps = np.concatenate([into @ s.transition, np.concatenate([nothing, now.transition, -now.output])], axis=1)
         shift = np.concatenate([np.zeros(len(nothing)), now.offset, -now.output_offset])
         mean = maps @ mean + into @ s.drift + received @ s.offset + shift
-        spread = moved(maps, spread, moved(into, s.process, moved(received, s.noise, 0.0)))
+        spread = propagate(maps, spread, propagate(into, s.process, propagate(received, s.noise, 0.0)))
         covariances.append(spread[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
         mean, spread = mean[:-q], spread[:-q, :-q]
     return np.array(covariances)

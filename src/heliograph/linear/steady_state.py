@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
 from heliograph.factors.roots import observe_root, roots_of, square
-from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains
+from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certify_radius, find_gains
 from heliograph.linear.recursion import covariance_step, noises_of
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
@@ -68,7 +68,7 @@ def critical_arrival(
         chain = np.array([[arrival, 1 - arrival]] * 2)
         system = KnownLossSystem(a, q, chain, chain[0], np.array([0, 1]), (c, lost), (r, np.zeros((0, 0))))
         gains = find_gains(system) if fixed is None else (fixed, lost.T)
-        return gains[0] if certified_radius(system, gains) < BELOW_ONE else None
+        return gains[0] if certify_radius(system, gains) < BELOW_ONE else None
 
     radius = spectral_radius(a)
     if radius < BELOW_ONE and fixed is None:

@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 from heliograph.model.estimate import STRENGTH, Claim
 from heliograph.model.premise import NOTHING, Kept
 from heliograph.numerics import check
-from heliograph.numerics.check import array, fail, file_path, instance, shown
+from heliograph.numerics.check import array, fail, file_path, instance, show_value
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -108,7 +108,7 @@ class LinearSystem(Module):
         return max(changes)
 
 
-def over_horizon(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
+def repeat_last(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
     """Parts of the first steps, of which all that follow are as the last, for every step of the horizon."""
     values = np.array(parts)
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
@@ -220,7 +220,7 @@ class Schedule(Module):
         if len(self.start) != n:
             raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
         if not isinstance(claim, str) or claim not in STRENGTH:
-            raise fail("claim", f"one of {list(STRENGTH)}", shown(claim))
+            raise fail("claim", f"one of {list(STRENGTH)}", show_value(claim))
         self.claim = claim
 
     @property

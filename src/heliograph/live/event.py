@@ -4,8 +4,8 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from heliograph.numerics.check import fail, is_whole, shown
-from heliograph.numerics.masked import unmasked
+from heliograph.numerics.check import fail, is_whole, show_value
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.types import ArrayLike, Float
 
 Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]
@@ -54,14 +54,14 @@ class Known(NamedTuple):
 def whole(name: str, value: object) -> int:
     """Check a count: an integer from 0 of 63 bits."""
     if not is_whole(value) or not 0 <= int(value) < 2**63:
-        raise fail(name, WHOLE, shown(value))
+        raise fail(name, WHOLE, show_value(value))
     return int(value)
 
 
 def moment(name: str, value: object) -> float:
     """Check a time: a finite number, since times are counted from an origin."""
     if not is_whole(value) and not isinstance(value, float | np.floating):
-        raise fail(name, "a finite number", shown(value))
+        raise fail(name, "a finite number", show_value(value))
     if not np.isfinite(value):
         raise fail(name, "a finite number", value)
     return float(value)
@@ -71,11 +71,11 @@ def numbers(name: str, value: ArrayLike, size: int, alone: int | None = None) ->
     """Copy `size` real numbers, or so many as come `alone`, NaN where one did not arrive; one need not be a list."""
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:
-        values = np.array(unmasked(value))
+        values = np.array(fill_masked(value))
         if values.dtype.kind not in "fiu":
             raise ValueError
     except (TypeError, ValueError, OverflowError):
-        raise fail(name, expected, shown(value)) from None
+        raise fail(name, expected, show_value(value)) from None
     values = values.astype(np.float64)
     values = values[None] if values.ndim == 0 and 1 in (size, alone) else values
     if values.ndim != 1 or len(values) not in (size, alone):

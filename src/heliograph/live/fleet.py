@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.lanes import Lanes
-from heliograph.live.leap import ARRIVAL, Leap, beside
+from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.plant import Plant, Withdrawn
 from heliograph.live.pool import Pool, legs_of, rounds_of
 from heliograph.live.rows import BEFORE, HeldRow, Rows
@@ -241,7 +241,7 @@ class Fleet:
     def advance(self, plant: Plant, now: float) -> None:
         """Advance the time of a plant by a clock; a leap that contradicts it is withdrawn."""
         leap, most = plant.leap, self.options.leap
-        if leap is not None and (found := beside(leap, plant.now, now, most)) is not None and found[0].now > -inf:
+        if leap is not None and (found := find_leap(leap, plant.now, now, most)) is not None and found[0].now > -inf:
             plant.take_back(found[0], most, self._names)
         elif leap is not None and now >= leap.time - most:
             plant.leap = None

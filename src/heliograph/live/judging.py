@@ -15,7 +15,7 @@ from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.model.estimate import Estimate
 from heliograph.model.faults import function_fault
 from heliograph.numerics.types import Float
-from heliograph.simulation.centres.blame import blamed
+from heliograph.simulation.centres.blame import find_blamed
 from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.rows.columns import FilterColumns
@@ -131,7 +131,7 @@ class Judges:
                 rows.setdefault(taken[i][-1].slot, []).append(i)
         for those in rows.values():
             if len({taken[i][2].node_index for i in those}) > 1:
-                one = blamed(those, lambda i: _size(taken[i][2]), lambda i: self._plausible_without(taken[i]))
+                one = find_blamed(those, lambda i: _size(taken[i][2]), lambda i: self._plausible_without(taken[i]))
                 for i in those:
                     if i != one:
                         del reasons[i]

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.live.later import Sweeper
 from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP, AbstractPlant
-from heliograph.numerics.caching import shared
+from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.network import Network
@@ -69,7 +69,7 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
     return ""
 
 
-@compiled
+@compile_on_call
 def _integrate_parts(
     plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
 ) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
@@ -134,4 +134,4 @@ class Lanes:
         return network_identity(self.network, self.step_rows.program, {})
 
 
-shared_lanes = shared(Lanes)  # of a network, made at the first call
+shared_lanes = share_by_object(Lanes)  # of a network, made at the first call

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen, of_arrays, setting
+from heliograph.engine.choice import chosen, map_arrays, setting
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import Claim, Estimate, with_sound_claim
+from heliograph.model.estimate import Claim, Estimate, lower_unsound_claim
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module
@@ -234,11 +234,11 @@ class Sweeper:
 
 def _only(results: PyTree) -> PyTree:
     """Return the results of the one run of several."""
-    return of_arrays(lambda leaf: leaf[0, ...], results)
+    return map_arrays(lambda leaf: leaf[0, ...], results)
 
 
 def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
-    return with_sound_claim(Estimate(np.asarray(outputs.mean)[where], np.asarray(outputs.covariance)[where], claim))
+    return lower_unsound_claim(Estimate(np.asarray(outputs.mean)[where], np.asarray(outputs.covariance)[where], claim))
 
 
 def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:

@@ -74,7 +74,7 @@ class Leap(NamedTuple):
         return clock != self.clock or (self.back is not None and self.back < time < self.back + self.time - time)
 
 
-def beside(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
+def find_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
     """Return the leap of a chain before which a time goes on, and the newest arrival after it; None if there is none.
 
     Args:

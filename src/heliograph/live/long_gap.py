@@ -36,7 +36,9 @@ def factors_in(places: PyTree) -> list[Factors]:
     return [Factors(parts[stem + LOWER], parts[stem + VARIANCES]) for stem in stems if stem + LOWER in parts]
 
 
-def as_covariances(rows: Float[np.ndarray, "row state"], places: Sequence[Factors]) -> Float[np.ndarray, "row state"]:
+def convert_to_covariances(
+    rows: Float[np.ndarray, "row state"], places: Sequence[Factors]
+) -> Float[np.ndarray, "row state"]:
     """Return rows with the entries of L D L' in the places of those of L below its diagonal, and of D."""
     rows = rows.copy()
     for lower, variances in places:
@@ -47,8 +49,10 @@ def as_covariances(rows: Float[np.ndarray, "row state"], places: Sequence[Factor
     return rows
 
 
-def as_factors(rows: Float[np.ndarray, "row state"], places: Sequence[Factors]) -> Float[np.ndarray, "row state"]:
-    """Return what `as_covariances` was given."""
+def convert_to_factors(
+    rows: Float[np.ndarray, "row state"], places: Sequence[Factors]
+) -> Float[np.ndarray, "row state"]:
+    """Return what `convert_to_covariances` was given."""
     rows = rows.copy()
     for lower, variances in places:
         n = variances.shape[-1]
@@ -90,10 +94,10 @@ def _states_after(
     passed = [state]
 
     def seen(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
-        return list(as_covariances(np.stack(states), places))
+        return list(convert_to_covariances(np.stack(states), places))
 
     def by_covariances(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
-        return as_covariances(step(as_factors(states, places), k), places)
+        return convert_to_covariances(step(convert_to_factors(states, places), k), places)
 
     for i in range(min(PROBES, count // PROBED)):
         passed.append(_walk(step, passed[-1], at + i * PROBED, PROBED))
@@ -111,7 +115,7 @@ def _states_after(
 
 def _alone(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Float[np.ndarray, " state"]:
     """Return one state by factors of one by covariances."""
-    alone: Float[np.ndarray, " state"] = as_factors(state[None], places)[0]
+    alone: Float[np.ndarray, " state"] = convert_to_factors(state[None], places)[0]
     return alone
 
 

@@ -7,7 +7,7 @@ from math import inf
 from typing import NamedTuple, TypeAlias
 
 from heliograph.live.event import INPUTS, Known, Verdict
-from heliograph.live.leap import ARRIVAL, Leap, Moments, beside
+from heliograph.live.leap import ARRIVAL, Leap, Moments, find_leap
 from heliograph.live.rows import HeldRow, Key, Rows
 
 GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
@@ -181,7 +181,7 @@ class Plant:
             sure: whether another clock says the same.
             names: names of the nodes in their order, then that of the inputs.
         """
-        found = beside(self.leap, self.now, time, most)
+        found = find_leap(self.leap, self.now, time, most)
         if self.leap is None or found is None:
             return
         leap, newest = found

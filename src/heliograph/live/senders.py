@@ -71,7 +71,7 @@ def sender_status(trigger: AbstractTrigger, losses: LossChain, last: int | None,
     """The status where the newest value is of step `last`, the newest final step `final` and the present one `now`."""
     begun = -1 if last is None else last
     silent, provisional = max(final - begun, 0), max(now - max(final, begun), 0)
-    missed = missed_heartbeats(trigger, last, silent, final)
+    missed = count_missed_heartbeats(trigger, last, silent, final)
     return SenderStatus(
         last,
         silent,
@@ -81,7 +81,7 @@ def sender_status(trigger: AbstractTrigger, losses: LossChain, last: int | None,
     )
 
 
-def missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
+def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
     """Transmissions that were due in the silent steps; the first value is due at once.
 
     Between two heartbeats the sender may have transmitted on an event that was lost too: then the next one is due

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import attempted, setting
+from heliograph.engine.choice import setting, try_native
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.trees.static import Static
@@ -143,4 +143,4 @@ def _compile_stepper(
         in_place = {-state + i: numbers + i for i in range(state)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
-    return attempted(made)
+    return try_native(made)

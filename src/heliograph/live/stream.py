@@ -8,19 +8,19 @@ import jax
 import numpy as np
 from scipy.stats import chi2
 
-from heliograph.filters.base import AbstractFilter, given, measured
+from heliograph.filters.base import AbstractFilter, check_input, check_measurement
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
-from heliograph.filters.plausibility import in_words, why_inputs
+from heliograph.filters.plausibility import describe, why_inputs
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
-from heliograph.live.stored.layout import fits, moved, parts_of, with_covariances
-from heliograph.live.stored.snapshot import Identity, check_same, packed, unpacked, versions
-from heliograph.model.estimate import JudgedEstimate, with_sound_claim
+from heliograph.live.stored.layout import describe_old_layout, fits, parts_of, relocate_parts
+from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
+from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim
 from heliograph.model.faults import function_fault
 from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
-from heliograph.numerics.caching import shared
+from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.trees.program_text import short_name, text_of
@@ -92,10 +92,10 @@ class Stream:
         # Arrays of doubles of the right size pass at once; everything else is checked and converted.
         z, outside = _row(measurement, placed.received), None
         if z is None or self.limits is not None:
-            z = np.asarray(measured(self.filter, measurement))
+            z = np.asarray(check_measurement(self.filter, measurement))
         u = _row(inputs, placed.given)
         if u is None:
-            u = np.asarray(given(self.filter, inputs))
+            u = np.asarray(check_input(self.filter, inputs))
         if self.limits is not None:
             # Values beyond the limits count as not arrived.
             outside = self.limits.outside(z)
@@ -117,7 +117,7 @@ class Stream:
             for _, line in self._angles.said_of(np.diagonal(stepper.estimate[1])[None]):
                 warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
         estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
-        return with_sound_claim(estimate) if nis != nis else estimate
+        return lower_unsound_claim(estimate) if nis != nis else estimate
 
     def _judge(self, beyond: bool) -> None:
         """Count measurements in a row that were not expected, and warn once of many."""
@@ -127,8 +127,8 @@ class Stream:
 
     def _refuse(self, z: np.ndarray, u: np.ndarray) -> None:
         """Refuse implausible values, or accept the step that was flagged."""
-        measured(self.filter, z)
-        given(self.filter, u)
+        check_measurement(self.filter, z)
+        check_input(self.filter, u)
         stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
         if len(u) and (why := why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
@@ -139,7 +139,7 @@ class Stream:
             if not without:
                 raise fail(f"inputs of step {self.steps}", "plausible ones", f"{u.tolist()}: {why}{self._fault(u)}")
         if reason > 0:
-            why = in_words(reason, distance) + self._fault(u)
+            why = describe(reason, distance) + self._fault(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         stepper.step(z, u, self.steps)  # anew, if inputs were tried without
         stepper.accept()
@@ -172,7 +172,7 @@ class Stream:
             "beyond": self._beyond,
             "of": self._placed.identity,
         }
-        return packed(head, leaves)
+        return pack(head, leaves)
 
     @classmethod
     def restore(
@@ -196,20 +196,20 @@ class Stream:
         Raises:
             ValueError: no snapshot, or one of another filter or version.
         """
-        new, (head, arrays) = cls(filter, limits, invalid), unpacked(data)
+        new, (head, arrays) = cls(filter, limits, invalid), unpack(data)
         mine, other = new._placed.identity, head.get("of", {})
         check_same("snapshot", mine, other, SAME, accept_changes)
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
         new._last, new._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
         # Parts by their paths, which a version before 0.3.0 did not write.
         layout = new._placed.layout
-        paths = head.get("paths", list(with_covariances(layout)))
+        paths = head.get("paths", list(describe_old_layout(layout)))
         leaves = [arrays[f"state.{i}"] for i in range(sum(name.startswith("state.") for name in arrays))]
         old = dict(zip(paths, leaves, strict=False))
         if len(paths) != len(leaves) or not fits({path: leaf.shape for path, leaf in old.items()}, layout):
             expected = f"a state with the parts of {other['filter']} as it is here: {', '.join(layout)}"
             raise fail("snapshot", expected, ", ".join(f"{path} {list(leaf.shape)}" for path, leaf in old.items()))
-        new._stepper.put(list(moved(old, layout).values()))
+        new._stepper.put(list(relocate_parts(old, layout).values()))
         return new
 
     def __getstate__(self) -> dict[str, object]:
@@ -281,4 +281,4 @@ class _Placed:
         }
 
 
-_place = shared(_Placed)
+_place = share_by_object(_Placed)

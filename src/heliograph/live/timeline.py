@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.filters.plausibility import in_words
+from heliograph.filters.plausibility import describe
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import FleetAngles, Judges
@@ -18,13 +18,13 @@ from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.senders import SenderStatus
 from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, description
 from heliograph.live.stored.plant_codec import plant_bytes, plant_from
-from heliograph.live.stored.snapshot import check_same, packed, unpacked
-from heliograph.model.estimate import Estimate, JudgedEstimate, with_sound_claim
-from heliograph.numerics.check import check_count, fail, instance, scalar, shown
+from heliograph.live.stored.snapshot import check_same, pack, unpack
+from heliograph.model.estimate import Estimate, JudgedEstimate, lower_unsound_claim
+from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import by_name
+from heliograph.simulation.results.by_name import split_by_name
 from heliograph.simulation.results.record import Record
 
 
@@ -113,10 +113,10 @@ class Timeline:
     def __getstate__(self) -> dict[str, object]:
         """Return the whole state, in double precision; compiled programs are left out."""
         head, arrays = self._state()
-        return {"network": self.network, "saved": packed(head, arrays)}
+        return {"network": self.network, "saved": pack(head, arrays)}
 
     def __setstate__(self, stored: dict[str, Any]) -> None:
-        vars(self).update(vars(self._resume(stored["network"], *unpacked(stored["saved"]))))
+        vars(self).update(vars(self._resume(stored["network"], *unpack(stored["saved"]))))
 
     @property
     def engine(self) -> str:
@@ -252,7 +252,7 @@ class Timeline:
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
         head, arrays = self._state()
-        return packed(head | {"of": self._lanes.identity, DESCRIPTION: self._description}, arrays)
+        return pack(head | {"of": self._lanes.identity, DESCRIPTION: self._description}, arrays)
 
     @cached_property
     def _description(self) -> str:
@@ -280,7 +280,7 @@ class Timeline:
         Raises:
             ValueError: no snapshot, or one of another network or version.
         """
-        head, arrays = unpacked(data)
+        head, arrays = unpack(data)
         mine, other = shared_lanes(network).identity, head.get("of", {})
         if accept_changes and mine != other:
             arrays = arrays | {"plant": cls._carry_over(network, head, arrays["plant"].tobytes())}
@@ -321,7 +321,7 @@ class Timeline:
         """Convert an event to numbers."""
         sizes, name = self._fleet.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
-            raise fail("node of an event", f"one of {', '.join(sizes)}", shown(node))
+            raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))
         index, size = sizes[node]
         at = moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
@@ -346,7 +346,7 @@ class Timeline:
             if judged is not None:
                 nis, received = float(outputs[judged.distance]), int(outputs[judged.arrived])
                 reason = 0.0 if place.judgement is None else float(outputs[place.judgement.reason])
-                refused = in_words(reason, nis) if reason > 0 else ""
+                refused = describe(reason, nis) if reason > 0 else ""
                 estimates[place.node][place.filter] = JudgedEstimate(
                     estimate.mean, estimate.covariance, estimate.claim, nis, received, refused
                 )
@@ -355,11 +355,11 @@ class Timeline:
     def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Arrange outputs by node and filter."""
         estimates = self._lanes.step_rows.outputs.tree(outputs)
-        mean = by_name(self.network, estimates, lambda estimate: np.asarray(estimate.mean), -3)
-        covariance = by_name(self.network, estimates, lambda estimate: np.asarray(estimate.covariance), -4)
+        mean = split_by_name(self.network, estimates, lambda estimate: np.asarray(estimate.mean), -3)
+        covariance = split_by_name(self.network, estimates, lambda estimate: np.asarray(estimate.covariance), -4)
         return {
             node: {
-                name: with_sound_claim(Estimate(mean[node][name], covariance[node][name], claim))
+                name: lower_unsound_claim(Estimate(mean[node][name], covariance[node][name], claim))
                 for name, claim in claims.items()
             }
             for node, claims in self._lanes.claims.items()

@@ -21,10 +21,10 @@ from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.module import same
 from heliograph.numerics.traced import is_traced
-from heliograph.random_affine.base import AbstractRandomAffine, without_names
+from heliograph.random_affine.base import AbstractRandomAffine, drop_names
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known, maps_in_series
-from heliograph.random_affine.erasure import arrived, outcomes, second_moments
+from heliograph.random_affine.erasure import condition_on_arrival, outcomes, second_moments
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import Modes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise
@@ -73,7 +73,7 @@ def _enlarge_own(believed: Premise, own: Premise) -> Premise:
     return own.replaced(plant=plant, sensor=sensor, channel=channel)
 
 
-def joined(premises: Sequence[Premise]) -> Premise:
+def join_premises(premises: Sequence[Premise]) -> Premise:
     """Return the premise of a filter that receives all measurements of these, one after the other; of one plant."""
     if len(premises) == 1:
         return premises[0]
@@ -199,8 +199,8 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
     if a is b:
         return True
     if isinstance(a, AbstractRandomAffine) and isinstance(b, AbstractRandomAffine):
-        return _same_map(without_names(a), without_names(b), order, loses)
-    if same(without_names(a), without_names(b)):
+        return _same_map(drop_names(a), drop_names(b), order, loses)
+    if same(drop_names(a), drop_names(b)):
         return True
     if first(a).remembers or first(b).remembers:
         return False
@@ -221,7 +221,7 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
     try:
         if order == MEAN_AND_COVARIANCE:
             return _same_moments(a, b)
-        return (a.erases or b.erases) and same(arrived(a), arrived(b))
+        return (a.erases or b.erases) and same(condition_on_arrival(a), condition_on_arrival(b))
     except ValueError:  # no moments, or more than can be listed
         return False
 
@@ -293,7 +293,7 @@ def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.nda
     """
     maps: Sequence[AbstractRandomAffine]
     try:
-        whole = arrived(channel)
+        whole = condition_on_arrival(channel)
     except ValueError:  # losses that depend on the mode: where all modes are alike, no memory of the gains is left
         maps = joint_modes(channel).maps
     else:
@@ -325,7 +325,7 @@ def _same_observation(
     maps = [whole for observation in (a, b) if (whole := _compose_with_sensor(*observation)) is not None]
     if len(maps) < 2 or is_bounded(a) != is_bounded(b):
         return False
-    return _same_map(without_names(maps[0]), without_names(maps[1]), order, True)
+    return _same_map(drop_names(maps[0]), drop_names(maps[1]), order, True)
 
 
 def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:

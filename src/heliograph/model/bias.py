@@ -13,7 +13,7 @@ from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_
 from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library
-from heliograph.numerics.types import Array, ArrayLike, Float, renamed
+from heliograph.numerics.types import Array, ArrayLike, Float, rename
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 Biases = TypeAliasType("Biases", Float[ArrayLike, " biases"])  # or one number for all
@@ -65,7 +65,7 @@ def with_bias(
     entering = np.zeros((n, seen.shape[1])) if entering is None else entering
     if not isinstance(bias, LinearPlant):
         named = (
-            [renamed(name, f"{name}_bias") for name in sensor.outputs]
+            [rename(name, f"{name}_bias") for name in sensor.outputs]
             if alone
             else [f"bias{i}" for i in range(seen.shape[1])]
         )
@@ -126,7 +126,7 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
     models = plant, bias
     if set(bias.inputs) - set(plant.inputs):
         raise fail("bias", f"a plant whose inputs are some of {list(plant.inputs)}", list(bias.inputs))
-    new = {name: renamed(name, f"bias_{name}") if name in plant.states else name for name in bias.states}
+    new = {name: rename(name, f"bias_{name}") if name in plant.states else name for name in bias.states}
     states = (*plant.states, *new.values())
     circular = (*plant.circular, *(new[name] for name in bias.circular))
     # Both laws of the initial state, and of the noises.

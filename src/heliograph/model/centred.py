@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.model.channel import Channel, amplify_and_forward
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered
@@ -15,7 +15,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.check import array, check_horizon, fail, rank
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.combine import known
 
 
@@ -45,7 +45,7 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
 
 
 def _centre(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
-    (channel,) = as_maps("channel less a reference", [channel])
+    (channel,) = check_maps("channel less a reference", [channel])
     if channel.past or channel.erases:
         what = "late" if channel.past else "one that erases"
         raise fail("channel less a reference", "neither late nor lossy by itself (put `centred` inside)", what)
@@ -57,7 +57,7 @@ def _centre(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> A
     return amplify_and_forward([known(np.eye(len(r)), -r), channel, known(np.eye(channel.outputs), gain @ r)])
 
 
-def predicted_signal(
+def predict_signal(
     plant: AbstractPlant, sensor: AbstractSensor, x: Float[Array, " n"], u: ArrayLike
 ) -> Float[jax.Array, " m"]:
     """Prediction h(f(x, u) + E w) + E v of a signal from the state a step before, which both ends of a link compute."""
@@ -94,7 +94,7 @@ def expected_signal(
     return np.asarray(_along(plant, sensor, u))
 
 
-@compiled
+@compile_on_call
 def _along(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "horizon inputs"]) -> jax.Array:
     def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         k, u = row

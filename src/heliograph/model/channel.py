@@ -16,13 +16,21 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import (
     AbstractRandomAffine,
     all_inner_maps,
-    as_maps,
     check_forgets,
+    check_maps,
     independent,
     inner_maps,
 )
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
-from heliograph.random_affine.delay import Delay, Delayed, DelayLine, Relayed, in_series, of_part, signal_size
+from heliograph.random_affine.delay import (
+    Delay,
+    Delayed,
+    DelayLine,
+    Relayed,
+    connect_in_series,
+    place_part,
+    signal_size,
+)
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate
@@ -131,7 +139,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
         ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
-    return in_series(independent(as_maps("series", hops)))
+    return connect_in_series(independent(check_maps("series", hops)))
 
 
 def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> Delayed:
@@ -165,7 +173,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
         ValueError: an arrival probability outside [0, 1].
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
-    (channel,) = as_maps("dropout", [channel])
+    (channel,) = check_maps("dropout", [channel])
     return Mixture([channel, silent(channel.outputs, channel.inputs)], library(p).stack([p, 1 - p]), radius)
 
 
@@ -194,9 +202,9 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    both = independent(as_maps("stack", [relayed, direct]))
+    both = independent(check_maps("stack", [relayed, direct]))
     past = max(c.past for c in both)
-    return Stack([c if c.past == past else of_part(c, signal_size(c), 0, past) for c in both])
+    return Stack([c if c.past == past else place_part(c, signal_size(c), 0, past) for c in both])
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
@@ -208,10 +216,10 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    channels = independent(as_maps("parallel channels", channels))
+    channels = independent(check_maps("parallel channels", channels))
     parts, start, total, past = [], 0, sum(signal_size(c) for c in channels), max(c.past for c in channels)
     for c in channels:
-        parts.append(of_part(c, total, start, past))
+        parts.append(place_part(c, total, start, past))
         start += signal_size(c)
     return Stack(parts)
 
@@ -232,7 +240,7 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
         ValueError: links of other sizes; an erasure in a link, since a receiver of a sum does not see who is missing;
             flags or time stamps, which would be added up.
     """
-    links = independent(as_maps("links of a sum", links))
+    links = independent(check_maps("links of a sum", links))
     for i, link in enumerate(links, 1):
         _check_added(f"link {i} of a sum", link)
     sizes, sent = [link.outputs for link in links], [signal_size(link) for link in links]
@@ -270,7 +278,7 @@ def mean_gain(channel: Channel) -> Channel:
     """
 
     def mean_of(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-        check_forgets("channel taken at its mean gain", as_maps("channel taken at its mean gain", [channel])[0])
+        check_forgets("channel taken at its mean gain", check_maps("channel taken at its mean gain", [channel])[0])
         return channel.mean_gain()
 
     at_mean: Channel = at_each_step(mean_of, channel)
@@ -287,7 +295,7 @@ def check_link(
     check_sensor(sensor, states)
     if moments and not late:
         _ = sensor.noise.covariance
-    as_maps("channel", [channel])
+    check_maps("channel", [channel])
     if channel.past and not late:
         expected = "one without delays (linear_filter knows them; hg.filters.late_filter a constant one for any filter)"
         raise fail("channel", expected, f"one that is late by up to {channel.past} steps")
@@ -302,12 +310,12 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
         raise fail("channel", expected, f"one that takes {signal_size(channel)}")
 
 
-def received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
+def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
     start, senses = first(plant), first(sensor)
     check_turns("sensor of a plant", senses.measure, start.initial_mean, start.angles, senses.angles)
     steps = unstack(channel) if isinstance(channel, OverTime) and senses.circular else [first(channel)]
-    results = {carried(step, senses.angles) for step in steps}
+    results = {carry_angles(step, senses.angles) for step in steps}
     if len(results) > 1:
         raise fail("channel", "the same angles at every step", sorted(results))
     return results.pop()
@@ -316,7 +324,7 @@ def received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Ang
 ROUNDING = 1e-12  # of a gain of 1 that was computed
 
 
-def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
+def carry_angles(channel: AbstractRandomAffine, sent: Angles) -> Angles:
     """Return the indices of outputs that are angles, from those of the inputs; noise and erasures leave angles."""
     if not sent:
         return ()
@@ -325,27 +333,27 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             return _trace_angles(channel, sent)
         case Series():
             for affine in channel.maps:
-                sent = carried(affine, sent)
+                sent = carry_angles(affine, sent)
             return sent
         # Outputs of parts stand one after another.
         case Stack():
             starts = np.cumsum([0, *(affine.outputs for affine in channel.maps)])
             items = zip(starts, channel.maps, strict=False)
-            return tuple(int(start) + i for start, affine in items for i in carried(affine, sent))
+            return tuple(int(start) + i for start, affine in items for i in carry_angles(affine, sent))
         case Erasure() | OneStepLate() | Delayed():  # a time stamp of what is late stands after it
-            return carried(inner_maps(channel)[0], sent)
+            return carry_angles(inner_maps(channel)[0], sent)
         case DelayLine():  # of what was sent at each of the steps that may arrive
             size = channel.inputs // (1 + channel.past)
-            return carried(channel.line, tuple(t * size + i for t in range(1 + channel.past) for i in sent))
+            return carry_angles(channel.line, tuple(t * size + i for t in range(1 + channel.past) for i in sent))
         case ModeOutput():  # a class, of whatever is sent
             return ()
         case Relayed():
             for stage in channel.stages:
-                sent = carried(stage, sent)
+                sent = carry_angles(stage, sent)
             return sent
         # All choices must agree.
         case Mixture() | Modes():
-            results = {carried(affine, sent) for affine in channel.maps}
+            results = {carry_angles(affine, sent) for affine in channel.maps}
             if len(results) == 1:
                 return results.pop()
     raise _refuse(type(channel).__name__)

@@ -17,8 +17,8 @@ from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, che
 from heliograph.numerics.check import array, fail, function, instance, names, scalar, table
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import ArrayLike, Float, renamed
-from heliograph.random_affine.delay import on_delay_line
+from heliograph.numerics.types import ArrayLike, Float, rename
+from heliograph.random_affine.delay import place_on_delay_line
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Shaped
 
 
@@ -43,7 +43,7 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     moved: AnyPlant = at_each_step(partial(_append_line, past=first(channel).past), plant, sensor)
     n, total = len(first(plant).states), len(first(moved).states)
     everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
-    return moved, everything, on_delay_line(channel)
+    return moved, everything, place_on_delay_line(channel)
 
 
 def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
@@ -64,7 +64,7 @@ def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     # Nothing was sent before the start.
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     line = [
-        renamed(name, f"{name}_{d}_ago" if d else f"{name}_sent") for d in range(past + 1) for name in sensor.outputs
+        rename(name, f"{name}_{d}_ago" if d else f"{name}_sent") for d in range(past + 1) for name in sensor.outputs
     ]
     return LinearPlant(
         xp.concatenate([moves, rest], axis=1),
@@ -179,7 +179,7 @@ def _drifts(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
         spread += [clock_offset**2, drift**2]
         wander.append(gain)
         offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
-        states += [renamed(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
+        states += [rename(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
     center, start, strength = (library(x).asarray(library(x).stack(x)) for x in (start_at, spread, wander))
     each, xp = np.eye(len(clocks)), library(start, strength)
     start, strength = xp.diag(start), xp.diag(strength)
@@ -242,7 +242,7 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | JointS
         raise fail("sensors", "at least one", "none")
     for name, sensor in by_node.items():
         instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary")
-    outputs = [renamed(output, f"{name}_{output}") for name, sensor in by_node.items() for output in sensor.outputs]
+    outputs = [rename(output, f"{name}_{output}") for name, sensor in by_node.items() for output in sensor.outputs]
     outputs = list(names("outputs of all nodes", outputs, len(outputs), "y"))
     circular = tuple(f"{name}_{output}" for name, sensor in by_node.items() for output in sensor.circular)
     parts = tuple(by_node.values())

@@ -6,7 +6,7 @@ from typing import Literal, TypeVar
 import equinox as eqx
 import numpy as np
 
-from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, shown, standard_deviations
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_value, standard_deviations
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.outliers import is_bounded
@@ -91,11 +91,11 @@ def weakest(claims: list[Claim]) -> Claim:
         raise fail("claims", "at least one", "none")
     for claim in claims:
         if not isinstance(claim, str) or claim not in STRENGTH:
-            raise fail("claim", f"one of {', '.join(STRENGTH)}", shown(claim))
+            raise fail("claim", f"one of {', '.join(STRENGTH)}", show_value(claim))
     return min(claims, key=STRENGTH.__getitem__)
 
 
-def given_bounds(claim: Claim, *models: PyTree) -> Claim:
+def lower_to_upper(claim: Claim, *models: PyTree) -> Claim:
     """Lower a claim to "upper" where some noise of these models is known by a bound of its covariance alone."""
     return weakest([claim, "upper"]) if is_bounded(*models) else claim
 
@@ -129,7 +129,7 @@ def _is_semidefinite(correlations: np.ndarray) -> np.ndarray:
 AnyEstimate = TypeVar("AnyEstimate", bound=Estimate)
 
 
-def with_sound_claim(estimate: AnyEstimate) -> AnyEstimate:
+def lower_unsound_claim(estimate: AnyEstimate) -> AnyEstimate:
     """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none.
 
     Several keep theirs: `claims` says of which it holds.

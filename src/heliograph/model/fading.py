@@ -10,7 +10,7 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, flag, scalar, text
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories, with_memories
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps, memories, replace_memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain
 from heliograph.random_affine.combine import GainAndNoise, Stack
 from heliograph.random_affine.law import Constant
@@ -23,7 +23,7 @@ from heliograph.random_affine.modes import (
     harmless,
     joint_modes,
     laws,
-    mixed,
+    mix_maps,
 )
 from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, components
 
@@ -171,13 +171,13 @@ def shared(link: Channel, name: str) -> Channel:
         ValueError: a channel without memory (nodes share its independent draws by `Network.sharing`), no name.
     """
     text("name of what is shared", name)
-    as_maps("shared link", [first(link)])
+    check_maps("shared link", [first(link)])
     held = memories(link)
     if not held:
         raise fail("shared link", "one with memory, such as gilbert_elliott(...)", "one drawn anew at each step, which "
                    "nodes share by Network.sharing")  # fmt: skip
     twins = {key: m.named(name if len(held) == 1 else f"{name} {i}") for i, (key, m) in enumerate(held.items())}
-    return with_memories(link, twins)
+    return replace_memories(link, twins)
 
 
 def without_memory(channel: Channel) -> Channel:
@@ -192,12 +192,12 @@ def without_memory(channel: Channel) -> Channel:
     Raises:
         ValueError: a channel that remembers in a way of its own.
     """
-    if not as_maps("channel", [first(channel)])[0].remembers:
+    if not check_maps("channel", [first(channel)])[0].remembers:
         return channel
     if not isinstance(channel, OverTime):
         return forgetful(channel)
     steps = [joint_modes(step, order=2) for step in unstack(channel)]
-    return over_time([mixed(step, law) for step, law in zip(steps, laws(steps), strict=True)])
+    return over_time([mix_maps(step, law) for step, law in zip(steps, laws(steps), strict=True)])
 
 
 def memory_matters(channel: Channel) -> bool:
@@ -211,7 +211,7 @@ def memory_matters(channel: Channel) -> bool:
     Raises:
         ValueError: a channel with a memory of another kind.
     """
-    if not as_maps("channel", [first(channel)])[0].remembers:
+    if not check_maps("channel", [first(channel)])[0].remembers:
         return False
     if uncertain_chain(channel):
         return True

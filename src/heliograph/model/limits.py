@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
@@ -49,7 +49,7 @@ class Limits(Module):
         self.low, self.high = pairs[:, 0], pairs[:, 1]
         codes = _numbers("invalid values", invalid)
         if codes.ndim > 1 or not np.all(np.isfinite(codes)):
-            raise fail("invalid values", "a finite number or several", shown(invalid))
+            raise fail("invalid values", "a finite number or several", show_value(invalid))
         self.invalid = np.atleast_1d(codes)
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
@@ -88,14 +88,14 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
     try:
         values = np.asarray(limits, dtype=object)
     except (TypeError, ValueError):
-        raise fail("limits", expected, shown(limits)) from None
+        raise fail("limits", expected, show_value(limits)) from None
     if values.shape not in ((2,), (received, 2)):
-        raise fail("limits", expected, shown(limits))
+        raise fail("limits", expected, show_value(limits))
     rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
     pairs = [[end if bound is None else bound for bound, end in zip(row, everything, strict=True)] for row in rows]
     intervals = _numbers("limits", pairs, expected)
     if np.any(~(intervals[:, 0] < intervals[:, 1])):
-        raise fail("limits", "a low end below the high one", shown(limits))
+        raise fail("limits", "a low end below the high one", show_value(limits))
     return intervals
 
 
@@ -105,5 +105,5 @@ def _numbers(name: str, value: object, expected: str = "numbers") -> Float[np.nd
         if values.size and values.dtype.kind not in "fiu":
             raise ValueError
     except (TypeError, ValueError, OverflowError):
-        raise fail(name, expected, shown(value)) from None
+        raise fail(name, expected, show_value(value)) from None
     return values.astype(np.float64)

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.model.over_time import OverTime, first
-from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continued, nearest, wrapped
-from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
+from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continue_angles, nearest, wrap_angles
+from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, show_error
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, traced_shape
+from heliograph.numerics.traced import is_traced, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
     AbstractNoise,
@@ -89,7 +89,7 @@ class AbstractPlant(Module):
 
     def difference(self, x: A, other: A) -> A:
         """x - other of states (..., n), angles between -pi and pi."""
-        return wrapped(x - other, self.angles)
+        return wrap_angles(x - other, self.angles)
 
     def near(self, x: A, other: Array) -> A:
         """The same state x (..., n), its angles within half a turn of those of `other`: so they can be averaged."""
@@ -97,7 +97,7 @@ class AbstractPlant(Module):
 
     def moves(self, u: jax.Array, center: jax.Array) -> Callable[[jax.Array], jax.Array]:
         """x -> f(x, u) with angles continued from those at `center`, as moments are made of it."""
-        return continued(lambda x: self.transition(x, u), center, self.angles, self.angles)
+        return continue_angles(lambda x: self.transition(x, u), center, self.angles, self.angles)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """f(x, u): shapes (n,), (inputs,) -> (n,)."""
@@ -309,11 +309,11 @@ def check_turns(
         return
     points = np.stack([center, *(np.asarray(center) + TURN * np.eye(len(center))[list(given)])])
     try:
-        start, *turned = computed(_values_at, _values_by_xla, (function, points, rest))
+        start, *turned = compute_once(_values_at, _values_by_xla, (function, points, rest))
     except jax.errors.TracerArrayConversionError:  # the function holds a traced number
         return
     for i, value in zip(given, turned, strict=True):
-        change = wrapped(value - start, angles)
+        change = wrap_angles(value - start, angles)
         if np.any(np.abs(change) > SAME * (1 + np.abs(start))):
             raise fail(f"{name} with circular states", "one that a full turn does not change",
                        f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
@@ -353,9 +353,9 @@ def angles_among(angles: "Sequence[int] | AnyPlant", states: int) -> Angles:
 def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:
     """Raise ValueError unless a user's function returns an array of `shape`."""
     try:
-        got = traced_shape(name, called, *values)
+        got = trace_shape(name, called, *values)
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-        raise fail(name, f"a function in operations of jax.numpy, of shape {shape}", shown_error(error)) from error
+        raise fail(name, f"a function in operations of jax.numpy, of shape {shape}", show_error(error)) from error
     if got != shape:
         raise fail(name, f"shape {shape}", f"shape {got}")
 

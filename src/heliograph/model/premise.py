@@ -14,7 +14,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
 
 MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim rests on
@@ -110,7 +110,7 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
     try:
         parameters = inspect.signature(make)
     except (TypeError, ValueError) as error:
-        raise fail("what makes a filter", "a function of a plant, a sensor and a channel", shown(make)) from error
+        raise fail("what makes a filter", "a function of a plant, a sensor and a channel", show_value(make)) from error
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> B:

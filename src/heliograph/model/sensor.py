@@ -13,10 +13,10 @@ from typing_extensions import TypeAliasType
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_named
-from heliograph.numerics.caching import cached
-from heliograph.numerics.check import array, fail, function, instance, name_list, names, shown_error
+from heliograph.numerics.caching import cache_by_object
+from heliograph.numerics.check import array, fail, function, instance, name_list, names, show_error
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import traced_shape
+from heliograph.numerics.traced import trace_shape
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
@@ -50,9 +50,9 @@ class AbstractSensor(Module):
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""
         try:
-            got = traced_shape("measure(x) of a sensor", self.measure, np.zeros(states))
+            got = trace_shape("measure(x) of a sensor", self.measure, np.zeros(states))
         except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-            raise fail("sensor", f"to measure a state of length {states}", shown_error(error)) from error
+            raise fail("sensor", f"to measure a state of length {states}", show_error(error)) from error
         if got != (len(self.outputs),):
             raise fail("sensor", f"{len(self.outputs)} outputs {list(self.outputs)}", f"shape {got}")
 
@@ -213,7 +213,7 @@ def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, .
 AnySensor = TypeAliasType("AnySensor", AbstractSensor | OverTime)  # an OverTime holds one sensor per step
 
 
-@cached
+@cache_by_object
 def check_sensor(sensor: AbstractSensor, states: int) -> None:
     """Raise ValueError unless the sensor takes a state of this length and returns its outputs."""
     instance("sensor", sensor, AbstractSensor, "a sensor")

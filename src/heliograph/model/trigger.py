@@ -17,7 +17,7 @@ from heliograph.numerics.check import (
     rank,
     report_domain,
     scalar,
-    shown,
+    show_value,
 )
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced
@@ -244,7 +244,7 @@ class StochasticTrigger(AbstractTrigger):
     ):
         self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
         if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
-            raise fail("weight", "a positive definite matrix", shown(self.weight.tolist()))
+            raise fail("weight", "a positive definite matrix", show_value(self.weight.tolist()))
         self.reference = one_of("reference", reference, Literal["zero", "prediction"])
         self.losses = one_of("losses", losses, Literal["unknown", "known"])
         self.region, self.heartbeat = "box", None
@@ -304,7 +304,7 @@ def threshold(delta: ArrayLike) -> Float[Array, "..."]:
     report_domain("delta", delta, POSITIVE)
     checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
     if not is_traced(checked) and not np.all(checked > 0):
-        raise fail("delta", "a positive number, or one for each component", shown(np.asarray(checked).tolist()))
+        raise fail("delta", "a positive number, or one for each component", show_value(np.asarray(checked).tolist()))
     return checked
 
 
@@ -316,5 +316,5 @@ def one_of(name: str, value: object, kinds: object) -> Any:
     """
     words = get_args(kinds)
     if not isinstance(value, str) or value not in words:
-        raise fail(name, f"one of {', '.join(words)}", shown(value))
+        raise fail(name, f"one of {', '.join(words)}", show_value(value))
     return value

@@ -53,12 +53,12 @@ def nearest(value: A, reference: Array, angles: Angles) -> A:
     return unwrapped
 
 
-def wrapped(value: A, angles: Angles) -> A:
+def wrap_angles(value: A, angles: Angles) -> A:
     """Return angles (..., n) between -pi and pi; other components are unchanged."""
     return nearest(value, np.zeros(np.shape(value)[-1]), angles)
 
 
-def continued(
+def continue_angles(
     function: Callable[[jax.Array], jax.Array], center: jax.Array, given: Angles, angles: Angles
 ) -> Callable[[jax.Array], jax.Array]:
     """Return the function with its angular results continued from `center`, so that no jump is taken for a change.

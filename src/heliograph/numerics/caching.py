@@ -16,7 +16,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
     """Return the function with its results cached for each object that is its first argument.
 
     An object is identified by `id`, so that nothing is compared, and its entries go with it. Cached arrays are made
@@ -50,7 +50,7 @@ def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, 
     return cast(Callable[Concatenate[S, P], T], known)
 
 
-def shared(make: Callable[[S], T]) -> Callable[[S], T]:
+def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
     """Return the function with what it makes of an object shared by all who ask, as long as one of them holds it.
 
     What is made must hold the object, whose identity is the key.
@@ -67,7 +67,7 @@ def shared(make: Callable[[S], T]) -> Callable[[S], T]:
     return once
 
 
-def cached_arrays(function: Callable[P, T]) -> Callable[P, T]:
+def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
     """Return a function of arguments to be hashed with its results cached, copied at each call.
 
     JAX converts a NumPy array that a trace closes over to the precision of that trace once for all traces: after one in

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.masked import unmasked
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.traced import is_traced, warn_of_single
 from heliograph.numerics.types import ArrayLike, Names, NameWithUnit
 
@@ -33,7 +33,7 @@ class Marked(np.ndarray):
     report: Callable[[str, Domain], None] | None = None
 
 
-def marked(value: object, report: Callable[[str, Domain], None]) -> Marked:
+def mark_checked(value: object, report: Callable[[str, Domain], None]) -> Marked:
     """Return a copy of an array that calls `report(name, domain)` when it is checked."""
     copy = np.array(value, dtype=np.float64).view(Marked)
     copy.report = report
@@ -78,12 +78,12 @@ def fail(name: str, expected: str, got: object) -> InputError:
     return InputError(" ".join(f"{name}: expected {expected}, got {got}".split()))
 
 
-def shown(value: object) -> str:
+def show_value(value: object) -> str:
     """Return anything as a short part of one line."""
     return " ".join(repr(value).split())[:60]
 
 
-def shown_error(error: Exception) -> str:
+def show_error(error: Exception) -> str:
     """Return an error of a user's function as a short part of one line; where JAX cannot trace, what to write."""
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return "one that decides by a value: write jnp.where"
@@ -132,12 +132,12 @@ def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
 
 def _numbers(name: str, value: ArrayLike) -> Any:
     try:
-        numbers = jnp.asarray(value) if is_traced(value) else np.asarray(unmasked(value))
+        numbers = jnp.asarray(value) if is_traced(value) else np.asarray(fill_masked(value))
         if numbers.dtype.kind in "USmM":  # text and dates are no numbers, though they may read as such
             raise ValueError
         known = None if is_traced(value) else numbers.astype(np.float64 if numbers.dtype.kind != "c" else complex)
     except (TypeError, ValueError, OverflowError):
-        raise fail(name, "an array of numbers", shown(value)) from None
+        raise fail(name, "an array of numbers", show_value(value)) from None
     if np.issubdtype(numbers.dtype, np.complexfloating):
         raise fail(name, "real numbers", "complex ones")
     if known is not None:
@@ -171,17 +171,17 @@ def items(name: str, value: object, what: str) -> list[Any]:
             raise TypeError
         return list(cast(Iterable[object], value))
     except TypeError:
-        raise fail(name, f"a list of {what}", shown(value)) from None
+        raise fail(name, f"a list of {what}", show_value(value)) from None
 
 
 def table(name: str, value: object, what: str) -> dict[str, Any]:
     """Return a copy of a dictionary whose keys are names."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
-        raise fail(name, f"a dictionary of {what} by name", shown(value))
+        raise fail(name, f"a dictionary of {what} by name", show_value(value))
     return dict(value)
 
 
-def of_each(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: str = "node") -> list[T]:
+def spread_over_names(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: str = "node") -> list[T]:
     """Return one value for each name, from a value for all of them or a dictionary of just these names."""
     if not isinstance(value, Mapping):
         return [value] * len(names)
@@ -193,14 +193,14 @@ def of_each(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: s
 def instance(name: str, value: object, kind: type[T], what: str) -> T:
     """Return an object of a class."""
     if not isinstance(value, kind):
-        raise fail(name, what, shown(value))
+        raise fail(name, what, show_value(value))
     return value
 
 
 def function(name: str, value: object, of: str) -> Any:
     """Return what can be called."""
     if not callable(value):
-        raise fail(name, f"a function of {of}", shown(value))
+        raise fail(name, f"a function of {of}", show_value(value))
     return value
 
 
@@ -213,7 +213,7 @@ def check_progress(value: object, of: str) -> None:
 def file_path(name: str, value: object) -> Path:
     """Return the path of a file or folder."""
     if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
-        raise fail(name, "a path", shown(value))
+        raise fail(name, "a path", show_value(value))
     return Path(value)
 
 
@@ -222,13 +222,13 @@ def rank(name: str, value: object) -> int:
     try:
         return np.ndim(cast(ArrayLike, value))
     except (TypeError, ValueError, OverflowError):  # rows of different lengths, a set of arrays, a key
-        raise fail(name, "an array of numbers", shown(value)) from None
+        raise fail(name, "an array of numbers", show_value(value)) from None
 
 
 def flag(name: str, value: object) -> bool:
     """Return True or False."""
     if not isinstance(value, bool | np.bool_):
-        raise fail(name, "True or False", shown(value))
+        raise fail(name, "True or False", show_value(value))
     return bool(value)
 
 
@@ -237,7 +237,7 @@ def text(name: str, value: object) -> str:
     return instance(name, value, str, "a text")
 
 
-def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
+def repeat_per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
     """Return a number for each of `count` steps, from one for all or one each."""
     numbers: np.ndarray = np.broadcast_to(array(name, value, (count,) if rank(name, value) else ()), (count,))
     return numbers
@@ -252,7 +252,7 @@ def check_count(name: str, value: object, least: int = 1) -> int:
     """Return a whole number of at least `least`: an int or one of NumPy's, no float and no bool."""
     if not is_whole(value) or value < least:
         expected = "a positive whole number" if least == 1 else f"a whole number of at least {least}"
-        raise fail(name, expected, value if isinstance(value, int | float) else shown(value))
+        raise fail(name, expected, value if isinstance(value, int | float) else show_value(value))
     if value > MOST:
         raise fail(name, f"at most {MOST}", value)
     return int(value)
@@ -261,7 +261,7 @@ def check_count(name: str, value: object, least: int = 1) -> int:
 def check_seed(name: str, value: object) -> int:
     """Return a whole number that 32 bits hold, as the keys of draws do."""
     if not is_whole(value) or not 0 <= value <= MOST:
-        raise fail(name, f"a whole number from 0 to {MOST}", shown(value))
+        raise fail(name, f"a whole number from 0 to {MOST}", show_value(value))
     return int(value)
 
 
@@ -279,7 +279,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
     Whole numbers that doubles cannot tell apart stay what they are.
     """
     if getattr(getattr(value, "dtype", None), "kind", "") == "M":
-        clock: np.ndarray = np.asarray(unmasked(value)).astype("datetime64[ns]")
+        clock: np.ndarray = np.asarray(fill_masked(value)).astype("datetime64[ns]")
         if clock.shape != (count,) or np.isnat(clock).any():
             raise fail(
                 name, f"{count} dates", f"shape {clock.shape}, {np.count_nonzero(np.isnat(clock))} of them missing"
@@ -391,5 +391,5 @@ def names(name: str, value: Names | None, count: int, prefix: str) -> tuple[str,
         return tuple(f"{prefix}{i}" for i in range(count))
     distinct = tuple(name_list(name, value))
     if len(distinct) != count or len(set(distinct)) != count:
-        raise fail(name, f"{count} distinct names", shown(list(distinct)))
+        raise fail(name, f"{count} distinct names", show_value(list(distinct)))
     return distinct

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 
 DATE = re.compile(
     r"(?P<day>\d{4}-\d\d-\d\d)(?:[T ](?P<clock>\d\d:\d\d(?::\d\d(?:[.]\d{1,9})?)?))?"
@@ -39,7 +39,7 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
         # Local times and times with a zone cannot be compared.
         zones.add(zoned)
         if len(zones) > 1:
-            raise fail(f"{name}, row {row}", "a zone with every date or with none", shown(text))
+            raise fail(f"{name}, row {row}", "a zone with every date or with none", show_value(text))
     return np.array(results, dtype=np.int64).view("datetime64[ns]")
 
 
@@ -60,7 +60,7 @@ def moment_of(text: str, name: str) -> tuple[int, bool]:
         return _instant(match), match["zone"] is not None
     except ValueError:
         expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
-        raise fail(name, expected, shown(text)) from None
+        raise fail(name, expected, show_value(text)) from None
 
 
 def _instant(match: re.Match[str]) -> int:
@@ -117,7 +117,7 @@ def unequal_steps(time: np.ndarray) -> str:
     return f"steps of {usual:g} and {longest:g} {unit}".rstrip()
 
 
-def in_iso(time: np.ndarray) -> np.ndarray:
+def format_dates(time: np.ndarray) -> np.ndarray:
     """Dates as texts in UTC, all with as many digits of a second as one of them needs; NaT is empty."""
     there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
     unit = next(unit for unit, size in UNITS.items() if not np.any(there % size))

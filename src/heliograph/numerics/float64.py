@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.collector import no_collector
 from heliograph.numerics.types import PyTree
 
@@ -119,7 +119,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
     return scoped
 
 
-def compiled(function: Callable[P, R]) -> Callable[P, R]:
+def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function once per structure and shapes of its arguments, run it in float64, hand NumPy arrays back.
 
     Numbers in the arguments become arrays first, so that a step counter does not compile anew at each step. Inside a
@@ -147,5 +147,5 @@ def as_array(leaf: object) -> object:
     """Return a number as an array, which compiled code takes as an argument; anything else as it is."""
     value = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
     if isinstance(value, np.ndarray) and value.dtype.kind in "OUS":
-        raise fail("argument", "numbers that a double can hold", shown(leaf))
+        raise fail("argument", "numbers that a double can hold", show_value(leaf))
     return value

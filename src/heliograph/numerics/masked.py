@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 
-def unmasked(value: Any) -> Any:
+def fill_masked(value: Any) -> Any:
     """Return numbers with NaN, or dates with NaT, where they are masked or missing; anything else as it is.
 
     Masked are those of NumPy's masked arrays, also within a list, and None and NA in columns of tables.

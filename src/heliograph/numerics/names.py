@@ -28,7 +28,7 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
         if name in names or name.startswith("_"):
             with no_collector():
                 return load(name)
-        raise AttributeError(f"{package} has no attribute {name!r}{offered(name, _public(package, names))}")
+        raise AttributeError(f"{package} has no attribute {name!r}{suggest_names(name, _public(package, names))}")
 
     return attribute, listed, names
 
@@ -42,7 +42,7 @@ def refuse_attribute(owner: object, name: str, remedies: Mapping[str, str] | Non
     if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
         object.__getattribute__(owner, name)
     public = {other: other for other in object.__dir__(owner) if not other.startswith("_")}
-    remedy = offered(name, public)
+    remedy = suggest_names(name, public)
     if not remedy and name in import_module("heliograph").__all__:
         remedy = f"; write hg.{name}(...)"
     if remedies and name in remedies:
@@ -50,7 +50,7 @@ def refuse_attribute(owner: object, name: str, remedies: Mapping[str, str] | Non
     raise AttributeError(f"{kind.__name__} has no attribute {name!r}{remedy}")
 
 
-def offered(name: str, known: Mapping[str, str]) -> str:
+def suggest_names(name: str, known: Mapping[str, str]) -> str:
     """Return the end of a message that offers the known names most like one that does not exist."""
     near = closest(name, known)
     return f"; closest: {', '.join(near)}" if near else ""

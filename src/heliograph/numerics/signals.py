@@ -49,7 +49,7 @@ def _imports_in_c(frame: FrameType | None) -> bool:
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
+def hold_signals() -> Iterator[None]:
     """Let no signal to stop part what the block does: the first one that comes is raised again at its end.
 
     Only the main thread is interrupted by signals; in others this does nothing.

@@ -32,7 +32,7 @@ DOUBLE = "with np.asarray, or after jax.config.update('jax_enable_x64', True)"
 MEANT_BITS = 12  # of a number of fewer, such as 2^-30, all are meant, whatever its shortest decimal is
 
 
-def rounded_to_single(value: object) -> tuple[float, float] | None:
+def find_rounded_to_single(value: object) -> tuple[float, float] | None:
     """Return the first number of an array that was rounded to single precision, as it was meant and as it is.
 
     Known by its value, in double precision too: it is a number of single precision of many bits, and the shortest
@@ -54,13 +54,13 @@ def warn_of_single(name: str, value: object) -> None:
     """Warn, once in a process, of an array of single precision with a number that was rounded, as JAX makes 0.1."""
     if isinstance(value, jax.core.Tracer) or getattr(value, "dtype", None) != np.float32:
         return
-    rounded = rounded_to_single(value)
+    rounded = find_rounded_to_single(value)
     if rounded is not None:
         got = f"a JAX array of single precision of shape {np.asarray(value).shape}"
-        _say(f"{name}: expected double precision, got {got}, {in_single(rounded)}; make it {DOUBLE}")
+        _say(f"{name}: expected double precision, got {got}, {describe_rounded(rounded)}; make it {DOUBLE}")
 
 
-def in_single(rounded: tuple[float, float]) -> str:
+def describe_rounded(rounded: tuple[float, float]) -> str:
     """Return in words which number was meant, and which it is."""
     return f"{rounded[0]:g} is {rounded[1]:.10g}"
 
@@ -78,7 +78,7 @@ def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[An
     return list(made.consts), shape
 
 
-def traced_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
+def trace_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
     """Return the shape of a function's result, traced in double precision; warn of arrays in it that have less."""
     held, shape = constants(function, *arguments)
     for constant in held:
@@ -103,7 +103,7 @@ def plain(value: Any) -> float | jax.Array:
     return number
 
 
-def stacked(parts: Sequence[object]) -> jax.Array | np.ndarray:
+def stack_parts(parts: Sequence[object]) -> jax.Array | np.ndarray:
     """Stack numbers or arrays of one shape along a new first axis."""
     array: jax.Array | np.ndarray = library(parts).stack(parts)
     return array
@@ -114,7 +114,7 @@ def is_zero(value: Any) -> bool:
     return not is_traced(value) and not np.any(value)
 
 
-def placed(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.ndarray:
+def scatter(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.ndarray:
     """Return an array of zeros of shape `size` with `values` added at `places` (an index of its leading axes).
 
     Values at repeated places add up.

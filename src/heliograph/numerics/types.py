@@ -52,12 +52,12 @@ def unit_of(name: str) -> str:
     return name.unit if isinstance(name, NameWithUnit) else ""
 
 
-def renamed(name: str, new: str) -> str:
+def rename(name: str, new: str) -> str:
     """Return a new name for what has this one: of the same unit."""
     return NameWithUnit(new, name.unit) if isinstance(name, NameWithUnit) else new
 
 
-def with_unit(name: str) -> str:
+def append_unit(name: str) -> str:
     """Return a name with its unit in parentheses, if it has one, as on an axis: "position (m)"."""
     unit = unit_of(name)
     return f"{name} ({unit})" if unit else str(name)

@@ -20,11 +20,11 @@ import scipy
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.types import Float
-from heliograph.planning.budget import PowerLimits, as_budget, power_limits
+from heliograph.planning.budget import PowerLimits, check_budget, power_limits
 from heliograph.planning.moments import check_constant_noise, check_design_plant, measurement_moment, steady_moment
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.realised import with_best_filter
-from heliograph.planning.transmitters import amplified, sent_powers, transmitter_names
+from heliograph.planning.realised import add_best_filter
+from heliograph.planning.transmitters import amplify_transmitter, compute_sent_powers, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.random_affine.superposed import Superposed
@@ -82,7 +82,7 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
     links, unit_channel = links_of(node, second)
     names = [f"{name}.{hop}" for hop in transmitter_names(node.channel)]
     sent = links.present**2 * links.unit
-    limits = power_limits(as_budget(problem.budget), names, np.ones(len(names), dtype=bool), sent[None])
+    limits = power_limits(check_budget(problem.budget), names, np.ones(len(names), dtype=bool), sent[None])
     criterion = error.criterion(network.states)
 
     def covariance(information: np.ndarray) -> np.ndarray:
@@ -92,15 +92,15 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
         return criterion.exact(covariance(links.information(amplitudes))[None])
 
     caps = np.sqrt(np.minimum(limits.peak[0], limits.mean) / links.unit)
-    closed = closed_form(links, limits.total, caps)
+    closed = solve_closed_form(links, limits.total, caps)
     starts = 1 if closed is not None else check_count("starts", problem.starts)
     seed = check_seed("seed", problem.seed)
-    chosen = searched(links, limits.total, caps, value, starts, seed) if closed is None else closed
+    chosen = search_amplitudes(links, limits.total, caps, value, starts, seed) if closed is None else closed
     found = value(chosen)
     bound = found if closed is not None else criterion.exact(covariance(_limit(links, limits, caps))[None])
     channel: AbstractRandomAffine = unit_channel
     for hop, amplitude in zip(transmitter_names(node.channel), chosen, strict=True):
-        channel = amplified(channel, hop, float(amplitude))
+        channel = amplify_transmitter(channel, hop, float(amplitude))
     powers = {name: np.array([power]) for name, power in zip(names, chosen**2 * links.unit, strict=True)}
     return PowerDesign(
         problem=problem,
@@ -112,7 +112,7 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
         sensitivity=dict.fromkeys(names, float("nan")),
         price=float("nan"),
         numbers={},
-        realised=Network(network.plant, {name: with_best_filter(network.plant, node, channel)}),
+        realised=Network(network.plant, {name: add_best_filter(network.plant, node, channel)}),
     )
 
 
@@ -129,7 +129,7 @@ def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[Links, Sup
         raise _unfit(f"{counts} hops and {[link.inputs for link in channel.maps]} numbers")
     unit = channel
     for hop in transmitter_names(channel):
-        whole = amplified(unit, hop, None)
+        whole = amplify_transmitter(unit, hop, None)
         assert isinstance(whole, Superposed)
         unit = whole
     described, now = [second_order(link) for link in unit.maps], [second_order(link) for link in channel.maps]
@@ -137,10 +137,10 @@ def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[Links, Sup
     spread = np.array([float(d.nominal.center[0, 0, 0, 0]) for d in described])
     floor = sum(float(d.nominal.center[0, 0, -1, -1]) for d in described) + float(channel.noise.covariance[0, 0])
     places = [at[0] for at in channel.places]
-    power = np.array(list(sent_powers(unit, second).values()))
+    power = np.array(list(compute_sent_powers(unit, second).values()))
     shared = np.asarray(sensor.noise.covariance)[np.ix_(places, places)]
     noise = np.outer(mean, mean) * shared + np.diag(spread * power)
-    present = np.sqrt(np.array(list(sent_powers(channel, second).values())) / power)
+    present = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
     signs = np.array([np.sign(float(d.mean_gain[0, 0])) for d in now]) * np.sign(mean)
     rows = mean[:, None] * np.asarray(sensor.matrix)[places]
     return Links(rows, noise, power, floor, np.where(signs == 0, 1.0, signs) * present), unit
@@ -165,7 +165,7 @@ def steady_error(
     return np.asarray(prior - prior @ output.T @ gain)
 
 
-def closed_form(links: Links, total: float, caps: Vector) -> Vector | None:
+def solve_closed_form(links: Links, total: float, caps: Vector) -> Vector | None:
     """Best amplitudes of one scalar signal under a total, or under limits of each where noises are independent."""
     _, sizes, right = np.linalg.svd(links.rows)
     if len(sizes) > 1 and sizes[1] > ALIKE * sizes[0]:
@@ -217,7 +217,7 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
     return at(high)
 
 
-def searched(
+def search_amplitudes(
     links: Links, total: float, caps: Vector, value: Callable[[Vector], float], starts: int, seed: int
 ) -> Vector:
     """Amplitudes of the least error that searches from random starts find; signs matter."""

@@ -47,7 +47,7 @@ class Budget(Module):
             raise fail("budget", "a total, a limit per transmitter or a peak", "none")
 
 
-def as_budget(value: object) -> Budget:
+def check_budget(value: object) -> Budget:
     """Budget from one, or from a number: that of the total power."""
     if isinstance(value, Budget):
         return value
@@ -126,7 +126,7 @@ class PowerLimits(NamedTuple):
         return rows / scale[:, None], most / scale
 
 
-def unlimited(steps: int, count: int) -> PowerLimits:
+def make_unlimited(steps: int, count: int) -> PowerLimits:
     """Limits that exclude nothing."""
     return PowerLimits(np.full((steps, count), np.inf), np.full(count, np.inf), np.inf)
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
-from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar, shown
+from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar, show_value
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.planning.added import adds_up, design_added
-from heliograph.planning.budget import as_budget, power_limits, unlimited
+from heliograph.planning.budget import check_budget, make_unlimited, power_limits
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, steady_moment
 from heliograph.planning.numbers.design import design_numbers
@@ -18,7 +18,7 @@ from heliograph.planning.paths.model import Paths
 from heliograph.planning.paths.networks import paths_of
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.realised import BEST, COVERED
-from heliograph.planning.transmitters import selected
+from heliograph.planning.transmitters import select_transmitters
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic import (
     periodic_behind_relays,
@@ -102,7 +102,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         raise fail("design", "a budget of power or a target error", "neither")
     if isinstance(problem.free, Mapping):
         expected = "names of transmitters (numbers are free of a function that returns a network)"
-        raise fail("free", expected, shown(problem.free))
+        raise fail("free", expected, show_value(problem.free))
     if isinstance(problem.network, Network) and adds_up(problem.network):
         return design_added(problem, problem.network)
     starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
@@ -119,13 +119,13 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         if error.steps != len(paths.kappa) or (error.horizon is None) != (paths.plants.start is None):
             raise fail("error", f"that over {len(paths.kappa)} steps for which the paths were made", f"{error.steps}")
         if problem.free is not None:
-            raise fail("free powers of paths", "all of them", shown(problem.free))
+            raise fail("free powers of paths", "all of them", show_value(problem.free))
     # What is free, and its limits.
     chosen = _free(paths, problem.free)
     if problem.budget is None:
-        limits = unlimited(error.steps, int(chosen.sum()))
+        limits = make_unlimited(error.steps, int(chosen.sum()))
     else:
-        limits = power_limits(as_budget(problem.budget), paths.names, chosen, fixed)
+        limits = power_limits(check_budget(problem.budget), paths.names, chosen, fixed)
     criterion = error.criterion(states)
     task = power_task(paths, criterion, limits, chosen, fixed, starts, seed)
     present = task.problem.exact(fixed[:, chosen]) if isinstance(network, Network) else float("nan")
@@ -138,7 +138,7 @@ def _free(paths: Paths, free: Sequence[str] | None) -> Bool[np.ndarray, "hop"]:
         names: Sequence[str] = paths.names
     else:
         names = tuple(items("free", free if not isinstance(free, str) else [free], "names"))
-    chosen = selected(paths.names, names, "free")
+    chosen = select_transmitters(paths.names, names, "free")
     if not np.any(chosen):
         raise fail("free", f"at least one transmitter of {list(paths.names)}", "none: nothing is free")
     return chosen
@@ -162,7 +162,7 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     error = problem.criterion
     if error.weight is not None or error.worst or error.steps > 1 or error.horizon is not None:
         raise fail("error of relays that filter", "the steady trace (slots are the steps)", "another")
-    limits = None if problem.budget is None else as_budget(problem.budget)
+    limits = None if problem.budget is None else check_budget(problem.budget)
     if limits is not None and (limits.total is None or limits.per_transmitter is not None or limits.peak is not None):
         raise fail("budget of relays that filter", "a total for each slot", "other limits")
     # Errors of the designed gains, and of those that minimise each relay's error.

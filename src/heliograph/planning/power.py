@@ -11,14 +11,14 @@ from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.relays import RECEIVER, SENSOR
 from heliograph.model.sensor import AnySensor, is_linear
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
-from heliograph.planning.transmitters import sent_powers, steady_powers
+from heliograph.planning.transmitters import compute_sent_powers, steady_powers
 from heliograph.relays.design import expected_maps, given_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import LOCAL, Network
@@ -131,7 +131,7 @@ def power(
 
 def _powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
     """Return the powers sent at step k for `moment` = E (y, 1)(y, 1)', or in the long run if there is no horizon."""
-    return steady_powers(at(channel, k), moment) if horizon is None else sent_powers(at(channel, k), moment, k)
+    return steady_powers(at(channel, k), moment) if horizon is None else compute_sent_powers(at(channel, k), moment, k)
 
 
 def _sources(network: Network) -> Sources:
@@ -196,7 +196,7 @@ def _draw_moments(
     return {name: np.asarray(y) for name, y in _average_draws(plant, sensors, jnp.asarray(inputs), keys).items()}
 
 
-@compiled
+@compile_in_float64
 def _average_draws(
     plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, keys: jax.Array
 ) -> dict[str, jax.Array]:
@@ -212,7 +212,7 @@ def _average_draws(
             moments = {}
             for draw, (name, sensor) in zip(draws, sensors.items(), strict=True):
                 here = at(sensor, k)
-                y = jnp.append(wrapped(here.measure(x) + here.noise.sample(draw), here.angles), 1.0)
+                y = jnp.append(wrap_angles(here.measure(x) + here.noise.sample(draw), here.angles), 1.0)
                 moments[name] = jnp.outer(y, y)
             return x, moments
 

@@ -10,7 +10,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.budget import Budget, as_budget
+from heliograph.planning.budget import Budget, check_budget
 from heliograph.planning.error import Error
 from heliograph.planning.numbers.problem import Build
 from heliograph.planning.paths.model import Paths
@@ -59,7 +59,7 @@ class DesignProblem:
         Args:
             total: largest mean power of all transmitters together.
         """
-        limits = None if self.budget is None else as_budget(self.budget)
+        limits = None if self.budget is None else check_budget(self.budget)
         budget = Budget(total) if limits is None else Budget(total, limits.per_transmitter, limits.peak)
         return replace(self, budget=budget, target_error=None)
 

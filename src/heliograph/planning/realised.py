@@ -16,7 +16,7 @@ from heliograph.numerics.module import same
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
-from heliograph.planning.paths.model import at_least
+from heliograph.planning.paths.model import check_at_least
 from heliograph.planning.transmitters import allocate, transmitter_names
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -61,7 +61,7 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         for k, second in enumerate(seconds)
     ]
     channels = {name: _make_over_time([step[name] for step in steps]) for name in nodes}
-    designed = {name: with_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
+    designed = {name: add_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
     if len(nodes) > 1:
         # All sensors and channels as one node, for the filter of all that is received.
@@ -70,10 +70,10 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         joint = _make_over_time([joint_sensor({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
         fused = {BEST: linear_filter(plant, joint, _make_over_time([parallel(list(step.values())) for step in steps]))}
     realised = Network(plant, designed, fused)
-    return repeated(realised) if error.period > 1 else realised
+    return repeat_network(realised) if error.period > 1 else realised
 
 
-def repeated(network: Network) -> Network:
+def repeat_network(network: Network) -> Network:
     """Network with everything in it that is OverTime repeated, over as many steps as a run may have."""
 
     def again(leaf: object) -> object:
@@ -93,12 +93,12 @@ def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict
     if unknown := sorted(set(given) - known):
         raise fail("powers of a network", f"names of transmitters {sorted(known)}", unknown)
     return {
-        name: at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))
+        name: check_at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))
         for name, power in given.items()
     }
 
 
-def with_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
+def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     """Return the node with this channel, and the best linear filter behind it."""
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or same(channel, node.channel):

@@ -17,7 +17,7 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
-from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, with_inner_maps
+from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, replace_inner_maps
 from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
@@ -116,7 +116,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
         case _:
             expected = "hops in series, stacks, sums, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
-    return with_inner_maps(channel, visited), position
+    return replace_inner_maps(channel, visited), position
 
 
 def _number_maps(
@@ -206,7 +206,7 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     return list(names)
 
 
-def selected(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
+def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
     """Mask of the names that are chosen, by name or by what stands before a dot.
 
     Raises:
@@ -221,7 +221,7 @@ def selected(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarr
     return chosen_mask
 
 
-def sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
+def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
     """Power of each transmitter at a step, the mean square of what it sends, from E (y, 1)(y, 1)' of the input.
 
     Exact: modes have the law of the step.
@@ -280,17 +280,17 @@ def allocate(
     """
     for name in transmitter_names(channel):  # in order: a relay receives what those before it send
         if name in powers:
-            now = sent_powers(channel, second, step)[name]
+            now = compute_sent_powers(channel, second, step)[name]
             if now <= 0 < powers[name]:
-                channel = amplified(channel, name, None)
-                now = sent_powers(channel, second, step)[name]
+                channel = amplify_transmitter(channel, name, None)
+                now = compute_sent_powers(channel, second, step)[name]
             if now <= 0 < powers[name]:
                 raise fail(f"transmitter {name!r}", "a signal that can be amplified", "none")
-            channel = amplified(channel, name, np.sqrt(powers[name] / now) if now > 0 else 0.0)
+            channel = amplify_transmitter(channel, name, np.sqrt(powers[name] / now) if now > 0 else 0.0)
     return channel
 
 
-def amplified(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
+def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
     """Channel in which a transmitter amplifies by this factor more; None: sends what it receives, whatever it sent."""
 
     def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:

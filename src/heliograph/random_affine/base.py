@@ -11,9 +11,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.numerics.check import array, fail, items, shown
+from heliograph.numerics.check import array, fail, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, stacked
+from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Float, PyTree
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.moments.monomials import Moments, count
@@ -127,7 +127,7 @@ class AbstractRandomAffine(Module):
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
         """Return E[Sym^order(H)] of each of the `extremes`."""
-        return stacked([m.moments(order).matrix for m in self.extremes()])
+        return stack_parts([m.moments(order).matrix for m in self.extremes()])
 
     def mean_gain(self) -> "AbstractRandomAffine":
         """Return the map whose gains are constant at their means; noises stay."""
@@ -163,7 +163,7 @@ class AbstractComposite(AbstractRandomAffine):
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the same map made of others."""
-        return with_inner_maps(self, parts)
+        return replace_inner_maps(self, parts)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return the same map made of each combination of the parts' extremes."""
@@ -228,7 +228,7 @@ def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     return [m for affine in inner_maps(channel) for m in (affine, *all_inner_maps(affine))]
 
 
-def with_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
+def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
     leaves, tree = _fields(channel)
     among, new = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
@@ -290,14 +290,14 @@ class Remembered(NamedTuple):
 def begin(channel: AbstractRandomAffine, key: jax.Array, keys: Sequence[jax.Array]) -> Remembered:
     """State before the first draw of a map that holds modes, with one key for each of `memories`."""
     states = tuple(m.begin(k) for m, k in zip(memories(channel).values(), keys, strict=True))
-    return Remembered(states, given(channel, states).init(key))
+    return Remembered(states, condition_on_memories(channel, states).init(key))
 
 
 def advance(
     channel: AbstractRandomAffine, state: Remembered, key: jax.Array, keys: Sequence[jax.Array]
 ) -> tuple[Remembered, jax.Array]:
     """H given the memories' states, and the states that follow."""
-    rest, h = given(channel, state.memories).draw(state.rest, key)
+    rest, h = condition_on_memories(channel, state.memories).draw(state.rest, key)
     held = memories(channel).values()
     return Remembered(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
 
@@ -318,7 +318,7 @@ def distinct(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
     return results
 
 
-def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
+def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
     """The map that forgets which modes, for the states of its `memories`; whatever is combined of maps stays so."""
     assert isinstance(channel, AbstractRandomAffine)
     by_identity = dict(zip(memories(channel), states, strict=True))
@@ -330,10 +330,10 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
     return memoryless
 
 
-def without_names(channel: T) -> T:
+def drop_names(channel: T) -> T:
     """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
     held = memories(channel)
-    return with_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
+    return replace_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
 
 
 def independent(maps: Sequence[T]) -> list[T]:
@@ -342,7 +342,7 @@ def independent(maps: Sequence[T]) -> list[T]:
     for index, affine in enumerate(maps):
         held = memories(affine)
         again = {key: m.labelled(f"{key} of {index}") for key, m in held.items() if m.name is None and key in taken}
-        apart.append(with_memories(affine, again))
+        apart.append(replace_memories(affine, again))
         taken |= set(held)
     return apart
 
@@ -356,10 +356,10 @@ def one_memory(maps: Sequence[T]) -> list[T]:
         {key: m.labelled(label) for (key, m), label in zip(held.items(), by_map[0], strict=True) if m.name is None}
         for held in by_map
     ]
-    return [with_memories(affine, twins) for affine, twins in zip(maps, labels, strict=True)]
+    return [replace_memories(affine, twins) for affine, twins in zip(maps, labels, strict=True)]
 
 
-def with_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
+def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
     """The map with other memories in place of those of these identities."""
 
     def replaced(leaf: PyTree) -> PyTree:
@@ -375,14 +375,14 @@ def _is_modal(leaf: object) -> bool:
     return isinstance(leaf, AbstractModal)
 
 
-def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
+def check_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
     """Check that `maps` is a sequence of at least one random affine map, and return it as a tuple."""
     checked = tuple(items(name, maps, "random affine maps"))
     if not checked:
         raise fail(name, "at least one map", "none")
     for affine in checked:
         if not isinstance(affine, AbstractRandomAffine):
-            raise fail(name, "random affine maps (hops, and maps made of them)", shown(affine))
+            raise fail(name, "random affine maps (hops, and maps made of them)", show_value(affine))
     return checked
 
 

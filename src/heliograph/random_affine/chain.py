@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss, hermevander
 
-from heliograph.numerics.caching import cached_arrays
+from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import (
     PROBABILITY,
     PROBABILITY_TOLERANCE,
@@ -27,7 +27,7 @@ from heliograph.numerics.check import (
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.law import drawn_index
+from heliograph.random_affine.law import draw_index
 
 Rows = Float[jax.Array | np.ndarray, "modes modes"]
 Law = Float[jax.Array | np.ndarray, " modes"]
@@ -141,11 +141,11 @@ class MarkovChain(AbstractMemory):
 
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw the mode at the first use."""
-        return drawn_index(self.initial, key)
+        return draw_index(self.initial, key)
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
         """Draw the next mode."""
-        return drawn_index(jnp.asarray(self.transition)[state], key)
+        return draw_index(jnp.asarray(self.transition)[state], key)
 
     def nodes(self, degree: int) -> Nodes:
         """The modes."""
@@ -249,7 +249,7 @@ def _binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     return binomial
 
 
-@cached_arrays
+@cache_arrays
 def _hermite(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
     x, w = hermegauss(count)

@@ -10,16 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.caching import cached
-from heliograph.numerics.check import array, fail, shown
-from heliograph.numerics.traced import library, placed, stacked
+from heliograph.numerics.caching import cache_by_object
+from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.traced import library, scatter, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import (
     AbstractComposite,
     AbstractRandomAffine,
     AbstractUniform,
-    as_maps,
     check_forgets,
+    check_maps,
 )
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.moments.monomials import (
@@ -74,7 +74,7 @@ class GainAndNoise(AbstractHop):
         self, law: AbstractLaw, matrix: "Float[ArrayLike, 'm p']", noise: "AbstractNoise | Float[ArrayLike, '*m']"
     ):
         if not isinstance(law, AbstractLaw):
-            raise fail("gain of a hop", "a law (Constant for a number)", shown(law))
+            raise fail("gain of a hop", "a law (Constant for a number)", show_value(law))
         self.law = law
         self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
@@ -93,14 +93,14 @@ class GainAndNoise(AbstractHop):
         """Always False: draws are independent over time."""
         return False
 
-    @cached
+    @cache_by_object
     def moments(self, order: int) -> Moments:
         """Return sum_k E[g^k] B_k, with B_k the `gain_coefficients`."""
         gains = gain_moments(self.law, order)
         basis = self.gain_coefficients(order)
         return Moments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
 
-    @cached
+    @cache_by_object
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
         """Return B_k: E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)], |b| = k."""
         rows, columns = count(self.outputs + 1, order), count(self.inputs + 1, order)
@@ -108,7 +108,7 @@ class GainAndNoise(AbstractHop):
         deterministic = symmetric_power(homogeneous(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
         row, column, rest, ways = sum_plan(self.outputs, order)
         terms = (ways * noise_vector(self.noise, order)[rest])[:, None] * deterministic[column]
-        return placed((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
+        return scatter((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return one map for each extreme law of the gain."""
@@ -141,7 +141,7 @@ def homogeneous(matrix: Matrix) -> Matrix:
 def gain_moments(law: AbstractLaw, order: int) -> Vector:
     """Return E[g^k] for k = 0, ..., order."""
     moment = law.moment  # of a module, whose methods are slow to look up
-    return stacked([moment(k) for k in range(order + 1)])
+    return stack_parts([moment(k) for k in range(order + 1)])
 
 
 def known(matrix: "Float[ArrayLike, 'm p']", offset: "Float[ArrayLike, ' m'] | None" = None) -> GainAndNoise:
@@ -196,7 +196,7 @@ class Series(AbstractCombination):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
-        self.maps = as_maps("series", maps)
+        self.maps = check_maps("series", maps)
         for first, second in zip(self.maps, self.maps[1:], strict=False):
             if first.outputs != second.inputs:
                 raise fail("series", f"a map that takes {first.outputs} inputs", f"one that takes {second.inputs}")
@@ -212,7 +212,7 @@ class Series(AbstractCombination):
         then = _compose_draws if self.erases else jnp.matmul
         return state, reduce(lambda h, matrix: then(matrix, h), drawn)
 
-    @cached
+    @cache_by_object
     def moments(self, order: int) -> Moments:
         """E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
@@ -220,7 +220,7 @@ class Series(AbstractCombination):
                         self.maps[0].moments(order).matrix)  # fmt: skip
         return Moments(matrix, self.outputs, self.inputs, order)
 
-    @cached
+    @cache_by_object
     def corner_moments(self, order: int) -> Corners:
         """Products of the parts' corners."""
         first, *rest = (m.corner_moments(order) for m in self.maps)
@@ -260,7 +260,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         weights: "Float[ArrayLike, ' maps']",
         radius: "Float[ArrayLike, '*maps']" = 0.0,
     ):
-        self.maps = as_maps("mixture", maps)
+        self.maps = check_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         self.check_shapes("mixture")
 
@@ -270,12 +270,14 @@ class Mixture(AbstractUniform, AbstractCombination):
         state, drawn = self._draw_each(state, keys)
         return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
 
-    @cached
+    @cache_by_object
     def moments(self, order: int) -> Moments:
         """sum_i p_i E[Sym^k(H_i)]."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix for m in self.maps]
-        matrix = library(parts, self.choice.probabilities).tensordot(self.choice.probabilities, stacked(parts), axes=1)
+        matrix = library(parts, self.choice.probabilities).tensordot(
+            self.choice.probabilities, stack_parts(parts), axes=1
+        )
         return Moments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
@@ -287,12 +289,12 @@ class Mixture(AbstractUniform, AbstractCombination):
             for parts in product(*(m.extremes() for m in self.maps))
         )
 
-    @cached
+    @cache_by_object
     def corner_moments(self, order: int) -> Corners:
         """The corners of the weights, with every combination of the maps' corners."""
         parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
         chosen = np.array(list(product(*(range(len(corners)) for corners in parts)))).T
-        combined = stacked([corners[which] for corners, which in zip(parts, chosen, strict=True)])
+        combined = stack_parts([corners[which] for corners, which in zip(parts, chosen, strict=True)])
         items = library(weights, combined).tensordot(weights, combined, axes=1)
         flat: Matrix = items.reshape(-1, *items.shape[2:])
         return flat
@@ -317,7 +319,7 @@ class Stack(AbstractCombination):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
-        self.maps = as_maps("stack", maps)
+        self.maps = check_maps("stack", maps)
         if len({m.inputs for m in self.maps}) != 1:
             raise fail("stack", "maps of one number of inputs", [m.inputs for m in self.maps])
 
@@ -332,14 +334,14 @@ class Stack(AbstractCombination):
         rows = [h[:-1] for h in drawn]
         return state, jnp.concatenate([*rows, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
-    @cached
+    @cache_by_object
     def moments(self, order: int) -> Moments:
         """E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
         check_forgets("moments of a map", self)
         refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
         items = [m.moments(order) for m in self.maps]
         tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in items]
-        return Moments(stacked(stack_rows(self, order, tables, multiply)), self.outputs, self.inputs, order)
+        return Moments(stack_parts(stack_rows(self, order, tables, multiply)), self.outputs, self.inputs, order)
 
 
 def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]) -> list[Any]:

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.numerics.check import check_count, fail, instance, shown
+from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
 from heliograph.random_affine.law import Discrete
@@ -85,7 +85,7 @@ class Delayed(AbstractDelayLine):
     timestamped: bool = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, delay: Delay, timestamped: bool = False):
-        (self.link,) = as_maps("delayed link", [link])
+        (self.link,) = check_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
         self.times, self.timestamped = _times(delay), instance("timestamped", timestamped, bool, "True or False")
@@ -131,7 +131,7 @@ def _times(delay: Delay) -> tuple[int, ...]:
         case int() | np.integer():
             values = [delay]
         case _:
-            raise fail("delay", "a number of steps, a Discrete law or a MarkovChain of it", shown(delay))
+            raise fail("delay", "a number of steps, a Discrete law or a MarkovChain of it", show_value(delay))
     return tuple(check_count("delay", d, 0) for d in values)
 
 
@@ -143,7 +143,7 @@ def _chosen(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
     return known(np.pad(rows, ((0, 1), (0, 0))), np.append(np.zeros(size), float(d)))
 
 
-def on_delay_line(channel: T) -> T:
+def place_on_delay_line(channel: T) -> T:
     """The channel (or all channels in a tree) as a plain map of the line."""
 
     def plain(leaf: object) -> object:
@@ -158,11 +158,11 @@ def signal_size(channel: AbstractRandomAffine) -> int:
     return channel.inputs // (1 + channel.past)
 
 
-def of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
+def place_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
     """The channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
     longest, size = channel.past, signal_size(channel)
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
-    chosen = Series([known(np.eye((1 + past) * total)[rows]), on_delay_line(channel) if longest else channel])
+    chosen = Series([known(np.eye((1 + past) * total)[rows]), place_on_delay_line(channel) if longest else channel])
     return DelayLine(chosen, past) if past else chosen
 
 
@@ -227,9 +227,9 @@ class Relayed(AbstractDelayLine):
     @property
     def line(self) -> AbstractRandomAffine:
         """Return the stages in series, each fed by the storage of the one before."""
-        size, whole = signal_size(self.stages[0]), on_delay_line(self.stages[0])
+        size, whole = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
-            whole = Series([DelayedLine(whole, size, stage.past), on_delay_line(stage)])
+            whole = Series([DelayedLine(whole, size, stage.past), place_on_delay_line(stage)])
         return whole
 
     @property
@@ -238,14 +238,14 @@ class Relayed(AbstractDelayLine):
         return sum(stage.past for stage in self.stages)
 
 
-def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
+def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """Return links in series, each with its own delay; constant delays add up.
 
     A relay without memory that stores what it received for a constant d equals one that receives it d steps later:
     gains and noises are independent over time. One that stores it for a random time may forward one value twice, with
     one noise.
     """
-    links = as_maps("series", links)
+    links = check_maps("series", links)
     if not any(link.past for link in links):
         return Series(links)
     # A stage is a link with a random delay and all that follow it with constant ones.

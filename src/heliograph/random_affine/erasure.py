@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.traced import is_traced, plain
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_forgets, check_maps
 from heliograph.random_affine.combine import Series, Stack, known
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.moments.second_moments import second_moment_tensor
@@ -24,7 +24,7 @@ class Erasure(AbstractWrapper):
     arrival: Float[jax.Array | np.ndarray, ""]
 
     def __init__(self, base: AbstractRandomAffine, arrival: ArrayLike):
-        (self.base,) = as_maps("erasure", [base])
+        (self.base,) = check_maps("erasure", [base])
         self.arrival = scalar("arrival probability", arrival, 0.0, 1.0)
 
     @property
@@ -44,15 +44,15 @@ class Erasure(AbstractWrapper):
         raise fail("moments of a channel", "one without erasures (give the filter what is inside)", "an erasure")
 
 
-def arrived(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+def condition_on_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return the channel given that everything arrives, where losses are independent of gains."""
     if not channel.erases:
         return channel
     match channel:
         case Erasure():
-            return arrived(channel.base)
+            return condition_on_arrival(channel.base)
         case Series() | Stack():
-            return channel.rebuilt(*map(arrived, channel.maps))
+            return channel.rebuilt(*map(condition_on_arrival, channel.maps))
     raise fail("channel", "erasures of channels, not mixtures of them", type(channel).__name__)
 
 

@@ -14,10 +14,10 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics import check
-from heliograph.numerics.caching import cached
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, radii, scalar
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
+from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 
 Scalar = Float[jax.Array | np.ndarray, ""]
@@ -26,7 +26,7 @@ Vector = Float[jax.Array | np.ndarray, " n"]
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
-def drawn_index(probabilities: Vector, key: jax.Array) -> jax.Array:
+def draw_index(probabilities: Vector, key: jax.Array) -> jax.Array:
     """Draw one of finitely many: invert the distribution function at a uniform draw."""
     return jnp.sum(jax.random.uniform(key, dtype=float) > jnp.cumsum(jnp.asarray(probabilities))[:-1])
 
@@ -52,7 +52,7 @@ class AbstractLaw(Module):
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
         """Return E[g^k], k = 0, ..., order, of each of the `extremes`."""
-        return stacked([stacked([law.moment(k) for k in range(order + 1)]) for law in self.extremes()])
+        return stack_parts([stack_parts([law.moment(k) for k in range(order + 1)]) for law in self.extremes()])
 
     def mean_law(self) -> "Constant":
         """Return the constant law at E[g], for a filter that takes the mean gain as the true one."""
@@ -93,7 +93,7 @@ class Discrete(AbstractLaw):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Invert the distribution function at a uniform draw."""
-        return jnp.asarray(self.values)[drawn_index(self.probabilities, key)]
+        return jnp.asarray(self.values)[draw_index(self.probabilities, key)]
 
     def moment(self, order: int) -> float | jax.Array:
         """Return sum_i p_i v_i^order."""
@@ -125,9 +125,9 @@ class Discrete(AbstractLaw):
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
         """E[g^k], k = 0, ..., order, of each of the `extremes`."""
         corners = self.corners()
-        return stacked([corners @ self.values**k for k in range(order + 1)]).T
+        return stack_parts([corners @ self.values**k for k in range(order + 1)]).T
 
-    @cached
+    @cache_by_object
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
         """Corners of the polytope of probabilities: each but one at an end of its interval.
 

@@ -10,18 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import array, check_count, fail, instance, scalar, shown
+from heliograph.numerics.check import array, check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library, stacked
+from heliograph.numerics.traced import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import (
     AbstractModal,
     AbstractRandomAffine,
     AbstractUniform,
     AbstractWrapper,
-    as_maps,
     check_forgets,
-    given,
+    check_maps,
+    condition_on_memories,
     inner_maps,
     memories,
 )
@@ -51,8 +51,8 @@ class Modes(AbstractUniform, AbstractModal):
 
     def __init__(self, chain: MarkovChain, maps: Sequence[AbstractRandomAffine]):
         if not isinstance(chain, MarkovChain):
-            raise fail("chain", "a MarkovChain", shown(chain))
-        self.memory, self.maps = chain, as_maps("maps of the modes", maps)
+            raise fail("chain", "a MarkovChain", show_value(chain))
+        self.memory, self.maps = chain, check_maps("maps of the modes", maps)
         if len(self.maps) != chain.modes:
             raise fail("maps of the modes", f"{chain.modes}, one for each mode", len(self.maps))
         self.check_shapes("maps of the modes")
@@ -162,7 +162,7 @@ class Faded(AbstractHop, AbstractModal):
         noise: "AbstractNoise | Float[ArrayLike, '*m']",
     ):
         if not isinstance(drift, Autoregression):
-            raise fail("drift", "an Autoregression", shown(drift))
+            raise fail("drift", "an Autoregression", show_value(drift))
         self.memory, self.mean = drift, scalar("mean gain", mean)
         self.deviation = scalar("deviation of the gain", deviation, 0.0)
         self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
@@ -193,7 +193,7 @@ class JointModes(Module):
 
     def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
         """Return E[Sym^order(H) | mode] of each mode; times transition[i, j], it is block (j, i) of joint moments."""
-        return stacked([m.moments(order).matrix for m in self.maps])
+        return stack_parts([m.moments(order).matrix for m in self.maps])
 
 
 def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: int = 1) -> JointModes:
@@ -223,7 +223,10 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     # Independent memories: their laws multiply.
     initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
     transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
-    maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(chain.states for chain in chains)))
+    maps = tuple(
+        condition_on_memories(channel, [s.item() for s in chosen])
+        for chosen in product(*(chain.states for chain in chains))
+    )
     for m in maps:
         check_forgets("channel of a filter", m)
     most = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
@@ -259,10 +262,10 @@ def forgetful(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """
     if not channel.remembers:
         return channel
-    return mixed(joint_modes(channel, order=2))
+    return mix_maps(joint_modes(channel, order=2))
 
 
-def mixed(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
+def mix_maps(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
     """One of the modes' maps, by a law (that of the long run unless given)."""
     in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
     return Mixture(modes.maps, in_the_long_run / in_the_long_run.sum() if law is None else law)

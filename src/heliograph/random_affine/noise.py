@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.factors.columns import Columns, columns_of, eliminated, square_root
+from heliograph.factors.columns import Columns, columns_of, eliminate, square_root
 from heliograph.numerics import check
-from heliograph.numerics.check import array, fail, instance, items, shown
+from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
+from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.law import drawn_index
+from heliograph.random_affine.law import draw_index
 from heliograph.random_affine.moments.monomials import Exponents, exponents
 
 FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
@@ -75,7 +75,7 @@ class Gaussian(AbstractNoise):
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
-            self.factor, self.weights = eliminated(jnp.asarray(self.covariance))
+            self.factor, self.weights = eliminate(jnp.asarray(self.covariance))
             return
         self.factor = _root(self.covariance)
         self.weights = np.ones(n)
@@ -150,7 +150,7 @@ class FiniteSupport(AbstractNoise):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Invert the distribution function at a uniform draw."""
-        return jnp.asarray(self.atoms)[drawn_index(self.probabilities, key)]
+        return jnp.asarray(self.atoms)[draw_index(self.probabilities, key)]
 
     def moment(self, powers: Exponents) -> Number:
         """Return sum_s p_s prod_i atom_si^powers_i."""
@@ -170,7 +170,7 @@ class Independent(AbstractNoise):
             raise fail("independent noises", "at least one", "none")
         for component in self.parts:
             if not isinstance(component, AbstractNoise):
-                raise fail("independent noises", "laws of a noise vector", shown(component))
+                raise fail("independent noises", "laws of a noise vector", show_value(component))
         means, blocks = [component.mean for component in self.parts], [component.covariance for component in self.parts]
         self.mean = library(means).concatenate(means)
         self.covariance = scipy_for(blocks).linalg.block_diag(*blocks)
@@ -288,7 +288,7 @@ def components(value: NoiseLike) -> int | None:
     try:
         shape = np.shape(value) if not is_traced(value) else jnp.asarray(value).shape
     except ValueError:  # rows of different lengths
-        raise fail("noise", "a variance, a covariance or a law", shown(value)) from None
+        raise fail("noise", "a variance, a covariance or a law", show_value(value)) from None
     return shape[0] if shape else None
 
 
@@ -296,4 +296,4 @@ def components(value: NoiseLike) -> int | None:
 def noise_vector(noise: AbstractNoise, order: int) -> Vector:
     """E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
     moment = noise.moment  # of a module, whose methods are slow to look up
-    return stacked([moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])
+    return stack_parts([moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])

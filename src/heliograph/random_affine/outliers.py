@@ -13,7 +13,7 @@ from heliograph.numerics import check
 from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.random_affine.law import drawn_index
+from heliograph.random_affine.law import draw_index
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Number, Square, Vector
 
@@ -168,7 +168,7 @@ class Contaminated(AbstractNoise):
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw the branch, then from it."""
         first, second = jax.random.split(key)
-        branch = drawn_index(self.shares, first)
+        branch = draw_index(self.shares, first)
         laws = [Gaussian(r, m) for r, m in zip(self.covariances, self.means, strict=True)]
         return jnp.stack([law.sample(second) for law in laws])[branch]
 

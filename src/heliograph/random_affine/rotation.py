@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.caching import cached
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import scalar
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
@@ -50,7 +50,7 @@ class Rotation(AbstractRandomAffine):
         c, s = jnp.cos(phi), jnp.sin(phi)
         return jnp.stack([jnp.stack([c, -s, 0 * c]), jnp.stack([s, c, 0 * c]), jnp.array([0.0, 0.0, 1.0])])
 
-    @cached
+    @cache_by_object
     def moments(self, order: int) -> Moments:
         """Return Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), C the map to w and its conjugate."""
         turns = np.array([p - q for p, q, _ in exponents(3, order)])

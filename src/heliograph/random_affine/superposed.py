@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.caching import cached, cached_arrays
-from heliograph.numerics.check import check_count, fail, instance, items, shown
-from heliograph.numerics.traced import library, placed
+from heliograph.numerics.caching import cache_arrays, cache_by_object
+from heliograph.numerics.check import check_count, fail, instance, items, show_value
+from heliograph.numerics.traced import library, scatter
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.combine import (
     AbstractCombination,
     Corners,
@@ -63,7 +63,7 @@ class Superposed(AbstractCombination):
     def __init__(
         self, maps: Sequence[AbstractRandomAffine], noise: AbstractNoise, places: Sequence[Places], inputs: int
     ):
-        self.maps, self.taken = as_maps("sum", maps), check_count("inputs of a sum", inputs)
+        self.maps, self.taken = check_maps("sum", maps), check_count("inputs of a sum", inputs)
         self.noise = instance("noise of a sum", noise, AbstractNoise, "a law of a noise vector")
         self.places = tuple(
             tuple(check_count("place in the input of a sum", i, 0) for i in items("places of a map", chosen, "places"))
@@ -71,7 +71,7 @@ class Superposed(AbstractCombination):
         )
         if [len({i for i in chosen if i < inputs}) for chosen in self.places] != [m.inputs for m in self.maps]:
             expected = f"distinct ones below {inputs}, as many as each map has inputs"
-            raise fail("places of the maps of a sum", expected, shown(places))
+            raise fail("places of the maps of a sum", expected, show_value(places))
         if sizes := {m.outputs for m in self.maps} - {noise.dimension}:
             raise fail("sum", f"maps of {noise.dimension} outputs, as the noise has", f"maps of {sorted(sizes)}")
 
@@ -109,7 +109,7 @@ class Superposed(AbstractCombination):
             return np.zeros((self.outputs,) * axes + (size,) * axes)
         flat = [part.reshape(*part.shape[:-axes], -1) for part in parts.values()]
         values = library(flat).concatenate(flat, axis=-1)
-        whole = placed(
+        whole = scatter(
             (size**axes, *values.shape[:-1]), np.concatenate(where), values.transpose(-1, *range(values.ndim - 1))
         )
         return whole.transpose(*range(1, whole.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
@@ -123,14 +123,14 @@ class Superposed(AbstractCombination):
         top = jnp.concatenate([gains, offset[:, None]], axis=1)
         return state, jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
-    @cached
+    @cache_by_object
     def moments(self, order: int) -> Moments:
         """E[z^a | y] by halves."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix[None] for m in self.maps]
         return Moments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
 
-    @cached
+    @cache_by_object
     def corner_moments(self, order: int) -> Corners:
         """The same with every combination of the maps' corners."""
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
@@ -171,7 +171,7 @@ def _terms(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers
     return _Powers(ordered, by_degree)
 
 
-@cached_arrays
+@cache_arrays
 def _find_degree(outputs: int, degree: int, order: int) -> np.ndarray:
     """Positions at `order` of the monomials of z alone of this degree, times powers of 1."""
     alone = factors(outputs, degree)
@@ -199,13 +199,13 @@ def _plus(a: _Powers, b: _Powers, outputs: int) -> _Powers:
             right = b.by_degree[degree - first][None, :, other, None, :]
             products = (left * right).reshape(corners, len(row), -1)
             where = _products(left_variables, right_variables, first, degree - first, size).reshape(-1)
-            rows = placed((count(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
-            total = total + placed((count(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
+            rows = scatter((count(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
+            total = total + scatter((count(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
         by_degree.append(total.transpose(2, 1, 0))
     return _Powers(places, by_degree)
 
 
-@cached_arrays
+@cache_arrays
 def _ways(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     """Terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
     names = exponents(outputs + 1, degree)
@@ -217,7 +217,7 @@ def _ways(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     return tuple(tuple(np.array(column) for column in zip(*terms, strict=True)) for terms in ways)
 
 
-@cached_arrays
+@cache_arrays
 def _products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
     """Positions of the products of monomials of two sets of variables among those of all `size`."""
     left, right = np.array(a)[factors(len(a), first)], np.array(b)[factors(len(b), second)]

@@ -10,11 +10,11 @@ import numpy as np
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
-from heliograph.model.estimate import given_bounds
+from heliograph.model.estimate import lower_to_upper
 from heliograph.model.premise import Premise, believing
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import (
@@ -73,7 +73,7 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     return as_design(network, _propagate(steps, start_moments(network), joined))
 
 
-_propagate = compiled(propagate)
+_propagate = compile_in_float64(propagate)
 
 
 def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
@@ -158,7 +158,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
         moved = transition, gain, offset
         arrays = Gains(*moved, *moved, expected, constant, *believed)
-        schedules[name] = Schedule(arrays, network.initial()[0], given_bounds("exact", network))
+        schedules[name] = Schedule(arrays, network.initial()[0], lower_to_upper("exact", network))
     relayed = {name: schedules[name].gains.gain for name in network.relays}
     premise = Premise(network.plant, relays=network, gains=relayed)
     return {name: believing(schedule, premise) for name, schedule in schedules.items()}
@@ -173,7 +173,7 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
         raise fail("design", "one from the network's start on", got)
 
 
-@compiled
+@compile_in_float64
 def _predict_covariances(steps: Steps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
     """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
     return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
@@ -231,7 +231,7 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     Raises:
         ValueError: gains of the wrong shape, a relay without gains.
     """
-    return lmmse(receiver_system(network, gains), given_bounds("exact", network))
+    return lmmse(receiver_system(network, gains), lower_to_upper("exact", network))
 
 
 def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:
@@ -322,7 +322,7 @@ def relay_side(p: Steps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"
     return RelaySide(moved[:known, :known], moved[known:, :known], white)
 
 
-@compiled
+@compile_in_float64
 def _sides(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
     """`relay_side` at each step."""
 

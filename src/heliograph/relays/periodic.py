@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import fixed_point, on_entries
+from heliograph.linear.jump_system import make_entry_matrix, solve_fixed_point
 from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
-from heliograph.numerics.check import fail, instance, per_step
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.check import fail, instance, repeat_per_step
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.linalg import psd_solve, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -117,7 +117,7 @@ def check_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -
 def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:
     """M = step(M) for an affine map of symmetric (d, d) matrices."""
     constant, linear = jax.linearize(step, jnp.zeros((d, d)))
-    return jnp.asarray(fixed_point(jax.vmap(linear), constant))
+    return jnp.asarray(solve_fixed_point(jax.vmap(linear), constant))
 
 
 def steady(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Propagated:
@@ -177,19 +177,19 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     return jnp.asarray(period(affine_fixed_point(lambda e: period(e)[0], d))[1])
 
 
-_steady = compiled(steady)
-_steady_behind = compiled(steady_behind)
+_steady = compile_in_float64(steady)
+_steady_behind = compile_in_float64(steady_behind)
 
 
-@compiled
+@compile_in_float64
 def _operator(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
     """Linear part of one period of the second moments."""
     d = gains.shape[1] + steps.transition.shape[-1]
     _, linear = jax.linearize(lambda m: propagate(steps, m, gains).moments[-1], jnp.zeros((d, d)))
-    return jnp.asarray(on_entries(jax.vmap(linear), (d, d)))
+    return jnp.asarray(make_entry_matrix(jax.vmap(linear), (d, d)))
 
 
-@compiled
+@compile_in_float64
 def _solve_local_steady(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
     """Repeat the period until its moments change by less than CONVERGED."""
 
@@ -282,7 +282,7 @@ def _tune(
     unit = _units(network, start)[where]
     # Scaled gains x, and a multiplier for the power of each slot.
     slots = len(network.slots)
-    limit = np.full(slots, np.inf) if power_limit is None else per_step("power limit", power_limit, slots)
+    limit = np.full(slots, np.inf) if power_limit is None else repeat_per_step("power limit", power_limit, slots)
     limit = np.where(steps.talks[:, 1:].any(axis=1), limit, np.inf)  # silent relays send nothing, whatever they may
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
     if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
@@ -353,7 +353,7 @@ def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.
         (cost, power), gradient = jax.value_and_grad(inner, has_aux=True)(x)
         return cost, gradient, power
 
-    return compiled(value)
+    return compile_in_float64(value)
 
 
 def _receiver_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.relays import RelayNetwork, Steps
-from heliograph.numerics.check import array, check_count, fail, instance, per_step
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.check import array, check_count, fail, instance, repeat_per_step
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (
@@ -62,7 +62,7 @@ class Limited(NamedTuple):
 def power_limit_of(steps: Steps, value: ArrayLike, d: int) -> PowerLimit:
     """The limit on the moments after each step, from one on the power that all relays send at each step."""
     horizon = len(steps.live)
-    limit = per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
+    limit = repeat_per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
     mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
     talkers = steps.talks[:, 1:].sum(axis=1)
     fixed = mean_signal * talkers  # estimates are unbiased: E s = E x
@@ -133,7 +133,7 @@ def _inside(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Fl
     return smaller(low)
 
 
-@compiled
+@compile_in_float64
 def _judge(problem: Limited, gains: Float[Array, "time Fn R"]) -> tuple[Float[Array, ""], Float[Array, "time"]]:
     """The cost of given gains, and the part of each limit that they leave free."""
     moments = propagate(problem.steps, problem.start, gains).moments[1:]
@@ -141,7 +141,7 @@ def _judge(problem: Limited, gains: Float[Array, "time Fn R"]) -> tuple[Float[Ar
     return jnp.sum(problem.cost * moments), 1 - jnp.sum(form * moments, axis=(1, 2)) / limit
 
 
-@compiled
+@compile_in_float64
 def _change_gains(
     gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: Steps
 ) -> Float[Array, "time Fn R"]:
@@ -150,7 +150,7 @@ def _change_gains(
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
 
 
-@compiled
+@compile_in_float64
 def _barrier(
     problem: Limited, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
@@ -174,7 +174,7 @@ def _evaluate_barrier(
     return float(value), np.asarray(gradient).ravel()
 
 
-@compiled
+@compile_in_float64
 def _units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
     """L'^-1 for each step, L L' the normal matrix of its gains: in these units the cost curves alike in all directions.
 
@@ -290,7 +290,7 @@ class Search(NamedTuple):
     cost: Float[jax.Array, ""]
 
 
-@compiled
+@compile_in_float64
 def _sweeps(
     steps: Steps,
     start: Float[Array, "d d"],

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from heliograph.disk.quoting import in_figure, visible
+from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
@@ -93,7 +93,7 @@ def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figu
     axes.fill_between(front.totals, front.bounds, 0, step="pre", color=PALE, alpha=0.6, linewidth=0, label="impossible")
     axes.plot(front.totals, front.errors, "o-", color=BLUE, linewidth=1.6, markersize=4, label="found")
     for (name, (power, error)), colour in zip(marks.items(), (VERMILION, AMBER, GREEN), strict=False):
-        axes.plot([power], [error], "D", color=colour, markeredgecolor=INK, markersize=8, label=in_figure(name))
+        axes.plot([power], [error], "D", color=colour, markeredgecolor=INK, markersize=8, label=quote_for_figure(name))
     spread = np.ptp(front.errors)
     every = [*front.errors, *(error for _, error in marks.values())]
     axes.set(xscale="log", xlabel="total mean power", ylabel="error", xlim=(front.totals[0], front.totals[-1]))
@@ -116,7 +116,7 @@ def powers_figure(before: Mapping[str, float], after: Mapping[str, float]) -> Fi
     axes.barh(places, [after[name] for name in names], height=0.55, color=BLUE, label="designed")
     axes.plot([before.get(name, np.nan) for name in names], places, "|", color=VERMILION, markersize=13,
               markeredgewidth=2.2, label="as it is")  # fmt: skip
-    axes.set_yticks(places, [in_figure(name) for name in names])
+    axes.set_yticks(places, [quote_for_figure(name) for name in names])
     largest = max(np.nanmax([values.get(name, np.nan) for name in names]) for values in (before, after))
     axes.set(xlabel="mean power", xlim=(0, 1.05 * (largest or 1.0)))
     axes.grid(visible=False, axis="y")

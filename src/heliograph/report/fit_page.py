@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import in_figure, visible
+from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
 from heliograph.learning.losses.losses import Losses
@@ -86,7 +86,7 @@ def _estimates(learned: Learned) -> Figure:
             axes.set_xscale("log")
         axes.set_ylim(-len(forms) + 0.4, 0.9)
         axes.set_yticks([])
-        axes.set_ylabel(in_figure(row.name), rotation=0, ha="right", va="center")
+        axes.set_ylabel(quote_for_figure(row.name), rotation=0, ha="right", va="center")
         axes.margins(x=0.08)
         axes.grid(visible=False, axis="y")
     return figure
@@ -105,7 +105,7 @@ def _correlations(tested: list[Change]) -> Figure:
                 lags + shift, e.test.correlation, 1.96 * e.test.standard_error, fmt="none", ecolor=MUTED, lw=1
             )
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
-        axes.set_title(in_figure(f"{change.node}/{change.filter}"))
+        axes.set_title(quote_for_figure(f"{change.node}/{change.filter}"))
         axes.set_ylabel("correlation")
         axes.set_xticks(lags)
     legend_above(figure, grid[0])
@@ -125,7 +125,7 @@ def _pits(received: list[Uniformity]) -> Figure:
         )
         axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0, zorder=0)
         axes.axhline(1.0, color=MUTED, linewidth=0.8)
-        axes.set_title(in_figure(transforms.node))
+        axes.set_title(quote_for_figure(transforms.node))
         axes.set_ylabel("density")
     grid[-1].set_xlabel("probability of a smaller value")
     return figure

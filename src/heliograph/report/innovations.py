@@ -8,7 +8,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import in_figure, visible
+from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, stacked_panels
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.outputs import rounded
@@ -45,11 +45,11 @@ def innovations_figure(health: Health, tested: Sequence[FilterHealth]) -> Figure
         alike = white.shape[1] > len(COLOURS)
         for i, component in enumerate(white.T):
             name, colour = ("outputs", BLUE) if alike else (names[judged.node][i], COLOURS[i])
-            label = None if alike and i else in_figure(f"{white.shape[1]} {name}" if alike else name)
+            label = None if alike and i else quote_for_figure(f"{white.shape[1]} {name}" if alike else name)
             axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
         for level in (-BAND, BAND):
             axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
-        axes.set_title(in_figure(f"{judged.node}/{judged.filter}"))
+        axes.set_title(quote_for_figure(f"{judged.node}/{judged.filter}"))
         axes.set_ylabel("in deviations")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, markerscale=2)
     time_axis(health.record, grid[-1])
@@ -160,4 +160,6 @@ def not_drawn(names: Sequence[str], where: str) -> list[Text]:
 def time_axis(record: Record, axes: Axes) -> None:
     """Name the axis of time, with its unit."""
     units, dated = record.units, record.time.dtype.kind == "M"
-    axes.set_xlabel("time (UTC)" if dated else in_figure(f"time ({units['time']})" if "time" in units else "time"))
+    axes.set_xlabel(
+        "time (UTC)" if dated else quote_for_figure(f"time ({units['time']})" if "time" in units else "time")
+    )

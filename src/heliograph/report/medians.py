@@ -5,7 +5,7 @@ import numpy as np
 
 from heliograph.model.over_time import first
 from heliograph.numerics.types import Float
-from heliograph.random_affine.erasure import arrived
+from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.outliers import Contaminated, StudentT
 from heliograph.simulation.network import FUSED, Network
@@ -34,7 +34,7 @@ def law_medians(
     receiver = network.nodes[node]
     if not isinstance(receiver, Node):
         return np.zeros(receiver.received)
-    noise, channel = first(receiver.sensor).noise, arrived(first(receiver.channel))
+    noise, channel = first(receiver.sensor).noise, condition_on_arrival(first(receiver.channel))
     if is_symmetric(noise) or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
     # v through the mean gain, and what else the innovation is made of.

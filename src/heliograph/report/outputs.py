@@ -17,7 +17,7 @@ from heliograph.report.medians import law_medians
 from heliograph.report.results import Json
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.whiteness import correlated_mean
+from heliograph.simulation.results.whiteness import average_correlated
 
 
 class Errors(NamedTuple):
@@ -51,7 +51,7 @@ def errors_of(record: Record) -> list[Errors]:
             claim = weakest(np.unique(estimate.claims).tolist())
             rmse = record.rmse(node, name)
             per_state = values / np.where(known > 0, known, np.nan)
-            error = correlated_mean(per_state)[1] if judged.any() else np.nan
+            error = average_correlated(per_state)[1] if judged.any() else np.nan
             results.append(Errors(node, name, claim, rmse, _rmse_errors(record, node, name, rmse), size, error))
     return results
 
@@ -60,7 +60,7 @@ def _rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]
     """Return the standard error of each RMSE, that of the mean square over twice the RMSE; NaN where there is none."""
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
-    means = [correlated_mean(column)[1] for column in squares.T]
+    means = [average_correlated(column)[1] for column in squares.T]
     return {state: e / (2 * rmse[state]) if rmse[state] > 0 else np.nan for state, e in zip(rmse, means, strict=True)}
 
 
@@ -199,7 +199,7 @@ def judge_outputs(
     used = np.where(weight >= HALF, value**2 / variance, np.nan)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
-        size = correlated_mean(used[:, i]) if np.any(~np.isnan(used[:, i])) else (np.nan, np.nan)
+        size = average_correlated(used[:, i]) if np.any(~np.isnan(used[:, i])) else (np.nan, np.nan)
         judged.append(OutputJudgement(name, i in outliers, summary, *size, held_value(received[:, i], variance[:, i])))
     return judged
 

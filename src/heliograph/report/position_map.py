@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from heliograph.disk.quoting import in_figure
+from heliograph.disk.quoting import quote_for_figure
 from heliograph.report.figures import INK, STYLE, WIDTH, legend_above
-from heliograph.simulation.results.plots import colour_of, with_unit
+from heliograph.simulation.results.plots import colour_of, label_with_unit
 from heliograph.simulation.results.record import Record
 
 # Names that two coordinates of a plane have, without what stands before them: "x" and "y", "position_x" and ...
@@ -39,15 +39,15 @@ def map_figure(record: Record, node: str, names: Sequence[str]) -> Figure:
     for number, name in enumerate(names):
         estimate, colour = record.estimates[node][name], colour_of(number)
         mean = np.asarray(estimate.mean)
-        axes.plot(mean[:, i], mean[:, j], color=colour, linewidth=1.2, label=in_figure(name))
+        axes.plot(mean[:, i], mean[:, j], color=colour, linewidth=1.2, label=quote_for_figure(name))
         if estimate.claim != "none":
             for k in np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).astype(int)):
                 _add_ellipse(axes, mean[k, [i, j]], np.asarray(estimate.covariance)[k][np.ix_([i, j], [i, j])], colour)
     if record.truth is not None:
         axes.plot(record.truth[:, i], record.truth[:, j], color=INK, linestyle=":", label="truth")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(with_unit(record.states[i], record.units))
-    axes.set_ylabel(with_unit(record.states[j], record.units))
+    axes.set_xlabel(label_with_unit(record.states[i], record.units))
+    axes.set_ylabel(label_with_unit(record.states[j], record.units))
     legend_above(figure, axes)
     return figure
 

@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import in_figure, visible
+from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above, stacked_panels
 from heliograph.report.health import Health
@@ -131,7 +131,7 @@ def _links(health: Health) -> Figure:
         came = link.time[link.arrived]
         axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
         axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
-    names = [in_figure(f"{link.node}: {link.component}{_share(link, ' ({:.0%})', '')}") for link in links]
+    names = [quote_for_figure(f"{link.node}: {link.component}{_share(link, ' ({:.0%})', '')}") for link in links]
     axes.set_yticks(range(len(links)), names)
     axes.set_ylim(len(links) - 0.5, -0.5)
     axes.grid(visible=False)

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapte
 from pydantic_core.core_schema import no_info_after_validator_function, str_schema
 from typing_extensions import TypeAliasType
 
-from heliograph.numerics.check import InputError, fail, instance, shown
+from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.dates import instant
 
 Name = TypeAliasType("Name", Annotated[str, Field(max_length=200, pattern=r"^[^\x00]*$")])  # PostgreSQL keeps no NUL
@@ -130,20 +130,20 @@ def read_message(payload: bytes) -> Message:
         field = str(first["loc"][0]) if first["loc"] else ""
         if field not in EXPECTED:  # no JSON object, or one with a field more
             fields = f"a JSON object with no fields but {', '.join(EXPECTED)}"
-            raise fail("message", fields, shown(field) if field else _what(payload)) from None
-        came = "no such field" if first["type"] == "missing" else shown(first["input"])
+            raise fail("message", fields, show_value(field) if field else _what(payload)) from None
+        came = "no such field" if first["type"] == "missing" else show_value(first["input"])
         raise fail(f"message, {field}", EXPECTED[field], came) from None
 
 
 def _what(payload: bytes) -> str:
     """Return what came in place of a JSON object."""
     try:
-        return f"{shown(json.loads(payload))}, which is no object"
+        return f"{show_value(json.loads(payload))}, which is no object"
     except RecursionError:
         return "brackets nested too deeply"
     except ValueError as error:
         where = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
-        return f"{shown(payload)}, which is no JSON{where}"
+        return f"{show_value(payload)}, which is no JSON{where}"
 
 
 def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:

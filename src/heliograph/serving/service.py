@@ -17,7 +17,7 @@ from heliograph.live.lanes import Lanes as Lanes
 from heliograph.live.plant import Plant, Withdrawn
 from heliograph.live.rows import HeldRow
 from heliograph.live.stored.plant_codec import plant_bytes, plant_from
-from heliograph.numerics.check import instance, shown
+from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.collector import no_collector
 from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
@@ -218,7 +218,7 @@ class Service:
                 continue
             if isinstance(message, str) or verdict is None:
                 malformed += 1
-                said = why if isinstance(payload, str) else f"{why}: {shown(payload)}"
+                said = why if isinstance(payload, str) else f"{why}: {show_value(payload)}"
                 entries.append(_write_refusal(None, {}, "malformed", said))
                 continue
             # Used but for some of it, known already, or refused with the reason.

@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.judging import Candidate, Judges
-from heliograph.live.leap import ARRIVAL, Leap, beginning, beside
+from heliograph.live.leap import ARRIVAL, Leap, beginning, find_leap
 from heliograph.live.plant import Link, Plant, Withdrawn
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, seconds
@@ -162,7 +162,7 @@ class Using:
             return plant
         at = self._number(message.time, plant.origin, plant.name)
         said = self._number(message.arrival, plant.origin, plant.name) if message.arrival is not None else at
-        first, newest = beside(plant.leap, plant.now, said, leap) or (None, at)
+        first, newest = find_leap(plant.leap, plant.now, said, leap) or (None, at)
         begins = first is not None and first.now == -inf and not plant.holds(first, at, leap)
         clock = message.node if message.arrival is None else ARRIVAL
         if first is not None and begins and first.taken_back_by(clock, said, newest):

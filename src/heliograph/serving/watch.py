@@ -23,7 +23,7 @@ from heliograph.serving.output import Output
 from heliograph.serving.overview import Overview, Wrong
 from heliograph.serving.running_nis import MEMORY, RunningNis, used_nis
 from heliograph.serving.totals import Link, Totals
-from heliograph.simulation.description.diagram import listed
+from heliograph.simulation.description.diagram import join_names
 from heliograph.simulation.network import FUSED, Network
 
 T = TypeVar("T")
@@ -309,7 +309,7 @@ class Watch:
             of = sorted(node for node in links if links[node][name])
             # A line for each node, or one for many.
             yield from (
-                f"{listed(nodes)}: {sum(links[node][name] for node in nodes):,} {words}"
+                f"{join_names(nodes)}: {sum(links[node][name] for node in nodes):,} {words}"
                 for nodes in ([of] if len(of) > APART else [[node] for node in of])
             )
 

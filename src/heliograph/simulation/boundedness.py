@@ -11,10 +11,10 @@ from heliograph.linear.known_losses import (
     KindGains,
     KnownLossSystem,
     Unseen,
-    certified_radius,
+    certify_radius,
     fastest_unseen,
     find_gains,
-    reached,
+    is_reached,
 )
 from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, parallel
@@ -96,7 +96,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     for space in (np.eye(len(a)), growing):
         known = _group_losses(a, q, links, space)
         gains = find_gains(known.system)
-        radius = certified_radius(known.system, gains)
+        radius = certify_radius(known.system, gains)
         if radius < BELOW_ONE:
             bound = known.system.bound(gains).sum(axis=0) if known.exact else None
             return Boundedness("certified", _describe_certificate(a, radius), radius, 0.0, known.gains(gains), bound)
@@ -275,9 +275,9 @@ def _is_excited(network: Network, growing: np.ndarray, channel: KnownLosses, uns
     """
     a, q = channel.system.transition, channel.system.process
     expected = np.concatenate([unseen.vectors, growing], axis=1) if channel.random else unseen.vectors
-    if reached(expected, np.zeros_like(a), q):
+    if is_reached(expected, np.zeros_like(a), q):
         return True
     if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in channel.system.noises):
         return False
     start = q + np.asarray(first(network.plant).initial_covariance)
-    return reached(expected, a, q) or (unseen.growth > 1 and reached(expected, a, start))
+    return is_reached(expected, a, q) or (unseen.growth > 1 and is_reached(expected, a, start))

@@ -9,7 +9,7 @@ import jax
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.rules import Fusion
-from heliograph.model.agreement import differences, joined, part_of
+from heliograph.model.agreement import differences, join_premises, part_of
 from heliograph.model.estimate import Claim
 from heliograph.model.premise import Kept, Premise
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
@@ -40,7 +40,7 @@ class Belief(NamedTuple):
         return f"filter {self.filter!r} believes {self.another}{' at' if self.parts == (UNSAID,) else ' than'} {where}"
 
 
-def lowered_claim(claim: Claim) -> Claim:
+def lower_claim(claim: Claim) -> Claim:
     """Nominal, whatever is claimed more."""
     return "none" if claim == "none" else "nominal"
 
@@ -54,7 +54,7 @@ def nominal(filter: AbstractFilter) -> AbstractFilter:
     leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
     inner = [nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
     twin: AbstractFilter = copy(jax.tree.unflatten(tree, inner))
-    object.__setattr__(twin, "claim", lowered_claim(filter.claim))
+    object.__setattr__(twin, "claim", lower_claim(filter.claim))
     object.__setattr__(twin, "kept", Kept(filter.premise, filter.claim != twin.claim or filter.kept.lowered))
     return twin
 
@@ -66,7 +66,7 @@ def standing_in(own: Premise, filter: AbstractFilter) -> AbstractFilter:
         own: plant, sensor, channel and trigger of the place where it stands.
         filter: the filter, which keeps its claim outside of the network.
     """
-    is_weak = lowered_claim(filter.claim) == filter.claim
+    is_weak = lower_claim(filter.claim) == filter.claim
     return filter if is_weak or not parts_apart(own, filter) else nominal(filter)
 
 
@@ -89,7 +89,7 @@ def nodes_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | R
     }
 
 
-def fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
+def judge_fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
     """Return the fusions, with filters of all measurements as they stand in the network."""
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
@@ -148,7 +148,7 @@ def premise_of_all(network: HasNodes) -> Premise:
     if network.common is not None:
         return Premise(network.plant, network.common.sensor, network.common.channel)
     nodes = [name for name in network.names if isinstance(network.nodes[name], Node)]
-    return joined([premise_at(network, name) for name in nodes]) if nodes else Premise(network.plant)
+    return join_premises([premise_at(network, name) for name in nodes]) if nodes else Premise(network.plant)
 
 
 def beliefs(network: HasNodes) -> Iterator[Belief]:

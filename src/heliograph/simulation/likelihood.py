@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of, over_rows
 from heliograph.numerics.check import instance
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Scalar
 
@@ -37,11 +37,11 @@ def log_likelihood(
     arguments = filter, *data_of(filter, measurements, inputs)
     if is_traced(arguments):
         return _sum(*arguments)
-    return float(computed(_sum, _by_xla, arguments))
+    return float(compute_once(_sum, _by_xla, arguments))
 
 
 def _sum(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
     return jnp.sum(over_rows(filter, z, u, lambda state, innovation, k: jnp.asarray(innovation.log_likelihood)))
 
 
-_by_xla = compiled(_sum)
+_by_xla = compile_in_float64(_sum)

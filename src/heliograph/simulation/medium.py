@@ -19,15 +19,15 @@ from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor, without_output_names
 from heliograph.model.trigger import AbstractTrigger, Sender
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import without_names
+from heliograph.random_affine.base import drop_names
 from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.shared_fading import deliver, memory_places, start
-from heliograph.simulation.side_by_side import over_all
+from heliograph.simulation.side_by_side import map_all
 
 ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
 
@@ -103,7 +103,7 @@ class SeparateChannels(AbstractMedium):
             return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender)
 
         return tuple(
-            () if isinstance(group, Silent) else over_all(single, len(group.checksums))(group) for group in self.groups
+            () if isinstance(group, Silent) else map_all(single, len(group.checksums))(group) for group in self.groups
         )
 
     def receive(
@@ -113,7 +113,7 @@ class SeparateChannels(AbstractMedium):
 
         def single(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
             sensor = at(group.sensor, k)
-            y = sensed(sensor, x, draw_key(key, k, group.checksums, SENSOR))
+            y = measure(sensor, x, draw_key(key, k, group.checksums, SENSOR))
             if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
                 y = y - group.reference_filter.reference(reach.feed_back, u, k)
             memory, z = deliver(group.channel, reach.memory, y, key, k, group.checksums, group.memories)
@@ -134,7 +134,7 @@ class SeparateChannels(AbstractMedium):
         results = [
             (reach, jnp.zeros((group.count, 0)))
             if isinstance(group, Silent)
-            else over_all(single, len(group.checksums))(group, reach)
+            else map_all(single, len(group.checksums))(group, reach)
             for group, reach in zip(self.groups, state, strict=True)
         ]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
@@ -158,9 +158,9 @@ def _first_mean(filter: AbstractFilter) -> jax.Array:
     return jnp.asarray(filter.estimate(filter.init()).mean)
 
 
-def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
+def measure(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
     """y = h(x) + v, angles between -pi and pi."""
-    return wrapped(sensor.measure(x) + sensor.noise.sample(key), sensor.angles)
+    return wrap_angles(sensor.measure(x) + sensor.noise.sample(key), sensor.angles)
 
 
 class CommonChannel(AbstractMedium):
@@ -179,7 +179,7 @@ class CommonChannel(AbstractMedium):
     ) -> tuple[PyTree, ObservationModel]:
         """Measure x and deliver through the channel."""
         sensor, source = at(self.sensor, k), checksum(SENDER)
-        y = sensed(sensor, x, draw_key(key, k, source, SENSOR))
+        y = measure(sensor, x, draw_key(key, k, source, SENSOR))
         state, z = deliver(self.channel, state, y, key, k, source, ())
         return state, tuple(z[rows] for rows in self.rows)
 
@@ -338,4 +338,4 @@ def medium_of(network: Network) -> AbstractMedium:
 
 
 def _drop_names(channel: Channel, places: np.ndarray) -> Channel:
-    return without_names(channel) if len(places) else channel
+    return drop_names(channel) if len(places) else channel

@@ -14,7 +14,7 @@ from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.system import Schedule
-from heliograph.model.channel import Channel, check_link, received_angles
+from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant
@@ -24,12 +24,12 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
-from heliograph.random_affine.base import check_forgets, memories, without_names
-from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
+from heliograph.random_affine.base import check_forgets, drop_names, memories
+from heliograph.simulation.centres.centre import along_estimates, claim_of_informed, claim_of_reports
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.claims import (
-    fused_standing,
-    lowered_claim,
+    judge_fused_standing,
+    lower_claim,
     nodes_alike,
     nodes_standing,
     nominal_fused,
@@ -152,7 +152,7 @@ class Network(Module):
         self.places = FrozenMapping(_places_of(self.groups, self.kinds))
         self._check_links()
         self._check_fused()
-        self.fused = fused_standing(self)
+        self.fused = judge_fused_standing(self)
         for name, mesh in self.meshes.items():
             check_mesh(name, mesh, self)
 
@@ -175,7 +175,7 @@ class Network(Module):
             node = self.nodes[names[0]]
             if isinstance(node, Node):
                 check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
-                received_angles(self.plant, node.sensor, node.channel)
+                find_received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:
         for name, fusion in self.fused.items():
@@ -253,7 +253,7 @@ class Network(Module):
             ValueError: filters that do not use all outputs once, a channel with memory, parts that do not fit.
         """
         check_link(first(sensor), first(channel), len(first(plant).states), late=True)
-        received_angles(plant, sensor, channel)
+        find_received_angles(plant, sensor, channel)
         check_forgets("channel of nodes that share it", first(channel))
         # Each output goes to one node.
         received = {
@@ -318,23 +318,23 @@ class Network(Module):
         """Places of the angles among what each node receives."""
         if self.common is None:
             return {
-                name: received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
+                name: find_received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
                 for name, node in self.nodes.items()
             }
-        every = received_angles(self.plant, self.common.sensor, self.common.channel)
+        every = find_received_angles(self.plant, self.common.sensor, self.common.channel)
         return {name: tuple(i - row.start for i in every if i in row) for name, row in self.rows.items()}
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
         claims = {name: {f: filter.claim for f, filter in node.filters.items()} for name, node in self.nodes.items()}
         for name, mesh in self.meshes.items():
-            claim = lowered_claim(mesh_claim(name, mesh, self)) if self.single else mesh_claim(name, mesh, self)
+            claim = lower_claim(mesh_claim(name, mesh, self)) if self.single else mesh_claim(name, mesh, self)
             for node in self.mesh_nodes(name):
                 claims[node][name] = claim
         if self.fused:
             by_data = any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values())
             claims[FUSED] = {
-                name: lowered_claim(claim) if isinstance(fusion, Fusion) and (by_data or self.single) else claim
+                name: lower_claim(claim) if isinstance(fusion, Fusion) and (by_data or self.single) else claim
                 for name, fusion in self.fused.items()
                 for claim in (self._claim_of_fusion(fusion),)
             }
@@ -364,10 +364,10 @@ class Network(Module):
         if (fusion.by_report or fusion.rule.needs_plant_moments) and along_estimates(known):
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
                        type(next(iter(known.values()))[2]).__name__)  # fmt: skip
-        claim = informed_claim(rule, self.plant, known, self.common is not None)
+        claim = claim_of_informed(rule, self.plant, known, self.common is not None)
         if not fusion.by_report:
             return claim
-        return reported_claim(rule, claim, fusion, {n: node.complete for n, node in nodes.items()})
+        return claim_of_reports(rule, claim, fusion, {n: node.complete for n, node in nodes.items()})
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
         """Sensor, channel and the filter `name` of each node that has it and receives a sensor through a channel."""
@@ -389,7 +389,7 @@ Network._repr_html_ = table_of  # type: ignore[attr-defined]
 def _world(node: Node | ReceivingNode) -> object:
     """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
-        return node.sensor, without_names(node.channel), node.informed_by, node.trigger, node.predictor
+        return node.sensor, drop_names(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
 
 

@@ -22,7 +22,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.check import fail, shown, table
+from heliograph.numerics.check import fail, show_value, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
@@ -165,7 +165,7 @@ class Node(Module):
     @property
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
-        return received_names(self.outputs, self.received)
+        return name_received(self.outputs, self.received)
 
 
 @readable
@@ -183,7 +183,7 @@ class ReceivingNode(Module):
     @property
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
-        return received_names(self.outputs, self.received)
+        return name_received(self.outputs, self.received)
 
     @property
     def limits(self) -> None:
@@ -284,7 +284,7 @@ def check_trigger(
         raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
 
 
-def received_names(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
+def name_received(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
     """Names of the received components: the sensor's outputs where these are as many, else z0, z1, ..."""
     return outputs if len(outputs) == received else tuple(f"z{i}" for i in range(received))
 
@@ -333,4 +333,4 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
 def check_type(name: str, value: object, expected: type) -> None:
     """Refuse an object of another class, in one line."""
     if not isinstance(value, expected):
-        raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", shown(value))
+        raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", show_value(value))

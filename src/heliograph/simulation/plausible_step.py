@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plausibility import INPUT, Judgement, in_words, why_inputs, why_values
+from heliograph.filters.plausibility import INPUT, Judgement, describe, why_inputs, why_values
 from heliograph.model.faults import function_fault
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
@@ -109,7 +109,9 @@ class Judges:
         return [name for name, places in self._places.items() if not places]
 
 
-def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
+def find_refused_rows(
+    network: Network, outcome: Mapping[str, PyTree]
+) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
     """Rows of a recording that are implausible, each with its reason: by node, and to all central filters."""
     judges, refused = Judges(network), dict[str, dict[int, str]]()
     shared = judges.without_own
@@ -146,7 +148,7 @@ def doubts(
         reported = all_rows if node == FUSED else refused.get(node, {})
         rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in reported]
         if rows:
-            why = in_words(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
+            why = describe(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
             lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_times, fail, instance, rank, table
 from heliograph.numerics.dates import unequal_steps
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
-from heliograph.simulation.centres.blame import refused_centrally
+from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.description.wide_angles import beyond_a_turn, wide_in_rows
 from heliograph.simulation.network import Network
@@ -25,12 +25,12 @@ from heliograph.simulation.plausible_step import (
     Judges,
     any_implausible,
     doubts,
+    find_refused_rows,
     forbidden_rows,
     plausible_step,
-    refused_rows,
 )
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
-from heliograph.simulation.smoothed import Smoother, record_of, smoothed_part, with_truth
+from heliograph.simulation.smoothed import Smoother, add_truth, record_of, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters, initial_states
 from heliograph.smoothing.modes import AbstractSmoothing
 
@@ -102,7 +102,7 @@ def run(
     for line in beyond_a_turn(network, z):
         warnings.warn(line, stacklevel=2)
     # Filters, on what a recording without implausible data has.
-    smoothing = None if smooth is None else smoothed_part(network, smooth, steps)
+    smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, smoothing and smoothing.kinds, judges=True)
     with jax.enable_x64(True):
         arrivals = _reports_of(
@@ -115,7 +115,7 @@ def run(
     warn_of_no_numbers(record)
     for line in wide_in_rows(network, record):
         warnings.warn(line, stacklevel=2)
-    return record if true is None else with_truth(record, network.plant, true, smooth)
+    return record if true is None else add_truth(record, network.plant, true, smooth)
 
 
 def _drop_beyond_limits(
@@ -188,12 +188,12 @@ def _find_refused(
     before: dict[str, dict[int, str]],
 ) -> dict[str, dict[int, str]]:  # fmt: skip
     """Find the rows that all filters of a node refuse, and central ones' by the node to blame; new ones alone."""
-    (filters, _, u, arrivals), (refused, shared) = rest, refused_rows(network, outputs)
+    (filters, _, u, arrivals), (refused, shared) = rest, find_refused_rows(network, outputs)
     if shared:
-        states = computed(_central_states, _central_states_by_xla, (filters, u, arrivals, grouped))
+        states = compute_once(_central_states, _central_states_by_xla, (filters, u, arrivals, grouped))
         in_order = {name: z[name] for name in network.names}
         nodes = Judges(network).without_own
-        refused |= refused_centrally(filters.central, states, in_order, u, shared, nodes)
+        refused |= refuse_centrally(filters.central, states, in_order, u, shared, nodes)
     new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
     return {name: rows for name, rows in new.items() if rows}
 
@@ -215,7 +215,7 @@ def _filter_rows(*arguments: PyTree) -> PyTree:
     """Run `_run_filters`, with results as NumPy arrays, by native code where it supports the filters."""
     # Joint covariances are stored at places that the graph, an argument here, decides: XLA's.
     by_xla = any(mesh.is_long or mesh.needs_joint for mesh in arguments[0].meshes.values())
-    return _scan_in_parts(*arguments) if by_xla else computed(_run_filters, _by_xla, arguments)
+    return _scan_in_parts(*arguments) if by_xla else compute_once(_run_filters, _by_xla, arguments)
 
 
 def _scan_in_parts(

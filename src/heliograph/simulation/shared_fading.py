@@ -12,7 +12,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, memories, without_names
+from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, drop_names, memories
 from heliograph.random_affine.delay import signal_size
 from heliograph.simulation.draws import (
     CHANNEL,
@@ -63,7 +63,7 @@ def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     """Stack channels by structure; each is looked at once, however many names have it."""
     listed, memories = list(channels.values()), list(memory_places(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
-    kinds = {id(channel): without_names(channel) for channel in {id(c): c for c in listed}.values()}
+    kinds = {id(channel): drop_names(channel) for channel in {id(c): c for c in listed}.values()}
     alike: dict[object, dict[int, int]] = {}
     for which, kind in kinds.items():
         same = alike.setdefault(structure(kind), {})

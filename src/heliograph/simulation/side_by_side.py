@@ -50,13 +50,13 @@ def filter_step(
     if smooths:
         if judges:
             *_, judgement, innovation = step_with_judgement(filter, state, z, u, k)
-            weighed = weighed_in(innovation)
+            weighed = get_weighed(innovation)
         after, steps = filter.step_with_smoother(state, z, u, k)
         return after, StepOutput(filter.after_step(after, k), steps, judgement, weighed)
     # With a judgement, or alone.
     if judges:
         after, estimate, judgement, innovation = step_with_judgement(filter, state, z, u, k)
-        weighed = weighed_in(innovation)
+        weighed = get_weighed(innovation)
     else:
         after, estimate = filter.step(state, z, u, k)
     if skip is not None:
@@ -65,7 +65,7 @@ def filter_step(
     return after, StepOutput(estimate, judgement=judgement, weighed=weighed)
 
 
-def weighed_in(innovation: Innovation) -> Weighed | None:
+def get_weighed(innovation: Innovation) -> Weighed | None:
     """The innovation by component, of a filter that weighs; None of all others."""
     if innovation.weight is None:
         return None
@@ -88,7 +88,7 @@ class StackedFilters(Module):
 
     def init(self) -> PyTree:
         """Return states before the first step, (filter and node, ...)."""
-        return over_all(initial_state, self.count * self.nodes)(self.filters)
+        return map_all(initial_state, self.count * self.nodes)(self.filters)
 
     def step(
         self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, skip: jax.Array | None = None
@@ -104,7 +104,7 @@ class StackedFilters(Module):
             return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
         reasons = None if skip is None else skip.reshape(-1)
-        both = over_all(single, self.count * self.nodes)
+        both = map_all(single, self.count * self.nodes)
         after, known = both(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), known)
 
@@ -114,7 +114,7 @@ class StackedFilters(Module):
         """Apply `read` to this step of filter f at each node, from the states before it; (node, ...)."""
         mine = slice(f * self.nodes, (f + 1) * self.nodes)
         filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
-        return over_all(lambda node, state, z: read(node, state, z, u, k), self.nodes)(filters, states, z)
+        return map_all(lambda node, state, z: read(node, state, z, u, k), self.nodes)(filters, states, z)
 
 
 def initial_state(filter: AbstractFilter) -> PyTree:
@@ -122,7 +122,7 @@ def initial_state(filter: AbstractFilter) -> PyTree:
     return jax.tree.map(jnp.asarray, filter.init())
 
 
-def over_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
+def map_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
     """Vectorise a function of one of what is stacked; some hold no array from which the number could be read.
 
     A single one is not vectorised: its function takes half as long to trace as the same over one axis more.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.numerics.check import check_count, check_progress, fail, instance, shown
+from heliograph.numerics.check import check_count, check_progress, fail, instance, show_value
 from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
@@ -38,7 +38,7 @@ from heliograph.simulation.runs.lanes import (
 )
 from heliograph.simulation.runs.memory import Needed, check_memory, out_of_memory, size_of
 from heliograph.simulation.runs.native import natively
-from heliograph.simulation.smoothed import Recorded, Smoother, finished, reduced_run, smoothed_part
+from heliograph.simulation.smoothed import Recorded, Smoother, finish, reduce_run, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World
 from heliograph.smoothing.modes import AbstractSmoothing
@@ -102,7 +102,7 @@ def monte_carlo(
     base = key_of(key)
     single = _is_single(precision, network)
     network = network.in_single_precision() if single else network
-    smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
+    smoothing = None if smooth is None else select_smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
         with out_of_memory(runs, horizon):
@@ -117,7 +117,7 @@ def monte_carlo(
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with out_of_memory(runs, horizon):
         recorded = _run_chunks(job, first_run, runs, chunk, progress)
-    return _warn_of_nan(finished(reducer, recorded, network, smoothing), network)
+    return _warn_of_nan(finish(reducer, recorded, network, smoothing), network)
 
 
 def _warn_of_nan(result: Result, network: Network) -> Result:
@@ -137,7 +137,7 @@ def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
 
 def _is_single(precision: Precision, network: Network) -> bool:
     if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
-        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
+        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", show_value(precision))
     if precision == "float32" and _is_lost(network):
         said = "single precision: numbers of plant or sensors below 1.2e-38 count as 0; choose larger units, or float64"
         warnings.warn(said, stacklevel=3)
@@ -279,7 +279,7 @@ def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) ->
 
 
 def _each_reduced(reducer: AbstractReducer[Any], later: Smoother | None, outputs: PyTree) -> OfStep:
-    recorded: OfStep = each_run(partial(reduced_run, reducer, later), outputs)
+    recorded: OfStep = each_run(partial(reduce_run, reducer, later), outputs)
     return recorded
 
 

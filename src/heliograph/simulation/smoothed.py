@@ -28,7 +28,7 @@ from heliograph.simulation.results.reducer import (
     OfStep,
     Result,
     Trajectories,
-    of_rows,
+    reduce_rows,
     trajectories_record,
 )
 from heliograph.simulation.stepping import AllFilters
@@ -93,12 +93,12 @@ def _fuse_at_each_time(fusion: Fused, estimates: Sequence[Estimate]) -> dict[str
     return fused
 
 
-def reduced_run(reducer: AbstractReducer[Result], later: Smoother | None, outputs: PyTree) -> OfStep:
+def reduce_run(reducer: AbstractReducer[Result], later: Smoother | None, outputs: PyTree) -> OfStep:
     """Reduce the results of a run (time, ...); with a smoother pairs of filtered and smoothed ones, and its NIS."""
     if later is None:
-        return of_rows(reducer, outputs)
+        return reduce_rows(reducer, outputs)
     both = later.both(outputs)
-    filtered, smoothed = of_rows(reducer, both["filtered"]), of_rows(reducer, both["smoothed"])
+    filtered, smoothed = reduce_rows(reducer, both["filtered"]), reduce_rows(reducer, both["smoothed"])
     return OfStep(
         (filtered.sums, smoothed.sums, both["nis"]),
         (filtered.ever, smoothed.ever),
@@ -120,7 +120,7 @@ class Part(NamedTuple):
         return Smoother(self.smoothing, filters.fusions, self.kinds, self.groups)
 
 
-def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> Part:
+def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> Part:
     """Select the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
 
     Raises:
@@ -192,7 +192,7 @@ def record_of(network: Network, smoothing: Part | None, outputs: PyTree, time: n
     return Trajectories().others(filtered, smoothed, smoothing.claims)
 
 
-def with_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: AbstractSmoothing | None) -> Record:
+def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: AbstractSmoothing | None) -> Record:
     """Return the record of a recording with the true states, angles of estimates within half a turn of them."""
 
     def near(estimate: Estimate, x: np.ndarray) -> Estimate:
@@ -202,7 +202,7 @@ def with_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Ab
 
     later = record.smoothed
     if later is not None and smoothing is not None:
-        later = with_truth(
+        later = add_truth(
             later, plant, np.broadcast_to(smoothing.about(truth), (len(later.time), truth.shape[1])), None
         )
     estimates = {
@@ -221,7 +221,7 @@ class Recorded(NamedTuple):
     collected: PyTree
 
 
-def finished(reducer: AbstractReducer[Result], recorded: Recorded, network: Network, smoothing: Part | None) -> Result:
+def finish(reducer: AbstractReducer[Result], recorded: Recorded, network: Network, smoothing: Part | None) -> Result:
     """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
     sums, common, count, collected = recorded
     # Without smoothing the result of the network alone.

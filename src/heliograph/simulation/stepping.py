@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen, compiled, computed, of_arrays
-from heliograph.filters.base import AbstractFilter, sized
+from heliograph.engine.choice import chosen, compile_on_call, compute_once, map_arrays
+from heliograph.filters.base import AbstractFilter, make_sizes
 from heliograph.filters.linear.plan import LinearStep
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
@@ -26,15 +26,15 @@ from heliograph.simulation.centres.centre import (
     CentreFilter,
     CentreState,
 )
-from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, fused_innovations
+from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
 from heliograph.simulation.centres.fusions import Fused, Reporting, centres_of, fusions_of, sources_of
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
 from heliograph.simulation.centres.mesh import Mesh, meshes_of
 from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.side_by_side import StackedFilters, filter_step, initial_state, over_all
-from heliograph.smoothing.backward_pass import planned_with_past
+from heliograph.simulation.side_by_side import StackedFilters, filter_step, initial_state, map_all
+from heliograph.smoothing.backward_pass import plan_with_past
 
 
 class AllFilters(Module):
@@ -89,7 +89,7 @@ class AllFilters(Module):
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
         self.reporting, self.meshes = _reporting(network), meshes_of(network)
-        self.tests = fused_innovations(network, self.alike) if tests else {}
+        self.tests = make_fused_innovations(network, self.alike) if tests else {}
         # Permutation of the groups' measurements into the order of the nodes.
         grouped = [name for names in network.groups for name in names]
         lengths = [network.nodes[name].received for name in grouped]
@@ -255,7 +255,7 @@ class AllFilters(Module):
         return centre.step(state, parts, means, u, k)
 
 
-@compiled
+@compile_on_call
 def initial_states(filters: AllFilters) -> PyTree:
     """Return states before the first step, by one program: otherwise each operation is a program of its own."""
     return jax.tree.map(jnp.asarray, filters.init())
@@ -266,7 +266,8 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     central = filters.central if all(filters.complete) else {}
     planned = [_plan_alike(a, u) if filters.complete[a.group] else a for a in filters.alike]
     central = {
-        name: computed(_plan_filter, _planned_by_xla, (filter, u, filters.smooths)) for name, filter in central.items()
+        name: compute_once(_plan_filter, _planned_by_xla, (filter, u, filters.smooths))
+        for name, filter in central.items()
     }
     changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(planned), filters.central | central))
     return cast(AllFilters, to_numpy(changed))
@@ -279,12 +280,12 @@ def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
         choice = chosen(_plan_filter, arguments, (True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
-    planned = of_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
+    planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
     return replace(alike, filters=planned)
 
 
 def _plan_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
-    return planned_with_past(filter, u) if smooths else filter.planned(u)
+    return plan_with_past(filter, u) if smooths else filter.planned(u)
 
 
 _planned_by_xla = quickly_compiled(_plan_filter)
@@ -292,7 +293,7 @@ _planned_by_xla = quickly_compiled(_plan_filter)
 
 @quickly_compiled
 def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
-    return over_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
+    return map_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
 
 
 def plans(filters: AllFilters) -> bool:
@@ -357,7 +358,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
         ages=uplinks.delay.shape[1],
         widest=max(uplinks.received),
         quantized=uplinks.quantizers is not None,
-        **sized(network.claims()[FUSED][name], network, len(uplinks.rows)),
+        **make_sizes(network.claims()[FUSED][name], network, len(uplinks.rows)),
     )
 
 

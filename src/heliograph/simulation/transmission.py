@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance, rank
@@ -46,7 +46,7 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     if not len(y):
         raise fail("signal", "at least one step", "none")
     check_horizon(len(y), steps_covered(channel))
-    return np.asarray(computed(_transmit, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
+    return np.asarray(compute_once(_transmit, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
 
 
 def _transmit(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
@@ -32,7 +32,7 @@ class World(Module):
         """Step to k with the input u: next state, and truth (n,), measurements and estimates."""
         (x, medium, states, edges), (k, u) = carry, row
         plant = at(self.plant, k)
-        x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
+        x = wrap_angles(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         medium, z = self.medium.receive(medium, x, u, key, k)
         z = tuple(present(values) if whole else values for values, whole in zip(z, self.filters.complete, strict=True))
         drawn: dict[str, PyTree] = {name: link.uplinks.draw(key, k) for name, link in self.filters.reporting.items()}

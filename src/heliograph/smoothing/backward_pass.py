@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
@@ -40,11 +40,11 @@ def smoother_steps(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z, u = data_of(filter, measurements, inputs)
     first = np.asarray(check_count("first step", first_step, 0))
-    return stepped(filter, z, u, filter.init() if state is None else state, first)
+    return step_rows(filter, z, u, filter.init() if state is None else state, first)
 
 
-@compiled
-def stepped(filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array) -> tuple[PyTree, SmootherStep]:
+@compile_on_call
+def step_rows(filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array) -> tuple[PyTree, SmootherStep]:
     """Step a filter over rows of data inside a compiled computation, like `smoother_steps`."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
@@ -54,7 +54,7 @@ def stepped(filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Ar
     return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)
 
 
-def planned_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
+def plan_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
     """Plan the filter for these inputs and complete data, with its smoother steps but for their data."""
     planned = filter.planned(inputs)
     if planned is filter:
@@ -65,11 +65,11 @@ def planned_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
 def quiet_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
     """Return smoother steps for measurements of zero: right but for means, if no gain depends on data."""
     quiet = jnp.zeros((len(inputs), filter.received))
-    steps: SmootherStep = stepped(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
+    steps: SmootherStep = step_rows(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
     return steps
 
 
-def swept(steps: SmootherStep) -> Estimate:
+def sweep_back(steps: SmootherStep) -> Estimate:
     """Estimate each step's state given all data: one backward pass."""
 
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
@@ -84,7 +84,7 @@ def swept(steps: SmootherStep) -> Estimate:
     return _append(earlier, last.estimate_from(last.after))
 
 
-def swept_means(steps: SmootherStep) -> jax.Array:
+def sweep_means(steps: SmootherStep) -> jax.Array:
     """Estimate the mean of each step's state given all data: one backward pass."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
@@ -98,7 +98,7 @@ def swept_means(steps: SmootherStep) -> jax.Array:
     return _append(earlier, _plant_mean(last, end))
 
 
-def swept_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
+def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
     last = len(steps.mean) - 1
     times = jnp.arange(last + 1)
@@ -120,7 +120,7 @@ def swept_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     return estimate
 
 
-def carried_ahead(steps: SmootherStep, step: int) -> Estimate:
+def carry_ahead(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 

@@ -9,20 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array, Float
-from heliograph.smoothing.backward_pass import carried_ahead, swept, swept_means, swept_over_lag
+from heliograph.smoothing.backward_pass import carry_ahead, sweep_back, sweep_means, sweep_over_lag
 
 BLOCKS = 10  # parts of a run, whose scatter gives the standard error of the NIS
 DEVIATIONS = 3.5  # standard errors of the mean NIS: fewer may be chance
 EXCESS = 1.05  # times the expected NIS: less does little harm
 
 
-@compiled
+@compile_on_call
 def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
     """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
     if steps.nis is None or steps.received is None:
@@ -85,7 +85,7 @@ class AbstractSmoothing(Module):
         """Raise ValueError if a run of so many steps has no such estimate."""
 
 
-@compiled
+@compile_on_call
 def _swept(smoothing: AbstractSmoothing, steps: SmootherStep) -> Estimate:
     return smoothing.sweep(steps)
 
@@ -95,11 +95,11 @@ class FixedInterval(AbstractSmoothing):
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Estimates (time, ...)."""
-        return swept(steps)
+        return sweep_back(steps)
 
     def means(self, steps: SmootherStep) -> jax.Array:
         """Means (time, ...)."""
-        return swept_means(steps)
+        return sweep_means(steps)
 
 
 class FixedLag(AbstractSmoothing):
@@ -119,7 +119,7 @@ class FixedLag(AbstractSmoothing):
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Estimates (time, ...)."""
-        return swept_over_lag(steps, self.lag)
+        return sweep_over_lag(steps, self.lag)
 
 
 class FixedPoint(AbstractSmoothing):
@@ -139,7 +139,7 @@ class FixedPoint(AbstractSmoothing):
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Estimates (time from that step on, ...)."""
-        return carried_ahead(steps, self.step)
+        return carry_ahead(steps, self.step)
 
     def about(self, values: A) -> A:
         """Repeat the value of that step, once per estimate of it."""
@@ -152,7 +152,7 @@ class FixedPoint(AbstractSmoothing):
             raise fail("step of a fixed point", f"one of the run's {horizon}, counted from 0", self.step)
 
 
-def named_smoothing(name: str) -> AbstractSmoothing | None:
+def parse_smoothing(name: str) -> AbstractSmoothing | None:
     """Smoothing by a word of the command line: "all" for the fixed interval, a number for a lag, nothing for none."""
     if name == "":
         return None

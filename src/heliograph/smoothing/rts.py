@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import planned_with_past, quiet_steps, stepped
+from heliograph.smoothing.backward_pass import plan_with_past, quiet_steps, step_rows
 from heliograph.smoothing.modes import AbstractSmoothing, FixedInterval
 
 
@@ -57,7 +57,7 @@ def rts_smoother(
     rows, inputs = data_of(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
-    _, steps = stepped(filter, rows, inputs, filter.init(), np.asarray(0))
+    _, steps = step_rows(filter, rows, inputs, filter.init(), np.asarray(0))
     estimate = FixedInterval().estimates(steps)
     return Smoothed(np.asarray(estimate.mean), np.asarray(estimate.covariance), estimate.claim)
 
@@ -112,18 +112,18 @@ def planned_smoother(
     return PlannedSmoother(planned, smoothing, u, _estimate(filter, smoothing, u))
 
 
-@compiled
+@compile_on_call
 def _means(planned: PlannedSmoother, z: Array) -> jax.Array:
-    _, steps = stepped(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
+    _, steps = step_rows(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
     return planned.smoothing.means(jax.tree.map(jnp.asarray, steps))
 
 
-@compiled
+@compile_on_call
 def _plan(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
-    planned = planned_with_past(filter, u)
+    planned = plan_with_past(filter, u)
     return None if planned is filter else planned
 
 
-@compiled
+@compile_on_call
 def _estimate(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
     return smoothing.sweep(quiet_steps(filter, u))

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import STRENGTH, Estimate, Innovation
 from heliograph.numerics.check import standard_deviations
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.likelihood import log_likelihood
 
@@ -46,7 +46,7 @@ def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5,
     for k, z in enumerate(data):
         # Each step twice: determinism, structure, estimate, prediction + correction, vmap.
         arguments = filter, state, z, u[k], np.asarray(k)
-        (stepped, parts, side_by_side), again = (computed(_each_way, _each_way_by_xla, arguments) for _ in range(2))
+        (stepped, parts, side_by_side), again = (compute_once(_each_way, _each_way_by_xla, arguments) for _ in range(2))
         (following, estimate), (corrected, known, innovation) = stepped, parts
         assert np.array_equal(estimate.mean, again[0][1].mean), (
             "step: expected the same estimate from the same arguments"
@@ -89,7 +89,7 @@ def _each_way(*arguments: PyTree) -> tuple[PyTree, ...]:
 
 
 # By XLA three programs: one of all three is more than thrice as much work for its optimiser.
-_step_by_xla, _parts_by_xla, _side_by_side_by_xla = map(compiled, (_step, _parts, _side_by_side))
+_step_by_xla, _parts_by_xla, _side_by_side_by_xla = map(compile_in_float64, (_step, _parts, _side_by_side))
 
 
 def _each_way_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:

@@ -31,7 +31,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.monomials import exponents
-from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, described_by
+from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, describe_second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 
 Modes = TypeVar("Modes", SideInformation, ObservationModel)  # a channel at one step, mode by mode
@@ -170,7 +170,7 @@ def rescaled_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     gain, offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
     spread, shift, power, nominal = map(scaled, (channel.spread, channel.shift, channel.power, channel.nominal))
     mean = np.concatenate([gain, offset[:, None]], axis=1)
-    return described_by(mean, spread, shift, power, nominal, channel.uncertain)
+    return describe_second_moments(mean, spread, shift, power, nominal, channel.uncertain)
 
 
 def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.columns import Columns, decorrelated, joined, reciprocal, square_root
+from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal, square_root
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected
+from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
 from heliograph.filters.gaussian.signal import Received, Signal, observe_received
-from heliograph.filters.gaussian.transform import at_points
+from heliograph.filters.gaussian.transform import evaluate_at_points
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
@@ -76,7 +76,7 @@ class RawMoment(AbstractReading):
 
     def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
         """Take E[y y'] for Cov(y): E y (E y)' is one more column of its noise."""
-        noise = joined(signal.noise, Columns(signal.mean[:, None], jnp.ones(1)))
+        noise = join_columns(signal.noise, Columns(signal.mean[:, None], jnp.ones(1)))
         return _condition(self.update, signal._replace(noise=noise), channel, z)
 
 
@@ -129,14 +129,16 @@ class MixedCross(AbstractFilter):
     def predict(self, state: Propagated, u: ArrayLike = (), k: Step = 0) -> Propagated:
         """Move the points, and keep them."""
         plant, x = at(self.base.plant, k), state.belief
-        moved = at_points(lambda x: plant.transition(x, jnp.asarray(u)), x, square_root(len(x.mean) * x.variances))
+        moved = evaluate_at_points(
+            lambda x: plant.transition(x, jnp.asarray(u)), x, square_root(len(x.mean) * x.variances)
+        )
         return Propagated(*self.base.predict(x, u, k), *moved)
 
     @corrects
     def correct(self, state: Propagated, z: ArrayLike, k: Step = 0) -> tuple[Propagated, Innovation]:
         """Redraw for y only, correct."""
         sensor, channel, x = at(self.base.sensor, k), at(self.base.channel, k), state.belief
-        ahead, behind = at_points(sensor.measure, x, square_root(len(x.mean) * x.variances))
+        ahead, behind = evaluate_at_points(sensor.measure, x, square_root(len(x.mean) * x.variances))
         y = jnp.concatenate([ahead, behind], axis=1)
         points = jnp.concatenate([state.ahead, state.behind], axis=1)
         mean, count = jnp.mean(y, axis=1), y.shape[1]
@@ -144,11 +146,11 @@ class MixedCross(AbstractFilter):
         spread = apart @ apart.T / count + sensor.noise.covariance
         cross = (points - x.mean[:, None]) @ apart.T / count
         # What of Cov y is not by these slopes may be less than nothing: the reading is of no joint law.
-        slopes = decorrelated(x.root, cross).T * reciprocal(x.variances)
+        slopes = decorrelate(x.root, cross).T * reciprocal(x.variances)
         weights, vectors = eigh(spread - (slopes * x.variances) @ slopes.T)
         second = spread + jnp.outer(mean, mean)
         signal = Signal(x, mean, slopes, Columns(vectors, weights), second, jnp.diagonal(second))
-        after, innovation = corrected(signal, channel, self.base.rule, jnp.asarray(z))
+        after, innovation = correct_signal(signal, channel, self.base.rule, jnp.asarray(z))
         return Propagated(*after, state.ahead, state.behind), innovation
 
     def estimate(self, state: Propagated) -> Estimate:

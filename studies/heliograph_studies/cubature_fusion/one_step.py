@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 import heliograph as hg
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.numerics.check import array, scalar
-from heliograph.numerics.float64 import compiled, to_numpy
+from heliograph.numerics.float64 import compile_in_float64, to_numpy
 from heliograph_studies.cubature_fusion.setting import OUTPUTS, Scenario, Transition, transition
 
 Array = np.ndarray
@@ -100,7 +100,7 @@ def predicted(s: Scenario, rule: AbstractTransform, covariance: Array | None = N
     return mean, moved + s.process_noise * np.eye(5)
 
 
-@compiled
+@compile_in_float64
 def _moved(f: Transition, rule: AbstractTransform, mean: Array, covariance: Array) -> tuple[Any, Any]:
     """Mean and covariance of f(x); compiled once for f and rule."""
     result = rule.apply(lambda x: f(x, ()), jnp.asarray(mean), jnp.asarray(covariance))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.extras import how_to_install
 
 MOVING = 0.01  # m in one odometry row of 0.1 or 0.2 s: the robot has started
@@ -65,7 +65,7 @@ def find_recording(name: str = "plaza2") -> Path:
         ValueError: no recording of this name, or the installed gtsam comes without it.
     """
     if name not in FILES:
-        raise fail("recording", f"one of {', '.join(FILES)}", shown(name))
+        raise fail("recording", f"one of {', '.join(FILES)}", show_value(name))
     spec = find_spec("gtsam")
     if spec is None or spec.origin is None:
         raise ModuleNotFoundError(

@@ -17,7 +17,7 @@ from heliograph.model.channel import Channel, amplify_and_forward, hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
-from heliograph.numerics.check import check_count, fail, items, per_step, shown
+from heliograph.numerics.check import check_count, fail, items, repeat_per_step, show_value
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -180,16 +180,16 @@ def _links(hops: Sequence[GainAndNoise]) -> list[_Link]:
     links = []
     for item in items("hops", hops, "hops"):
         if not isinstance(item, GainAndNoise) or item.inputs != 1 or item.outputs != 1:
-            raise fail(WHAT, "single hops of one number", shown(item))
+            raise fail(WHAT, "single hops of one number", show_value(item))
         variance = float(np.asarray(item.noise.covariance)[0, 0])
         links.append(_Link(float(item.law.moment(1)), float(item.law.moment(2)), variance))
     if not links or any(link.mean == 0 for link in links):
-        raise fail(WHAT, "at least one, each with a mean gain", shown(hops))
+        raise fail(WHAT, "at least one, each with a mean gain", show_value(hops))
     return links
 
 
 def _powers(powers: ArrayLike, count: int) -> np.ndarray:
-    result = per_step("powers", powers, count)
+    result = repeat_per_step("powers", powers, count)
     if np.any(result <= 0):
         raise fail("powers", "positive numbers", result.tolist())
     return result

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.testing import check_filter
 from tests.follow import follow
 from tests.oracles.event_grid import Link, Scalar, forgetful, posterior
@@ -204,7 +204,7 @@ def test_what_does_not_fit_is_refused_in_one_line():
         assert "\n" not in str(error.value)
 
 
-@compiled
+@compile_in_float64
 def innovations(item, state, z):
     """Of each value alone, from one state."""
     return jax.vmap(lambda value: item.correct(state, value[None])[1])(z)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 
-moments = compiled(truncated_normal)
+moments = compile_in_float64(truncated_normal)
 # Of a Gauss-Legendre rule with 40 nodes over 17 deviations or less: 1.2e-13 is what 1,500 random intervals showed.
 ACCURATE = 1e-12
 
@@ -83,7 +83,7 @@ def test_no_variance_is_negative_and_no_moment_is_no_number():
 @pytest.mark.parametrize("lower", [-38.0, -6.0, -0.5, 0.0, 1.0, 2.5, 3.999, 4.0, 4.5, 7.0, 20.0, 40.0, 1e3, 1e6])
 def test_a_tail_has_twelve_digits(lower):
     log_mass, mean, variance = reference(lower, np.inf)
-    result = compiled(upper_tail)(np.asarray(lower))
+    result = compile_in_float64(upper_tail)(np.asarray(lower))
     t = max(lower, 0.0)
     assert result.log_mass == pytest.approx(log_mass - t**2 / 2 - np.log(2 * np.pi) / 2, rel=ACCURATE, abs=ACCURATE)
     # Below -6 the mean is the density at the end, of which the reference has the digits that 1 - Z leaves.
@@ -94,7 +94,7 @@ def test_a_tail_has_twelve_digits(lower):
 def test_a_tail_anywhere_is_the_interval_without_an_end():
     random = np.random.default_rng(3)
     lower = random.normal(size=20_000) * 10 ** random.uniform(-8, 8, 20_000)
-    result, expected = compiled(upper_tail)(lower), moments(lower, np.full_like(lower, np.inf))
+    result, expected = compile_in_float64(upper_tail)(lower), moments(lower, np.full_like(lower, np.inf))
     assert np.all(result.variance > 0) and np.all(result.variance <= 1)
     for part, whole in zip(result, expected, strict=True):
         np.testing.assert_allclose(part, whole, rtol=2 * ACCURATE, atol=ACCURATE)  # an error of each

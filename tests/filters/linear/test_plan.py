@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.filters.linear.plan import PlannedFilter
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 
 STEPS = 7
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]], [[0.0], [1.0]])
@@ -44,7 +44,7 @@ def taken(item, z, u):
     return jax.lax.scan(body, start, (z, u, jax.numpy.arange(len(z))))[1]
 
 
-taken_by_xla = compiled(taken)
+taken_by_xla = compile_in_float64(taken)
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
@@ -53,7 +53,7 @@ def test_its_steps_are_the_originals(name):
     inputs, data = draw.normal(size=(STEPS, len(original.inputs))), 3 * draw.normal(size=(STEPS, 2))
     planned = original.planned(inputs)
     assert planned.claim == original.claim and planned is not original
-    expected, steps = (computed(taken, taken_by_xla, (item, data, inputs)) for item in (original, planned))
+    expected, steps = (compute_once(taken, taken_by_xla, (item, data, inputs)) for item in (original, planned))
     for x, y in zip(jax.tree.leaves((*expected, expected[2])), jax.tree.leaves((*steps, steps[3])), strict=True):
         np.testing.assert_allclose(y, x, rtol=0, atol=1e-12 * np.maximum(1.0, np.abs(x).max()))
 

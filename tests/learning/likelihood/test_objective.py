@@ -7,7 +7,7 @@ import pytest
 import heliograph as hg
 from heliograph.learning.description import describe
 from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.objective import _by_xla, at_points, objectives
+from heliograph.learning.likelihood.objective import _by_xla, evaluate_at_points, objectives
 
 STEPS, RECORDINGS = 157, 2
 TOLERANCE = 1e-10  # of the largest entry: what rounding is given that 157 steps add it up, and information squares it
@@ -48,7 +48,7 @@ def points(objective):
 def test_native_code_computes_what_the_compiler_of_jax_does(both):
     objective, data = both
     x = points(objective)
-    native = at_points(objective, x, data)
+    native = evaluate_at_points(objective, x, data)
     with jax.enable_x64(True):
         for i, point in enumerate(x):
             parts = [_by_xla(objective, point, z, u) for z, u in zip(data.measurements, data.inputs, strict=True)]
@@ -64,10 +64,10 @@ def test_native_code_computes_what_the_compiler_of_jax_does(both):
 def test_scores_are_the_derivatives_of_the_likelihood(both):
     objective, data = both
     for x in points(objective):
-        result = at_points(objective, x[None], data)
+        result = evaluate_at_points(objective, x[None], data)
         with jax.enable_x64(True):
             total = sum(hg.log_likelihood(objective.filter(x), z) for z in data.measurements)
         np.testing.assert_allclose(result.total[0], total, rtol=1e-12)
-        ends = [at_points(objective, x + sign * DIFFERENCE * np.eye(len(x)), data).total for sign in (-1, 1)]
+        ends = [evaluate_at_points(objective, x + sign * DIFFERENCE * np.eye(len(x)), data).total for sign in (-1, 1)]
         slopes = (ends[1] - ends[0]) / (2 * DIFFERENCE)
         np.testing.assert_allclose(result.gradient[0], slopes, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())

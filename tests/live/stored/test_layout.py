@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.live.stored.layout import factors, fits, moved, parts_of, placed, with_covariances
+from heliograph.live.stored.layout import describe_old_layout, factors, fits, parts_of, place_flags, relocate_parts
 
 NEW = {
     ".mean": [2, 3],
@@ -19,7 +19,7 @@ OLD = {".mean": [2, 3], ".covariance": [2, 3, 3], ".inner.covariance": [1, 1], "
 
 
 def test_an_older_layout_is_that_of_now_with_covariances():
-    assert with_covariances(NEW) == OLD and list(with_covariances(NEW)) == list(OLD)
+    assert describe_old_layout(NEW) == OLD and list(describe_old_layout(NEW)) == list(OLD)
     assert fits(OLD, NEW) and fits(NEW, NEW) and fits(OLD, OLD)
     for other in (
         OLD | {".covariance": [2, 2, 2]},
@@ -34,7 +34,7 @@ def test_a_sum_of_an_event_filter_has_its_parts_in_the_order_that_they_had_with_
     """Snapshots without names of parts are read by this order."""
     sensor = hg.LinearSensor([[1.0]], 0.1)
     start = hg.event_filter(hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), sensor, hg.perfect(1), hg.SendOnDelta(0.5)).init()
-    before = with_covariances({path: part.shape for path, part in parts_of(start).items()})
+    before = describe_old_layout({path: part.shape for path, part in parts_of(start).items()})
     assert list(before) == [".weight", ".mean", ".covariance", ".label", ".begun", ".moved"]
     assert before[".covariance"] == list(start.covariance.shape)
 
@@ -60,7 +60,7 @@ def test_parts_move_to_their_paths_of_now():
     parts = {path: generator.normal(size=(5, *shape)) for path, shape in OLD.items()}
     parts[".covariance"] = parts[".covariance"] @ np.swapaxes(parts[".covariance"], -1, -2)
     parts[".inner.covariance"] **= 2
-    results = moved(parts, NEW)
+    results = relocate_parts(parts, NEW)
     assert {path: list(part.shape[1:]) for path, part in results.items()} == NEW
     np.testing.assert_array_equal(results[".law"], parts[".law"])
     np.testing.assert_array_equal(results[".inner.variances"], parts[".inner.covariance"][..., 0])
@@ -85,4 +85,4 @@ def test_flags_whose_columns_were_noted_as_those_of_their_numbers_are_put_in_the
         }
         for name, parts in right.items()
     }
-    assert placed(wrong) == right == placed(right)
+    assert place_flags(wrong) == right == place_flags(right)

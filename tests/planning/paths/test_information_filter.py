@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliograph.planning import Error
-from heliograph.planning.paths.model import Plants, RiccatiMap, adjoint, covariances, fixed_point
+from heliograph.planning.paths.model import Plants, RiccatiMap, adjoint, covariances, solve_fixed_point
 from heliograph.planning.paths.networks import paths_of
 from tests.planning.published import A, Q, path_problem, two_hops
 
@@ -55,7 +55,7 @@ def test_the_adjoint_is_the_gradient(start):
 
 def test_an_error_that_nobody_receives_is_refused():
     with pytest.raises(ValueError, match="steady error: expected one that converges"):
-        fixed_point(RiccatiMap(np.diag([1.1, 0.5]), np.diag([0.0, 1.0]), np.eye(2)))
+        solve_fixed_point(RiccatiMap(np.diag([1.1, 0.5]), np.diag([0.0, 1.0]), np.eye(2)))
 
 
 @pytest.mark.parametrize("error", [Error(), Error(worst=True), Error(horizon=3, at_end=True), Error(period=2)], ids=str)

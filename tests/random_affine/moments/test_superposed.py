@@ -130,7 +130,10 @@ def test_bounds_hold_under_every_corner(name, few, monkeypatch):
     assert len(laws) > 1
     if not few:
         monkeypatch.setattr(second_moments, "CORNERS", 1)
-    seen, generator = second_moments.described_by(*second_moments._bounds(channel), True), np.random.default_rng(3)
+    seen, generator = (
+        second_moments.describe_second_moments(*second_moments._bounds(channel), True),
+        np.random.default_rng(3),
+    )
     present = np.ones(channel.outputs, dtype=bool)
     for _ in range(3):
         second = second_moment(generator, channel.inputs + 1)

@@ -15,7 +15,7 @@ from heliograph.files.bags.layout import Decoder, RawMessage
 from heliograph.files.bags.mcap_chunks import messages_of
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources import Sources
-from heliograph.numerics.check import InputError, fail, shown_error
+from heliograph.numerics.check import InputError, fail, show_error
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -67,7 +67,7 @@ def read_bag(
         ValueError: no bag, fields that are not in it, or no topic of the sources; one line.
         ModuleNotFoundError: rosbags is not installed (extra "bags").
     """
-    with opened(path) as (reader, cut):
+    with open_bag(path) as (reader, cut):
         events.broken = cut
         counts = Counter[str]()
         for connection in reader.connections:
@@ -103,7 +103,7 @@ def read_bag(
 
 
 @contextmanager
-def opened(path: Path) -> "Iterator[tuple[AnyReader, str]]":
+def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
     """Open a bag for reading; of an MCAP file that was cut off, what is whole, and a line that says so, else "".
 
     Raises:
@@ -262,7 +262,7 @@ def _there(fields: dict[str, str], path: str) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    return " ".join(shown_error(error).split()).rstrip(".")
+    return " ".join(show_error(error).split()).rstrip(".")
 
 
 def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, eliminated, joined, nothing
+from heliograph.factors.columns import Columns, eliminate, join_columns, nothing
 from heliograph.factors.gaussian import Gaussian, observe, of_columns
 from heliograph.filters.event.parts import CERTAIN, Parts
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
@@ -80,8 +80,8 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
         gain = jnp.where(varies, (x.root * x.variances) @ rows.T / size, 0.0)
         given, _ = observe(x, rows, jnp.zeros(len(rows)), nothing(len(rows)), varies)
         mean = x.mean + gain @ jnp.where(varies, moments.mean - centre, 0.0)
-        spread = eliminated(moments.covariance).through(gain)
-        return moments.log_mass, of_columns(mean, joined(given.columns, spread))
+        spread = eliminate(moments.covariance).through(gain)
+        return moments.log_mass, of_columns(mean, join_columns(given.columns, spread))
 
     log_mass, after = jax.lax.map(cut_one, parts.gaussian)
     return Parts(parts.log_weight + log_mass, after, parts.label)

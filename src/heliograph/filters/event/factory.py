@@ -5,14 +5,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, sized
+from heliograph.filters.base import AbstractFilter, make_sizes
 from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.patterns import SideInformation, by_pattern
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, given_bounds
+from heliograph.model.estimate import Claim, lower_to_upper
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, check_plant
@@ -87,7 +87,9 @@ def event_filter(
     premise = Premise(plant, sensor, channel, trigger, order=None)
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _claim_of(plant, sensor, channel, trigger)
-        return believing(StochasticEventFilter(trigger=trigger, **shared, **sized(claim, start, received)), premise)
+        return believing(
+            StochasticEventFilter(trigger=trigger, **shared, **make_sizes(claim, start, received)), premise
+        )
     filter = EventFilter(
         trigger=_threshold(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
         known=known,
@@ -96,7 +98,7 @@ def event_filter(
         alike=all(_alike(step) for step in steps),
         ages=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
         **shared,
-        **sized("nominal", start, received),
+        **make_sizes("nominal", start, received),
     )
     return believing(filter, premise)
 
@@ -117,7 +119,7 @@ def _claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: Sto
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_is_known(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):
-        return given_bounds("exact", plant, sensor, channel)
+        return lower_to_upper("exact", plant, sensor, channel)
     hidden = trigger.losses == "unknown" and any(_loses(step) for step in steps)
     return "exact" if all(_reveals(s) for s in steps) and _is_gaussian(plant, sensor) and not hidden else "nominal"
 

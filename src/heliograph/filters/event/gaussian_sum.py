@@ -9,18 +9,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, given, leading, with_rows
+from heliograph.factors.gaussian import Gaussian, append_rows, given, leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import cut_to_ball
-from heliograph.filters.event.moments import Link, arriving, augmented, moved, pinned, updated
-from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
+from heliograph.filters.event.moments import Link, arriving, augment, condition_parts, pin, predict_jointly
+from heliograph.filters.event.parts import (
+    FLOOR,
+    Parts,
+    cut,
+    cut_away,
+    join,
+    log_total,
+    reduce_parts,
+    safe_log,
+    together,
+)
 from heliograph.filters.gaussian.belief import smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.centred import predicted_signal
+from heliograph.model.centred import predict_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -115,12 +125,12 @@ class EventFilter(AbstractSizedFilter):
         """Always true: silence is a measurement."""
         return True
 
-    @compiled
+    @compile_on_call
     def init(self) -> EventBelief:
         """The prior, and no reference yet."""
         start, m = at(self.plant, 0), self.outputs
         x = given(start.initial_mean, start.initial_covariance)
-        both = with_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
+        both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
@@ -153,10 +163,10 @@ class EventFilter(AbstractSizedFilter):
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
         """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
         plant, u, start = at(self.plant, k), jnp.asarray(u), start_of(self.plant)
-        both = jax.vmap(lambda x: moved(plant, self.transform, x, u, start))(state.gaussian)
+        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
             expected, places = self.reference(self._whole(state).mean, u, k), len(self.states) + np.arange(self.outputs)
-            both = jax.vmap(lambda x: pinned(x, places, expected))(both)
+            both = jax.vmap(lambda x: pin(x, places, expected))(both)
         rows = jnp.asarray(at(self.channel, k).transition)
         label = jnp.einsum("hsiac,ij->hsjac", state.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
         if self.trigger.heartbeat is not None:
@@ -167,7 +177,7 @@ class EventFilter(AbstractSizedFilter):
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
-        return predicted_signal(at(self.plant, k), at(self.sensor, k), mean, u)
+        return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
     def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:
@@ -181,7 +191,7 @@ class EventFilter(AbstractSizedFilter):
         for s, those in enumerate(self.senders):
             mine = values[those] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
-            wide = augmented(plant, sensor, self.transform, parts, start)
+            wide = augment(plant, sensor, self.transform, parts, start)
             arrived = jnp.any(~jnp.isnan(mine))
             after, expected, spread = self._condition_on_sender(wide, channel, mine, lost, s, begun[s])
             whole = log_total(after.log_weight)
@@ -238,7 +248,9 @@ class EventFilter(AbstractSizedFilter):
         # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
         outside = join(self._cut_to_outside(wide.labelled(s, dropped), sender, 1.0), self._outside)
         fresh = together([outside, join(wide.labelled(s, forced))]).keep(self._find_new_reference(sender))
-        few = reduced(together([others.keep(as_it_was), fresh]), self.lost, slice(n + sender.start, n + sender.stop))
+        few = reduce_parts(
+            together([others.keep(as_it_was), fresh]), self.lost, slice(n + sender.start, n + sender.stop)
+        )
         return self._or_nothing(together([slots.keep(as_it_was), few]), wide)
 
     def _condition_on_value(
@@ -263,7 +275,7 @@ class EventFilter(AbstractSizedFilter):
             moments = channel.mean, channel.gain_spread, channel.noise
             links.append(Link(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
             before.append(wide.labelled(s, only))
-            used.append(updated(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers))
+            used.append(condition_parts(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers))
         # Restricted to where the sender had to send.
         count, size = len(links), len(label)
         selected = self._select_sent(together([*used, *before]), s, begun)

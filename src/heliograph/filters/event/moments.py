@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, below_diagonal, joined, outer, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, leading, observe, of_columns, with_rows
+from heliograph.factors.columns import Columns, below_diagonal, join_columns, outer, rounding_of, triangular
+from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns
 from heliograph.filters.event.parts import Parts
 from heliograph.filters.gaussian.belief import image_of, process_noise
 from heliograph.filters.gaussian.signal import gain_noise, signal_of
@@ -30,7 +30,7 @@ class Link(NamedTuple):
         return Link(self.mean[rows], self.gain_spread[rows, rows], noise)
 
 
-def augmented(
+def augment(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: Parts, start: jax.Array
 ) -> Parts:
     """Augment each Gaussian of (x, r) by y = h(x) + v; `start` (n,) is E[x_i^2] before any data."""
@@ -39,33 +39,33 @@ def augmented(
     def augment_one(both: Gaussian) -> Gaussian:
         signal = signal_of(plant, sensor, transform, leading(both, n), start)
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
-        return with_rows(both, signal.mean, slopes, triangular(joined(signal.noise, rounding_of(signal.size))))
+        return append_rows(both, signal.mean, slopes, triangular(join_columns(signal.noise, rounding_of(signal.size))))
 
     return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
 
 
-def moved(
+def predict_jointly(
     plant: AbstractPlant, transform: AbstractTransform, both: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
     """Move (x, r) by one step of the plant; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
     rest = len(both.mean) - n
     image = image_of(plant, transform, leading(both, n), u)
-    noise = joined(image.curvature, process_noise(plant, u, start))
+    noise = join_columns(image.curvature, process_noise(plant, u, start))
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, rest))), both.root[n:]])
     fresh = Columns(jnp.pad(noise.matrix, ((0, rest), (0, 0))), noise.weights)
     mean = jnp.concatenate([image.mean + plant.noise_mean(), both.mean[n:]])
-    return of_columns(mean, joined(Columns(slopes, both.variances), fresh))
+    return of_columns(mean, join_columns(Columns(slopes, both.variances), fresh))
 
 
-def pinned(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
+def pin(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
     """Set components that are known: these values, and no variance."""
     root = x.root.at[places].set(np.eye(len(x.mean))[places])
     variances = x.variances.at[places].set(0.0)
     return Gaussian(x.mean.at[places].set(values), below_diagonal(root), variances)
 
 
-def updated(
+def condition_parts(
     parts: Parts,
     z: jax.Array,
     arrived: jax.Array,
@@ -81,7 +81,7 @@ def updated(
         expected, slopes, noise = _transform_by_link(x, link.of_sender(sender, m), m)
         after, innovations = observe(x, slopes, z - expected, noise, arrived)
         if delivers:  # y is z, to the last digit
-            after = pinned(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
+            after = pin(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
         return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
 
     after, density = jax.vmap(update_one)(parts.gaussian)
@@ -93,7 +93,7 @@ def arriving(x: Gaussian, link: Link, sender: slice, m: int) -> Gaussian:
 
     def receive_one(x: Gaussian) -> Gaussian:
         expected, slopes, noise = _transform_by_link(x, link.of_sender(sender, m), m)
-        return of_columns(expected, joined(Columns(slopes, x.variances), noise))
+        return of_columns(expected, join_columns(Columns(slopes, x.variances), noise))
 
     received: Gaussian = jax.vmap(receive_one)(x)
     return received
@@ -103,5 +103,5 @@ def _transform_by_link(x: Gaussian, link: Link, m: int) -> tuple[jax.Array, jax.
     """Return E z, slopes and noise of z = G y + n, y the last m components."""
     centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
     second = Columns(rows, x.variances).covariance + outer(centre, centre)
-    noise = joined(link.noise, gain_noise(link.gain_spread, second, centre))
+    noise = join_columns(link.noise, gain_noise(link.gain_spread, second, centre))
     return gain @ centre + link.mean[:, -1], gain @ rows, noise

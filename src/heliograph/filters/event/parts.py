@@ -138,7 +138,7 @@ def _join(parts: Parts, groups: int) -> Parts:
     return few
 
 
-def reduced(parts: Parts, count: int, places: slice) -> Parts:
+def reduce_parts(parts: Parts, count: int, places: slice) -> Parts:
     """Reduce to at most `count` Gaussians: pairs that are nearest in the components `places` are joined first.
 
     The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.

@@ -7,19 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
-from heliograph.factors.columns import Columns, eliminated, joined
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.columns import Columns, eliminate, join_columns
 from heliograph.factors.gaussian import Gaussian, given, observe, of_columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
-from heliograph.filters.gaussian.belief import predicted, smoother_step_by_transform, start_of
+from heliograph.filters.gaussian.belief import predict_gaussian, smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
-from heliograph.filters.modes.multiple_model import receive, repeated
+from heliograph.filters.modes.multiple_model import receive, repeat
 from heliograph.filters.modes.patterns import SideInformation, append_flag
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.centred import predicted_signal
+from heliograph.model.centred import predict_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -75,7 +75,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Always true: silence is a measurement."""
         return True
 
-    @compiled
+    @compile_on_call
     def init(self) -> StochasticBelief:
         """The prior."""
         start = at(self.plant, 0)
@@ -86,7 +86,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
         """Move x and the modes; both ends compute the next reference."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = predicted(plant, self.transform, state.gaussian, u, start_of(self.plant))
+        moved = predict_gaussian(plant, self.transform, state.gaussian, u, start_of(self.plant))
         rows = jnp.asarray(at(self.channel, k).transition)
         law = jnp.where(state.moved, state.law @ rows, state.law)
         reference = state.reference
@@ -96,7 +96,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
-        return predicted_signal(at(self.plant, k), at(self.sensor, k), mean, u)
+        return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
     def correct(self, state: StochasticBelief, z: ArrayLike, k: Step = 0) -> tuple[StochasticBelief, Innovation]:
@@ -109,7 +109,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         # A value: each mode's update, joined.
         modes = len(state.law)
-        sent = repeated(signal, modes)
+        sent = repeat(signal, modes)
         posteriors, weight, innovation = receive(sent, channel, jnp.arange(modes), state.law, values)
         came = join(Parts(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
         # Nothing: silence, or a link that is down.
@@ -172,8 +172,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         (gain, spread), mean, total = link, signal.mean, signal.covariance
         # Of y.
         silent = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)
-        y = of_columns(mean, joined(Columns(signal.slopes, signal.prior.variances), signal.noise))
-        quiet, _ = observe(y, y.root, reference - mean, eliminated(self._inverse_weight()))
+        y = of_columns(mean, join_columns(Columns(signal.slopes, signal.prior.variances), signal.noise))
+        quiet, _ = observe(y, y.root, reference - mean, eliminate(self._inverse_weight()))
         d = quiet.mean - mean
         shift = -silent * d / (1 - silent)
         about = (total - silent * (quiet.covariance + jnp.outer(d, d))) / (1 - silent) - total
@@ -213,7 +213,7 @@ class StochasticEventFilter(AbstractSizedFilter):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
             return jnp.where(due, -jnp.inf, 0.0), prior
         value = reference - signal.mean
-        noise = joined(signal.noise, eliminated(self._inverse_weight()))
+        noise = join_columns(signal.noise, eliminate(self._inverse_weight()))
         after, innovations = observe(prior, signal.slopes, value, noise)
         size = jnp.abs(reference) + jnp.abs(signal.mean)
         return innovations.log_density(jnp.ones(len(value), bool), size) + self._log_height(), after

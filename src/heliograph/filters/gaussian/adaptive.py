@@ -19,16 +19,16 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.robust import RobustFilter, expected_of, signal_without_noise
+from heliograph.filters.gaussian.robust import RobustFilter, expect_received, signal_without_noise
 from heliograph.filters.gaussian.scores import (
     SMALLEST,
     AbstractWeights,
     Expected,
     branch_precision,
     joint_update,
-    reweighted,
+    reweight,
     score_update,
-    squared_residuals,
+    square_residuals,
 )
 from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import Law, ReceivedNoise, received_noise
@@ -114,7 +114,7 @@ class AdaptiveFilter(AbstractSizedFilter):
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
         signal = signal_without_noise(plant, sensor, base.transform, belief, start_of(base.plant, base))
-        before = expected_of(signal, at(base.channel, k))
+        before = expect_received(signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
         z = nearest(jnp.asarray(z), before.signal, angles)
         rule = base.rule if isinstance(base, RobustFilter) else None
@@ -189,8 +189,8 @@ def _learn(
         elif rule is not None:
             weight, shown = rule.iterate(before, _independent(noise), e, arrived)
             received = arrived & (weight > SMALLEST)
-        used = reweighted(_independent(noise), weight)
-        learned = scale + weight * squared_residuals(before, used, residual, received) / 2
+        used = reweight(_independent(noise), weight)
+        learned = scale + weight * square_residuals(before, used, residual, received) / 2
         last, noise = noise, jnp.where(received, learned / after_shape, noise)
     # The state with the last variances.
     if law is not None:

@@ -6,7 +6,7 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, columns_of, joined, rounding_of, triangular
+from heliograph.factors.columns import Columns, columns_of, join_columns, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, Image, given, move, of_sum
 from heliograph.factors.gaussian import transform as transformed
 from heliograph.filters.base import (
@@ -15,17 +15,17 @@ from heliograph.filters.base import (
     Step,
     corrects,
     estimates,
+    make_sizes,
     predicts,
-    sized,
 )
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.model.premise import believes
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -55,12 +55,12 @@ class AbstractBeliefFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """Mean and covariance of f(x, u) + w."""
-        return predicted(at(self.plant, k), self.transform, state, jnp.asarray(u), start_of(self.plant, self))
+        return predict_gaussian(at(self.plant, k), self.transform, state, jnp.asarray(u), start_of(self.plant, self))
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
         """Mean and covariance of the belief, angles between -pi and pi."""
-        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
+        return Estimate(wrap_angles(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of the state before the step given its prediction, and that after the update."""
@@ -92,7 +92,7 @@ def start_of(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array,
 def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> Columns:
     """Factors of Cov w, and of the rounding of a state that had the second moments `start`, (n,)."""
     own = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    return triangular(joined(own, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
+    return triangular(join_columns(own, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
 
 
 def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
@@ -102,7 +102,7 @@ def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u:
     return transform.image(plant.moves(u, x.mean), x)
 
 
-def predicted(
+def predict_gaussian(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
     """f(x, u) + w."""
@@ -185,11 +185,11 @@ def open_loop_filter(
     start = check_plant(plant)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
-    claim = given_bounds("exact" if linear else "nominal", plant)
+    claim = lower_to_upper("exact" if linear else "nominal", plant)
     return OpenLoop(
         plant=plant,
         transform=Cubature(),
         initial_mean=mean,
         initial_covariance=spread,
-        **sized(claim, start, 0),
+        **make_sizes(claim, start, 0),
     )

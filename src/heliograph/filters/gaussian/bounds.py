@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelated, joined, reciprocal, triangular
+from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal, triangular
 from heliograph.factors.gaussian import Gaussian, observe, of_sum
 from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
-from heliograph.filters.gaussian.signal import Received, Signal, eliminated_spread, homogeneous
+from heliograph.filters.gaussian.signal import Received, Signal, factor_spread, homogeneous
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
@@ -80,7 +80,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars:
     # The same bound as a Kalman update.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
     wide = prior._replace(variances=a * prior.variances)
-    return observe(wide, slopes, a * z.innovation, eliminated_spread(noise), present)[0]
+    return observe(wide, slopes, a * z.innovation, factor_spread(noise), present)[0]
 
 
 def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scalar: Array) -> Gaussian:
@@ -97,16 +97,16 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
     base = channel.power(unknown_part, present) + channel.spread(known_part, present)
     shift = channel.shift(unknown_part, present)
     # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
-    used = received(channel, present)[:, None]
-    signals = joined(Columns(signal.slopes, prior.variances), signal.noise)
+    used = mask_received(channel, present)[:, None]
+    signals = join_columns(Columns(signal.slopes, prior.variances), signal.noise)
     factors = triangular(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
-    explained = decorrelated(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
+    explained = decorrelate(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
     share = reciprocal(factors.weights)
     # The best beta, then the update with what is left of Omega as noise.
     cross = (slopes * prior.variances) @ prior.root.T
     parts = base + absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
     beta = smallest_scalars(zero_mean_sweep, scalar, parts)[0]
-    after = observe(prior, slopes, z.innovation, eliminated_spread(base + shift / beta - of_state), present)[0]
+    after = observe(prior, slopes, z.innovation, factor_spread(base + shift / beta - of_state), present)[0]
     wider = of_sum(after.mean, after.columns, Columns(explained, beta * share))
     return keep_unless(jnp.any(present), wider, after)
 
@@ -125,7 +125,7 @@ def absent(present: jax.Array) -> jax.Array:
     return jnp.diag(jnp.where(present, 0.0, 1.0))
 
 
-def received(channel: SecondOrder, present: jax.Array) -> jax.Array:
+def mask_received(channel: SecondOrder, present: jax.Array) -> jax.Array:
     """Return the mask (p,) of the signal's components that act on what arrived; the others count as never measured."""
     m, p = channel.mean_gain.shape[:2]
     reached = (channel.power.center != 0) | (channel.power.radius != 0)

@@ -10,15 +10,15 @@ from heliograph.filters.base import (
     FilterAngles,
     Step,
     corrects,
-    sized,
+    make_sizes,
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
-from heliograph.filters.gaussian.signal import Received, Signal, corrected_by, received_noise, signal_of
+from heliograph.filters.gaussian.signal import Received, Signal, condition, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan
-from heliograph.model.channel import Channel, check_link, mean_gain, perfect, received_angles
-from heliograph.model.estimate import Innovation, given_bounds
+from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain, perfect
+from heliograph.model.estimate import Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
@@ -58,14 +58,14 @@ class GaussianFilter(AbstractBeliefFilter):
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         signal = signal_of(at(self.plant, k), sensor, self.transform, state, start_of(self.plant, self))
         unknown = signal.about_mean() if self.linear else signal
-        return corrected(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
+        return correct_signal(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
         return plan(self, inputs) if self.linear else self
 
 
-def corrected(
+def correct_signal(
     signal: Signal,
     channel: SecondOrder,
     rule: AbstractUpdate,
@@ -81,8 +81,8 @@ def corrected(
     unknown = signal if unknown is None else unknown
     expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
     # By the nominal law: the best update of a known one.
-    slopes, noise = jnp.asarray(channel.mean_gain) @ unknown.slopes, received_noise(unknown, channel)
-    nominal, innovation = corrected_by(unknown.prior, slopes, noise, z, expected, angles)
+    slopes, noise = jnp.asarray(channel.mean_gain) @ unknown.slopes, make_received_noise(unknown, channel)
+    nominal, innovation = condition(unknown.prior, slopes, noise, z, expected, angles)
     received = Received(jnp.asarray(innovation.value), ~jnp.isnan(z))
     return rule.condition(unknown, channel, received, nominal), innovation
 
@@ -113,7 +113,7 @@ def _build(
     instance("update", update, AbstractUpdate, "one such as Polytope()")
     channel = perfect_for(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
-    angles = received_angles(plant, sensor, channel)
+    angles = find_received_angles(plant, sensor, channel)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     # Moments of the channel, its memory ignored.
     premise = Premise(plant, sensor, channel)
@@ -125,7 +125,7 @@ def _build(
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     claim = update.claim(uncertain=False) if linear and trusted and not prior_given else "nominal"
-    claim = given_bounds(claim, plant, sensor, channel)
+    claim = lower_to_upper(claim, plant, sensor, channel)
     filter = GaussianFilter(
         plant=plant,
         sensor=sensor,
@@ -136,7 +136,7 @@ def _build(
         initial_covariance=spread,
         linear=linear,
         observed_angles=angles,
-        **sized(claim, start, first(channel).outputs),
+        **make_sizes(claim, start, first(channel).outputs),
     )
     return believing(filter, premise)
 

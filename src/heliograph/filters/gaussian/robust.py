@@ -17,16 +17,16 @@ from heliograph.filters.gaussian.scores import (
     AbstractWeights,
     Corrected,
     Expected,
-    reweighted,
+    reweight,
     score_update,
-    squared_residuals,
-    weighted_update,
+    square_residuals,
+    update_weighted,
 )
-from heliograph.filters.gaussian.signal import Signal, received_noise, signal_of
+from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
-from heliograph.model.channel import Channel, check_link, received_angles
+from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first
@@ -138,7 +138,7 @@ class StudentVB(AbstractWeights):
         used = w = jnp.broadcast_to(jnp.ones_like(scale), e.shape)
         for _ in range(self.iterations):
             used = w
-            residual = squared_residuals(before, reweighted(noise, used), e, present)
+            residual = square_residuals(before, reweight(noise, used), e, present)
             w = (jnp.asarray(self.degrees) + 1) / (jnp.asarray(self.degrees) + residual / scale)
         return used, w
 
@@ -178,14 +178,14 @@ class RobustFilter(AbstractBeliefFilter):
             after = score_update(before, z, law)
             center, variance = law.mean_and_variance()
             return after.state, _innovation(before, z, center, jnp.diag(variance), after, True)
-        after = weighted_update(before, z, noise.center, columns_of(noise.covariance), self.rule)
+        after = update_weighted(before, z, noise.center, columns_of(noise.covariance), self.rule)
         return after.state, _innovation(before, z, noise.center, noise.covariance, after)
 
     def expected(self, state: Gaussian, k: Step) -> tuple[Expected, jax.Array]:
         """Moments of what would arrive without the noise that may hold outliers, and the sensor's mean signal."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start_of(self.plant, self))
-        return expected_of(signal, channel), signal.mean
+        return expect_received(signal, channel), signal.mean
 
 
 def signal_without_noise(
@@ -195,11 +195,11 @@ def signal_without_noise(
     return signal_of(plant, sensor, transform, state, start, nothing(len(sensor.outputs)))
 
 
-def expected_of(signal: Signal, channel: SecondOrder) -> Expected:
+def expect_received(signal: Signal, channel: SecondOrder) -> Expected:
     """Through the channel: t with mean M y + b and slopes M times the signal's; gain and plain noise are its noise."""
     gain = jnp.asarray(channel.mean_gain)
     mean = gain @ signal.mean + channel.offset
-    return Expected(signal.prior, mean, gain @ signal.slopes, received_noise(signal, channel))
+    return Expected(signal.prior, mean, gain @ signal.slopes, make_received_noise(signal, channel))
 
 
 def _innovation(
@@ -273,6 +273,6 @@ def robust_filter(
         rule = rule.of_law(_degrees(first(noise)))
     return RobustFilter(
         plant=plant, sensor=sensor, channel=plain, noise=noise, rule=rule, transform=move, initial_mean=mean,
-        initial_covariance=spread, received_angles=received_angles(plant, sensor, channel), claim="nominal",
+        initial_covariance=spread, received_angles=find_received_angles(plant, sensor, channel), claim="nominal",
         states=start.states, inputs=start.inputs, received=first(channel).outputs,
     )  # fmt: skip

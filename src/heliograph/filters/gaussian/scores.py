@@ -8,8 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, joined, triangular
-from heliograph.factors.gaussian import Gaussian, leading, observe, of_columns, revise, with_rows
+from heliograph.factors.columns import Columns, join_columns, triangular
+from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns, revise
 from heliograph.filters.robust_noise import Law
 from heliograph.numerics.module import Module, readable, unwritten
 
@@ -31,7 +31,7 @@ class Expected(NamedTuple):
     @property
     def columns(self) -> Columns:
         """Cov t."""
-        return joined(Columns(self.slopes, self.prior.variances), self.noise)
+        return join_columns(Columns(self.slopes, self.prior.variances), self.noise)
 
 
 class Corrected(NamedTuple):
@@ -54,7 +54,7 @@ def score_update(before: Expected, z: jax.Array, law: Law) -> Corrected:
     Source: Masreliez, Approximate non-Gaussian filtering with linear state and observation relations (1975).
     """
     n, m, present = len(before.prior.mean), len(before.signal), ~jnp.isnan(z)
-    both = with_rows(before.prior, before.signal, before.slopes, triangular(before.noise))
+    both = append_rows(before.prior, before.signal, before.slopes, triangular(before.noise))
     weights, density = [], jnp.zeros_like(z[0])
     for i in range(m):
         row = both.root[n + i]
@@ -110,28 +110,28 @@ class AbstractWeights(Module):
         return w, w
 
 
-def weighted_update(
+def update_weighted(
     before: Expected, z: jax.Array, center: jax.Array, noise: Columns, rule: AbstractWeights
 ) -> Corrected:
     """One joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; a component of weight zero is missing."""
     arrived = ~jnp.isnan(z)
     e = jnp.where(arrived, z - before.signal - center, 0.0)
     w, shown = rule.iterate(before, noise, e, arrived)
-    after = joint_update(before, e, arrived & (w > SMALLEST), reweighted(noise, w))
+    after = joint_update(before, e, arrived & (w > SMALLEST), reweight(noise, w))
     return Corrected(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
 
 
-def reweighted(noise: Columns, w: jax.Array) -> Columns:
+def reweight(noise: Columns, w: jax.Array) -> Columns:
     """r_ij / sqrt(w_i w_j): each row over the root of its weight."""
     return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
 
 def joint_update(before: Expected, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
     """State after the components that are present, with noise of this covariance besides that of t."""
-    return observe(before.prior, before.slopes, e, joined(before.noise, noise), present)[0]
+    return observe(before.prior, before.slopes, e, join_columns(before.noise, noise), present)[0]
 
 
-def squared_residuals(before: Expected, noise: Columns, e: jax.Array, present: jax.Array) -> jax.Array:
+def square_residuals(before: Expected, noise: Columns, e: jax.Array, present: jax.Array) -> jax.Array:
     """E_i = (z_i - t_i+)^2 + V_ii+ after a joint update with this noise: what is then known of each noise's square."""
     t = of_columns(jnp.zeros_like(e), before.columns)
     after, _ = observe(t, t.root, e, noise, present)

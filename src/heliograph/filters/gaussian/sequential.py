@@ -15,13 +15,13 @@ from heliograph.filters.base import (
     Step,
     corrects,
     estimates,
+    make_sizes,
     predicts,
-    sized,
 )
 from heliograph.filters.gaussian.belief import smoother_step_by_transform
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.agreement import joined
+from heliograph.model.agreement import join_premises
 from heliograph.model.estimate import Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
 from heliograph.model.premise import believing
@@ -124,7 +124,9 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     weakest_claim = weakest([filter.claim for filter in nodes])
     central = SequentialFilter(
         filters=nodes,
-        **sized("exact" if weakest_claim == "exact" else "nominal", nodes[0], sum(filter.received for filter in nodes)),
+        **make_sizes(
+            "exact" if weakest_claim == "exact" else "nominal", nodes[0], sum(filter.received for filter in nodes)
+        ),
     )
     premises = [filter.premise for filter in nodes if filter.premise is not None]
-    return believing(central, joined(premises) if len(premises) == len(nodes) else None)
+    return believing(central, join_premises(premises) if len(premises) == len(nodes) else None)

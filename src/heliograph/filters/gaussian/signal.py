@@ -9,13 +9,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, eliminated, joined, rounding_of, triangular, unit_of
+from heliograph.factors.columns import Columns, eliminate, join_columns, rounding_of, triangular, unit_of
 from heliograph.factors.gaussian import Gaussian, Innovations, observe
 from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
-from heliograph.numerics.angle import Angles, continued, nearest
+from heliograph.numerics.angle import Angles, continue_angles, nearest
 from heliograph.numerics.linalg import contract
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -47,7 +47,7 @@ class Signal(NamedTuple):
     @property
     def covariance(self) -> jax.Array:
         """Cov y (p, p), with the sensor's noise."""
-        return joined(Columns(self.slopes, self.prior.variances), self.noise).covariance
+        return join_columns(Columns(self.slopes, self.prior.variances), self.noise).covariance
 
     @property
     def cross(self) -> jax.Array:
@@ -81,9 +81,9 @@ def signal_of(
     if isinstance(sensor, LinearSensor):
         image = linear_image(sensor.matrix, sensor.measure(prior.mean), prior)
     else:
-        image = transform.image(continued(sensor.measure, prior.mean, plant.angles, sensor.angles), prior)
-    mean, noise = image.mean + law.mean, joined(law.columns if noise is None else noise, image.curvature)
-    second = joined(Columns(image.slopes, prior.variances), noise).covariance + jnp.outer(mean, mean)
+        image = transform.image(continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles), prior)
+    mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
+    second = join_columns(Columns(image.slopes, prior.variances), noise).covariance + jnp.outer(mean, mean)
     size = size_of(sensor, start) if isinstance(sensor, LinearSensor) else jnp.diagonal(second)
     return Signal(prior, mean, image.slopes, noise, second, size)
 
@@ -100,7 +100,7 @@ def size_of(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     return reach**2 + variances
 
 
-def received_noise(signal: Signal, channel: SecondOrder) -> Columns:
+def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
     """Return the noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
 
     A combination of outputs free of v and n is known to eps of it: these are made triangular, of known numbers once.
@@ -111,34 +111,34 @@ def received_noise(signal: Signal, channel: SecondOrder) -> Columns:
 
 
 def noise_through(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
-    """Return `received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
+    """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ jnp.sqrt(signal.size)) ** 2)
-    plain = triangular(joined(signal.noise.through(gain), link, rounding))
-    return joined(plain, gain_noise(gain_spread, signal.second, signal.mean))
+    plain = triangular(join_columns(signal.noise.through(gain), link, rounding))
+    return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
 
 
 def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> Columns:
     """Factor E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
-    return eliminated_spread(contract(gain_spread, homogeneous(second, mean, 1.0)))
+    return factor_spread(contract(gain_spread, homogeneous(second, mean, 1.0)))
 
 
-def eliminated_spread(spread: jax.Array) -> Columns:
+def factor_spread(spread: jax.Array) -> Columns:
     """Factor a spread that is formed: of a combination free of it, elimination leaves a hundred eps."""
-    return eliminated(spread, LOST * unit_of(spread))
+    return eliminate(spread, LOST * unit_of(spread))
 
 
 def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Columns:
     """Return Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
-    return joined(channel.noise, gain_noise(channel.gain_spread, second, mean))
+    return join_columns(channel.noise, gain_noise(channel.gain_spread, second, mean))
 
 
 def observe_received(signal: Signal, channel: SecondOrder, z: Received) -> tuple[Gaussian, Innovations]:
     """Condition the prior on what arrived behind the nominal law of the channel."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
-    return observe(signal.prior, slopes, z.innovation, received_noise(signal, channel), z.present)
+    return observe(signal.prior, slopes, z.innovation, make_received_noise(signal, channel), z.present)
 
 
-def corrected_by(
+def condition(
     x: Gaussian, slopes: jax.Array, noise: Columns, z: jax.Array, expected: jax.Array, angles: Angles = ()
 ) -> tuple[Gaussian, Innovation]:
     """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive."""
@@ -146,7 +146,7 @@ def corrected_by(
     z = nearest(z, expected, angles)
     value = z - expected
     after, innovations = observe(x, slopes, value, noise, present)
-    total = joined(Columns(slopes, x.variances), noise).covariance
+    total = join_columns(Columns(slopes, x.variances), noise).covariance
     density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
     return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
@@ -154,7 +154,7 @@ def corrected_by(
 def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
     """Return Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m)."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
-    return joined(Columns(slopes, signal.prior.variances), received_noise(signal, channel)).covariance
+    return join_columns(Columns(slopes, signal.prior.variances), make_received_noise(signal, channel)).covariance
 
 
 def homogeneous(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelated, eliminated, nothing, reciprocal, square_root
+from heliograph.factors.columns import Columns, decorrelate, eliminate, nothing, reciprocal, square_root
 from heliograph.factors.gaussian import Gaussian, Image, given
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
@@ -52,9 +52,9 @@ class AbstractTransform(Module):
 
 def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
     """Slopes (D^-1 L^-1 Cov(x, f))' and as curvature what Cov f has more than slopes D slopes'."""
-    slopes = decorrelated(x.root, moments.cross).T * reciprocal(x.variances)
+    slopes = decorrelate(x.root, moments.cross).T * reciprocal(x.variances)
     rest = moments.covariance - (slopes * x.variances) @ slopes.T
-    return Image(moments.mean, slopes, eliminated(rest))
+    return Image(moments.mean, slopes, eliminate(rest))
 
 
 class Cubature(AbstractTransform):
@@ -71,14 +71,14 @@ class Cubature(AbstractTransform):
         """Propagate the points and take their sample moments."""
         n = len(x.mean)
         steps = square_root(n * x.variances)
-        ahead, behind = at_points(function, x, steps)
+        ahead, behind = evaluate_at_points(function, x, steps)
         even = (ahead + behind) / 2
         mean = jnp.sum(even, axis=1) * (1 / n)
         slopes = (ahead - behind) / 2 * reciprocal(steps)
         return Image(mean, slopes, Columns(even - mean[:, None], jnp.full(n, 1 / n)))
 
 
-def at_points(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
+def evaluate_at_points(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
     """f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each."""
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)
@@ -133,7 +133,7 @@ class PolynomialMoments(AbstractTransform):
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
         rest = values - center[:, None] - slopes @ points.T
-        return Image(center, slopes * reciprocal(deviations), eliminated(Columns(rest, weights).covariance))
+        return Image(center, slopes * reciprocal(deviations), eliminate(Columns(rest, weights).covariance))
 
 
 def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:

@@ -30,7 +30,7 @@ from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,
     SecondOrder,
-    described_by,
+    describe_second_moments,
     nominal_spread,
     second_order,
     symmetric_product,
@@ -255,4 +255,4 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
     zero = np.zeros_like(noise)
     parts = scaled(spread + shift**2, noise), scaled(shift**2, zero), scaled(power, zero)
     mean = np.concatenate([gain, np.zeros((len(noise), 1))], axis=1)
-    return described_by(mean, *parts, nominal_spread(channel), shift > 0)
+    return describe_second_moments(mean, *parts, nominal_spread(channel), shift > 0)

@@ -62,7 +62,7 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
     return LinearBelief(*given(start.initial_mean, start.initial_covariance), mean, covariance)
 
 
-def predicted(belief: LinearBelief, step: Move) -> LinearBelief:
+def predict_belief(belief: LinearBelief, step: Move) -> LinearBelief:
     """Estimate and state before data after x+ = A x + b + w."""
     estimate = move(belief.estimate, step.matrix, step.shift, step.noise)
     mean = step.matrix @ belief.state_mean + step.shift

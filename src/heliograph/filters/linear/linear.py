@@ -7,12 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.gaussian import corrected, describe
+from heliograph.filters.gaussian.gaussian import correct_signal, describe
 from heliograph.filters.gaussian.signal import Signal, size_of
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, move_of, predicted, prior_belief
+from heliograph.filters.linear.belief import LinearBelief, move_of, predict_belief, prior_belief
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
@@ -20,7 +20,7 @@ from heliograph.filters.modes.uncertain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.delay import as_current, behind_delays
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -30,7 +30,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.base import as_maps
+from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outliers import is_bounded
 
@@ -69,13 +69,13 @@ class LinearFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
-        return predicted(state, move_of(at(self.plant, k), jnp.asarray(u), start_of(self.plant)))
+        return predict_belief(state, move_of(at(self.plant, k), jnp.asarray(u), start_of(self.plant)))
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Correct with the components of z that arrived."""
         sensor, channel, start = at(self.sensor, k), at(self.channel, k), start_of(self.plant)
-        return corrected_linear(state, sensor, channel, self.rule, jnp.asarray(z), start)
+        return correct_linear(state, sensor, channel, self.rule, jnp.asarray(z), start)
 
     @estimates
     def estimate(self, state: LinearBelief) -> Estimate:
@@ -110,13 +110,13 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     return Signal(state.estimate, mean, slopes, law.columns, symmetric(second), size_of(sensor, start))
 
 
-def corrected_linear(
+def correct_linear(
     state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, start: jax.Array
 ) -> tuple[LinearBelief, Innovation]:
     """Correct with the components of z that arrived: the signal's mean by the estimate, all else before any data."""
     before = signal_before_data(state, sensor, start)
     now = before._replace(mean=jnp.asarray(sensor.matrix @ state.mean + sensor.noise.mean))
-    after, innovation = corrected(now, channel, rule, z, unknown=before)
+    after, innovation = correct_signal(now, channel, rule, z, unknown=before)
     return LinearBelief(*after, state.state_mean, state.state_covariance), innovation
 
 
@@ -149,7 +149,7 @@ def linear_filter(
     Source: De Koning (1984), for multiplicative noise; Costa (1994), for modes.
     """
     # Delays: the same filter for the system enlarged by past signals.
-    if as_maps("channel", [first(channel)])[0].past:
+    if check_maps("channel", [first(channel)])[0].past:
         return behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
     check_linear("linear filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
@@ -175,8 +175,8 @@ def linear_filter(
         channel=described,
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
-        **sized(
-            given_bounds(rule.claim(whole.uncertain), plant, sensor, channel),
+        **make_sizes(
+            lower_to_upper(rule.claim(whole.uncertain), plant, sensor, channel),
             start,
             first(channel).outputs,
         ),
@@ -210,7 +210,7 @@ def memoryless_filter(
         return _nominal(ignoring) if matters else ignoring
 
     # Delays: the same filter for the system enlarged by past signals.
-    late = as_maps("channel", [first(forgets)])[0].past
+    late = check_maps("channel", [first(forgets)])[0].past
     return behind_delays(plant, sensor, forgets, make) if late else make(plant, sensor, forgets)
 
 

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.engine.choice import SHORT, computed
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.engine.choice import SHORT, compute_once
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
@@ -133,7 +133,7 @@ def plan(
     `projection` (n, N) maps the filter's mean to the plant's states.
     """
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
-    return _plan(*arguments) if is_traced(arguments) else computed(_plan, _plan_by_xla, arguments, SHORT)
+    return _plan(*arguments) if is_traced(arguments) else compute_once(_plan, _plan_by_xla, arguments, SHORT)
 
 
 def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
@@ -141,7 +141,7 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
     quiet = jnp.zeros(filter.received)
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
-        step, prior, after = followed(filter, state, quiet, row[1], row[0])
+        step, prior, after = plan_step(filter, state, quiet, row[1], row[0])
         return after, (step, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
 
     start = filter.init()
@@ -155,14 +155,14 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
         covariances=by_stage,
         start=start.mean,
         projection=projection,
-        **sized(filter.claim, filter, filter.received),
+        **make_sizes(filter.claim, filter, filter.received),
     )
 
 
 _plan_by_xla = quickly_compiled(_plan)
 
 
-def followed(
+def plan_step(
     filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step
 ) -> tuple[LinearStep, PyTree, PyTree]:
     """Matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
@@ -208,7 +208,7 @@ def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Arra
     if isinstance(filter, PlannedFilter):
         outcome: LinearStep = at(filter.steps, k)
         return outcome
-    step, _, _ = followed(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    step, _, _ = plan_step(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
     return step._replace(
         gain=jnp.where(present, step.gain, 0.0),
@@ -229,7 +229,7 @@ class Linearised(NamedTuple):
     noise: jax.Array
 
 
-def linearised_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
+def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
     """Linearise a filter's correction at its prediction, with its covariance held.
 
     The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.

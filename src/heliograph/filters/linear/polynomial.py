@@ -18,7 +18,7 @@ from heliograph.linear.polynomial import memory_system
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
@@ -28,7 +28,7 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.moments.moment_noise import about_mean
 from heliograph.random_affine.moments.monomials import count, monomials, position
 from heliograph.random_affine.moments.second_moments import has_known_gain
@@ -67,10 +67,10 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | 
     return Centre(start, _series([_matrix(p) for p in plants]), _series(drifts), _series(received))
 
 
-def without_mean(plant: AnyPlant) -> AnyPlant:
+def centre_plant(plant: AnyPlant) -> AnyPlant:
     """Return the plant of the centred state x_k - E[x_k]."""
     if isinstance(plant, OverTime):
-        return over_time([without_mean(step) for step in unstack(plant)])
+        return over_time([centre_plant(step) for step in unstack(plant)])
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     n = len(plant.states)
@@ -249,7 +249,7 @@ def _lift(
     """Lifted system of the model, about its mean where the gain is known."""
     check_model(plant, sensor, channel)
     centre = centre_of(plant, sensor, channel)
-    about = plant if centre is None else without_mean(plant)
+    about = plant if centre is None else centre_plant(plant)
     return centre, lifted_system(about, sensor, channel, degree, horizon)
 
 
@@ -354,12 +354,12 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
 
     Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
     """
-    check_forgets("channel of a memory filter", as_maps("channel", [first(channel)])[0])
+    check_forgets("channel of a memory filter", check_maps("channel", [first(channel)])[0])
     claim = claim_of(plant, sensor, channel, 2)
     # The linear filter's gains are needed for the moments of its products with z.
     centre, system = _lift(plant, sensor, channel, 1, horizon)
     linear = lmmse(system, claim)
-    about = plant if centre is None else without_mean(plant)
+    about = plant if centre is None else centre_plant(plant)
     products = lmmse(memory_system(about, sensor, channel, linear), linear.claim)
     names = first(plant).states
     filter = MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
@@ -378,4 +378,4 @@ def claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) 
         claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
     else:
         claim = "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"
-    return given_bounds(claim, plant, sensor, channel)
+    return lower_to_upper(claim, plant, sensor, channel)

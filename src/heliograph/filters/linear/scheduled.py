@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
-from heliograph.factors.columns import Columns, columns_of_each, joined, rounding_of, triangular
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, given, move
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.gaussian.signal import corrected_by
+from heliograph.filters.gaussian.signal import condition
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
@@ -69,7 +69,7 @@ class ScheduledFilter(AbstractSizedFilter):
         self.states, self.inputs = names("state names", states, g.direct.shape[1], "x"), ()
         self.received, self.kept = g.direct.shape[2], schedule.kept
 
-    @compiled
+    @compile_on_call
     def init(self) -> ScheduleState:
         """Return the schedule's initial state."""
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
@@ -171,7 +171,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         s: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
         expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
-        return corrected_by(state, slopes, noise, z, expected)
+        return condition(state, slopes, noise, z, expected)
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
@@ -206,7 +206,7 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
 
         def of_step(own: Columns, seconds: jax.Array) -> Columns:
-            return triangular(joined(own, rounding_of(seconds)))
+            return triangular(join_columns(own, rounding_of(seconds)))
 
         each: Callable[..., Columns] = jax.vmap(of_step)
         factors = each(columns_of_each(covariances), rounding)

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import LinearStep, PlannedFilter
 from heliograph.filters.modes.modal import ObservationModel, observation_models
-from heliograph.linear.jump_system import mixed, moved
+from heliograph.linear.jump_system import mix_modes, propagate
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.enlarged import with_past
 from heliograph.model.over_time import at, first
@@ -113,8 +113,8 @@ def _propagate(
     move[:n, n] = plant.shift(given)
     move[n + 1 :, n + 1 :], move[n + 1 :, n] = step.transition, step.drift
     noise[:n, :n] = plant.noise_covariance(given)
-    before = mixed(rows, moments)
-    return np.asarray(moved(move, before, before[:, n, n, None, None] * noise))
+    before = mix_modes(rows, moments)
+    return np.asarray(propagate(move, before, before[:, n, n, None, None] * noise))
 
 
 def _correct_moments(
@@ -131,8 +131,8 @@ def _correct_moments(
     use[:, n + 1 :, : n + 1] += gain @ mean @ measure
     use[:, n + 1 :, n + 1 :] -= gain @ step.output
     use[:, n + 1 :, n] -= gain @ step.offset
-    second = moved(measure, moments[:, : n + 1, : n + 1], law * noise)
-    added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * moved(mean, noise, 0.0)
-    after: np.ndarray = moved(use, moments, 0.0)
-    after[:, n + 1 :, n + 1 :] += moved(gain, added, 0.0)
+    second = propagate(measure, moments[:, : n + 1, : n + 1], law * noise)
+    added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * propagate(mean, noise, 0.0)
+    after: np.ndarray = propagate(use, moments, 0.0)
+    after[:, n + 1 :, n + 1 :] += propagate(gain, added, 0.0)
     return after

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.factors.columns import Columns, columns_of_each, joined, rounding_of
+from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of
 from heliograph.factors.gaussian import Gaussian, given, merge, move, observe
 from heliograph.filters.base import (
     AbstractSizedFilter,
@@ -18,19 +18,19 @@ from heliograph.filters.base import (
     Step,
     corrects,
     estimates,
+    make_sizes,
     predicts,
-    sized,
 )
 from heliograph.filters.gaussian.belief import process_noise, start_of
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.model.channel import Channel, check_link, received_angles
+from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
-from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
@@ -238,11 +238,11 @@ class MixtureFilter(AbstractSizedFilter):
 
         # Kalman update of one combination, with the rounding of what it says of the state.
         def condition(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, tuple[jax.Array, ...]]:
-            slopes, value = gain @ x.root, wrapped(z - gain @ x.mean - offset, self.observed_angles)
-            noise = joined(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
+            slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
+            noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
             after, innovations = observe(x, slopes, value, noise, present)
             likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
-            total = joined(Columns(slopes, x.variances), noise).covariance
+            total = join_columns(Columns(slopes, x.variances), noise).covariance
             return after, (likelihood, jnp.sum(present & innovations.determined), value, total)
 
         after, (likelihood, certain, value, total) = jax.vmap(condition)(c.gain, c.offset, c.noise)
@@ -258,7 +258,7 @@ class MixtureFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: MixtureBelief) -> Estimate:
         """Mean and covariance of the belief, angles between -pi and pi."""
-        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
+        return Estimate(wrap_angles(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of the state before the step given its prediction."""
@@ -308,7 +308,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
     # All combinations of atoms, mode by mode, for each step where they vary.
-    angles = received_angles(plant, sensor, channel)
+    angles = find_received_angles(plant, sensor, channel)
     floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
     if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):
         modes = [_modes(channel)]
@@ -324,7 +324,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         components=components,
         initial=modes[0].initial,
         observed_angles=angles,
-        **sized("nominal", start, first(channel).outputs),
+        **make_sizes("nominal", start, first(channel).outputs),
     )
 
 

@@ -18,16 +18,16 @@ import numpy as np
 from heliograph.factors.columns import (
     Columns,
     below_diagonal,
-    joined,
+    join_columns,
     outer,
     rounding_of,
     side_by_side,
     triangular,
 )
 from heliograph.factors.gaussian import Gaussian, given, of_columns
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import process_noise, start_of
-from heliograph.filters.gaussian.signal import corrected_by, eliminated_spread
+from heliograph.filters.gaussian.signal import condition, factor_spread
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
@@ -37,10 +37,10 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import stacked
+from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import divided, nominal_spread, undivided
+from heliograph.random_affine.moments.second_moments import divide_spread, nominal_spread, undivided
 
 
 class ObservationModel(Module):
@@ -158,13 +158,13 @@ class ModalFilter(AbstractModalFilter):
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
-        (move, noise, centre), rows = moved_about(at(self.plant, k), u, state.centre), self._rows(state, k)
+        (move, noise, centre), rows = predict_about(at(self.plant, k), u, state.centre), self._rows(state, k)
         law = state.law @ rows
         # F zeta about the moving centre.
         centred = state.mean - known_part(state.law, state.centre)
-        mean = moved_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
+        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
         root, fresh = self._moves(state, u, k)
-        after = of_columns(mean, joined(Columns(root, state.variances), fresh))
+        after = of_columns(mean, join_columns(Columns(root, state.variances), fresh))
         moments = jnp.einsum("ij,iab->jab", rows, _propagate_moments(state, move)) + law[:, None, None] * noise
         return ModalBelief(*after, moments, centre, jnp.asarray(True))
 
@@ -185,21 +185,21 @@ class ModalFilter(AbstractModalFilter):
 
     def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
         """Return F L of zeta = E zeta + L xi, and the columns of Cov(zeta+ - F zeta)."""
-        move, rows = moved_about(at(self.plant, k), u, state.centre)[0], self._rows(state, k)
+        move, rows = predict_about(at(self.plant, k), u, state.centre)[0], self._rows(state, k)
         own = self.moved_noise(u, k, Columns(jnp.eye(len(rows)), state.law @ rows))
-        fresh = joined(spread_of_moves(_propagate_moments(state, move), rows), own)
-        return moved_by_mode(state.gaussian.root, move, rows), fresh
+        fresh = join_columns(spread_of_moves(_propagate_moments(state, move), rows), own)
+        return predict_by_mode(state.gaussian.root, move, rows), fresh
 
     def _output(self, state: ModalBelief, k: Step) -> Output:
         """Return what is measured of zeta, less the mean output."""
         channel, sensor = at(self.channel, k), at(self.sensor, k)
-        (measure, noise), law = measured_about(sensor, state.centre), state.law
+        (measure, noise), law = measure_about(sensor, state.centre), state.law
         matrix, common = without_common(jnp.asarray(channel.mean) @ measure, law)
         sent = jax.vmap(lambda a: measure @ a @ measure.T)(state.moments) + law[:, None, None] * noise
         random = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent)
         plain = known_noise(channel, sensor.noise.columns, law)
         rounding = rounding_of_received(jnp.asarray(channel.mean), sent)
-        return Output(beside(matrix), common, joined(plain, rounding, eliminated_spread(random)))
+        return Output(place_beside(matrix), common, join_columns(plain, rounding, factor_spread(random)))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step given its prediction."""
@@ -221,7 +221,7 @@ def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns
     return Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
 
 
-def moved_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax.Array:
+def predict_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax.Array:
     """Multiply columns (N, c) by F, F[j, i] = Pi[i, j] A~: move each part by the plant, then mix all by the chain."""
     parts = columns.reshape(len(rows), len(move), -1)
     moved = jax.vmap(lambda part: move @ part)(parts).reshape(len(rows), -1)
@@ -230,7 +230,7 @@ def moved_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax.A
 
 def spread_of_moves(carried: jax.Array, rows: jax.Array) -> Columns:
     """Covariance (N, N) of zeta+ by the random move of the mode, sum_i Cov(1{next} | i) x E_i, of E_i (M, s, s)."""
-    return apart_by_mode(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], carried))
+    return separate_modes(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], carried))
 
 
 def covariance_of_mode(rows: jax.Array) -> jax.Array:
@@ -238,13 +238,13 @@ def covariance_of_mode(rows: jax.Array) -> jax.Array:
     return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
 
 
-def apart_by_mode(among: jax.Array) -> Columns:
+def separate_modes(among: jax.Array) -> Columns:
     """Columns (M s) of a covariance whose parts of size s sum to zero over the modes, from all modes but the last.
 
     Shapes: among (M - 1, s, M - 1, s).
     """
     others, size = among.shape[:2]
-    factors = eliminated_spread(among.reshape(others * size, others * size))
+    factors = factor_spread(among.reshape(others * size, others * size))
     return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
 
 
@@ -252,7 +252,7 @@ def known_noise(channel: ObservationModel, sent: Columns, law: jax.Array) -> Col
     """Columns (m, M columns) of sum_j P(j) (Hbar_j Cov(v) Hbar_j' + Cov n_j), which no signal scales."""
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     through = Columns(gains @ sent.matrix, jnp.broadcast_to(sent.weights, (len(law), len(sent.weights))))
-    return joined(side_by_side(through, law), side_by_side(channel.noise, law))
+    return join_columns(side_by_side(through, law), side_by_side(channel.noise, law))
 
 
 def rounding_of_received(gains: jax.Array, sent: jax.Array) -> Columns:
@@ -275,19 +275,19 @@ def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
 def observe_modes(x: Gaussian, centred: jax.Array, output: Output, z: ArrayLike) -> tuple[Gaussian, Innovation]:
     """Condition zeta on the components of z that arrived; `centred` is its mean less P(mode) c."""
     expected = output.common + output.matrix @ centred
-    return corrected_by(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
+    return condition(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
 
 
 def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
     """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0)."""
-    move = padded(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
-    return move, padded(plant.noise_covariance(u))
+    move = pad(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
+    return move, pad(plant.noise_covariance(u))
 
 
 def measure_matrix(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
     """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0)."""
-    measure = padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
-    return measure, padded(jnp.asarray(sensor.noise.covariance))
+    measure = pad(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+    return measure, pad(jnp.asarray(sensor.noise.covariance))
 
 
 def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
@@ -295,14 +295,14 @@ def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]
 
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
     """
-    spread, law = padded(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
+    spread, law = pad(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
     state = given(start.initial_mean, start.initial_covariance)
-    mode = apart_by_mode((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
+    mode = separate_modes((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
     # Factors of both, x before the indicator in each part.
     last = np.zeros((len(spread), len(spread)))
     last[-1, -1] = 1.0
     ends = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
-    root = jnp.kron(np.eye(len(law)), padded(state.root)) + jnp.kron(ends, last)
+    root = jnp.kron(np.eye(len(law)), pad(state.root)) + jnp.kron(ends, last)
     variances = jnp.concatenate([jnp.outer(law, state.variances), jnp.append(mode.weights, 0.0)[:, None]], axis=1)
     prior = Gaussian(jnp.kron(law, jnp.append(state.mean, 1.0)), below_diagonal(root), variances.reshape(-1))
     return prior, spread + last
@@ -313,13 +313,13 @@ def known_part(law: jax.Array, centre: jax.Array) -> jax.Array:
     return jnp.kron(law, jnp.append(centre, 0.0))
 
 
-def moved_about(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def predict_about(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A~ and Q~ of x - c, which no known input moves, and c one step later."""
     move, noise = move_matrix(plant, jnp.asarray(u))
     return move.at[:-1, -1].set(0.0), noise, move[:-1] @ jnp.append(centre, 1.0)
 
 
-def measured_about(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
+def measure_about(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
     """C~ and R~ of the centred state: y = C (x - c) + C c + E v."""
     measure, noise = measure_matrix(sensor)
     return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
@@ -334,12 +334,12 @@ def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Ar
     return output.at[:, :, -1].add(-common), common
 
 
-def beside(output: jax.Array) -> jax.Array:
+def place_beside(output: jax.Array) -> jax.Array:
     """Put output matrices (M, m, n + 1) side by side as one matrix (m, N) that acts on zeta."""
     return jnp.concatenate(list(output), axis=1)
 
 
-def padded(a: jax.Array) -> jax.Array:
+def pad(a: jax.Array) -> jax.Array:
     """Pad A by a row and a column of zeros: [[A, 0], [0, 0]]."""
     return jnp.pad(a, ((0, 1), (0, 1)))
 
@@ -360,7 +360,7 @@ def built_of_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: C
         sensor=sensor,
         channel=described,
         initial=initial,
-        **sized(claim, start, first(channel).outputs),
+        **make_sizes(claim, start, first(channel).outputs),
     )
 
 
@@ -376,10 +376,10 @@ def observation_models(channel: Channel) -> tuple[Float[Array, " M"], Observatio
 
 def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
     """Moments of the channel by mode at one step, and the transition from the step before."""
-    mean = stacked([m.moments(1).mean[:-1] for m in now.maps])
-    gains, noises = zip(*(divided(nominal_spread(m).center) for m in now.maps), strict=True)
-    noise = Columns(*(stacked(part) for part in zip(*noises, strict=True)))
-    return ObservationModel(before.transition, before.radius, mean, stacked(gains), noise)
+    mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
+    gains, noises = zip(*(divide_spread(nominal_spread(m).center) for m in now.maps), strict=True)
+    noise = Columns(*(stack_parts(part) for part in zip(*noises, strict=True)))
+    return ObservationModel(before.transition, before.radius, mean, stack_parts(gains), noise)
 
 
 def claim_of_modes(channel: Channel) -> Claim:

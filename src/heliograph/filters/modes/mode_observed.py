@@ -8,17 +8,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, Move, move_of, predicted, prior_belief
-from heliograph.filters.linear.linear import corrected_linear
+from heliograph.filters.linear.belief import LinearBelief, Move, move_of, predict_belief, prior_belief
+from heliograph.filters.linear.linear import correct_linear
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.patterns import append_flag
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation, given_bounds
+from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
@@ -26,10 +26,15 @@ from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
-from heliograph.random_affine.base import AbstractRandomAffine, given, memories
+from heliograph.random_affine.base import AbstractRandomAffine, condition_on_memories, memories
 from heliograph.random_affine.combine import Mixture
 from heliograph.random_affine.modes import degree_in
-from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, described_by, nominal_spread
+from heliograph.random_affine.moments.second_moments import (
+    QuadraticMap,
+    SecondOrder,
+    describe_second_moments,
+    nominal_spread,
+)
 
 
 class ModeObservedBelief(NamedTuple):
@@ -65,7 +70,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     channel: Channel
     late: bool = eqx.field(static=True)
 
-    @compiled
+    @compile_on_call
     def init(self) -> ModeObservedBelief:
         """Return the belief before any data."""
         belief = prior_belief(at(self.plant, 0))
@@ -79,7 +84,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
         """Predict both pairs of moments over step k."""
         move = move_of(at(self.plant, k), jnp.asarray(u), start_of(self.plant))
-        return state._replace(belief=predicted(state.belief, move), move=move)
+        return state._replace(belief=predict_belief(state.belief, move), move=move)
 
     @corrects
     def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
@@ -94,8 +99,8 @@ class ModeObservedFilter(AbstractSizedFilter):
         if self.late:
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
             then = _condition(at(self.channel, last), certain)
-            redone, _ = corrected_linear(state.before, at(self.sensor, last), then, rule, state.z, start)
-            redone = predicted(redone, state.move)
+            redone, _ = correct_linear(state.before, at(self.sensor, last), then, rule, state.z, start)
+            redone = predict_belief(redone, state.move)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
             then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
             described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
@@ -103,7 +108,7 @@ class ModeObservedFilter(AbstractSizedFilter):
             prior, described = state.belief, _condition(channel, certain)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
-        after, innovation = corrected_linear(prior, sensor, described, rule, z, start)
+        after, innovation = correct_linear(prior, sensor, described, rule, z, start)
         after = jax.tree.map(lambda a, b: jnp.where(is_known, a, b), after, prior)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         # The flags belong to the innovation; they add nothing to the likelihood.
@@ -121,7 +126,7 @@ class ModeObservedFilter(AbstractSizedFilter):
 
 def _condition(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
     held = memories(channel).values()
-    return _nominal(given(channel, [m.read(number) for m, number in zip(held, numbers, strict=True)]))
+    return _nominal(condition_on_memories(channel, [m.read(number) for m, number in zip(held, numbers, strict=True)]))
 
 
 def _following(last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
@@ -130,7 +135,7 @@ def _following(last: AbstractRandomAffine | None, channel: AbstractRandomAffine,
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
         choices.append(memory.following(None if last is None else memory.read(number), degree_in(channel, identity)))
     chosen = list(product(*(range(len(weights)) for _, weights in choices)))
-    maps = [given(channel, [choices[i][0][j] for i, j in enumerate(places)]) for places in chosen]
+    maps = [condition_on_memories(channel, [choices[i][0][j] for i, j in enumerate(places)]) for places in chosen]
     weights = [prod(choices[i][1][j] for i, j in enumerate(places)) for places in chosen]
     return _nominal(Mixture(maps, jnp.stack([jnp.asarray(w) for w in weights])))
 
@@ -140,7 +145,7 @@ def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
     none = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
-    return described_by(mean, spread, none, none, spread, False)
+    return describe_second_moments(mean, spread, none, none, spread, False)
 
 
 def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
@@ -198,8 +203,8 @@ def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: b
         sensor=sensor,
         channel=channel,
         late=late,
-        **sized(
-            given_bounds(
+        **make_sizes(
+            lower_to_upper(
                 "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel), plant, sensor, channel
             ),
             start,

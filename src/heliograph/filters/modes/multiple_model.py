@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian, given, merge, moments_of_mixture, of_matrix
 from heliograph.filters.base import (
@@ -22,22 +22,22 @@ from heliograph.filters.base import (
     Step,
     corrects,
     estimates,
+    make_sizes,
     predicts,
-    sized,
 )
-from heliograph.filters.gaussian.belief import predicted, process_noise, smoother_step_by_transform, start_of
-from heliograph.filters.gaussian.signal import Signal, corrected_by, noise_through, signal_of
+from heliograph.filters.gaussian.belief import predict_gaussian, process_noise, smoother_step_by_transform, start_of
+from heliograph.filters.gaussian.signal import Signal, condition, noise_through, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.modes.patterns import SideInformation, by_pattern, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.channel import Channel, check_link, received_angles
+from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
@@ -82,7 +82,7 @@ def _correct_in_mode(
     expected = mean[:, :-1] @ signal.mean + mean[:, -1]
     z = nearest(z, expected, angles)
     slopes, noise = mean[:, :-1] @ signal.slopes, noise_through(signal, mean[:, :-1], gain_spread, link)
-    return corrected_by(signal.prior, slopes, noise, z, expected)
+    return condition(signal.prior, slopes, noise, z, expected)
 
 
 def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
@@ -190,7 +190,7 @@ def shares(weight: jax.Array) -> jax.Array:
     return jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
 
 
-def mixed_and_moved(
+def mix_and_predict(
     plant: AbstractPlant,
     transform: AbstractTransform,
     parts: Gaussian,
@@ -202,7 +202,7 @@ def mixed_and_moved(
     share = shares(weight)
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge, parts), in_axes=1)(share)
-        return jax.vmap(lambda x: predicted(plant, transform, x, u, start))(mixtures)
+        return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
     matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
@@ -236,11 +236,11 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Return the angles of its plant, and those that its channel delivers."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
-    @compiled
+    @compile_on_call
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes."""
         start = at(self.plant, 0)
-        parts = repeated(given(start.initial_mean, start.initial_covariance), len(self.initial))
+        parts = repeat(given(start.initial_mean, start.initial_covariance), len(self.initial))
         return ModalBeliefs(*parts, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
 
     @predicts
@@ -249,7 +249,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         mixing, weight = self.merging.mixing(state.weight, rows)
-        moved = mixed_and_moved(plant, self.transform, state.parts, mixing, u, start_of(self.plant))
+        moved = mix_and_predict(plant, self.transform, state.parts, mixing, u, start_of(self.plant))
         parts: Gaussian = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(rows), leaf.shape[1])), moved)
         parts = parts._replace(mean=together(plant, parts.mean, jnp.sum(weight, axis=1)))
         return ModalBeliefs(*parts, weight, jnp.asarray(True))
@@ -270,7 +270,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def estimate(self, state: ModalBeliefs) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
         mean, covariance = moments_of_mixture(state.mean, state.covariance, jnp.sum(state.weight, axis=1))
-        return Estimate(wrapped(mean, first(self.plant).angles), covariance, self.claim)
+        return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return that of the whole mixture's moments around the update; modes are not smoothed."""
@@ -282,7 +282,7 @@ def _whole(state: ModalBeliefs) -> Gaussian:
     return merge(state.parts, jnp.sum(state.weight, axis=1))
 
 
-def repeated(x: T, count: int) -> T:
+def repeat(x: T, count: int) -> T:
     """Repeat the same so many times, along a new first axis."""
     every: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
     return every
@@ -299,11 +299,11 @@ def by_mode(
     """Return the fields that filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
-    angles, (initial, described) = received_angles(plant, sensor, channel), describe_modes(channel, nodes)
+    angles, (initial, described) = find_received_angles(plant, sensor, channel), describe_modes(channel, nodes)
     return {
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "observed_angles": angles,
         "transform": Cubature() if transform is None else transform,
-        **sized("nominal", start, first(channel).outputs),
+        **make_sizes("nominal", start, first(channel).outputs),
     }  # fmt: skip
 
 

@@ -16,10 +16,10 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import predicted, start_of
+from heliograph.filters.gaussian.belief import predict_gaussian, start_of
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.multiple_model import by_mode, receive, repeated, together
+from heliograph.filters.modes.multiple_model import by_mode, receive, repeat, together
 from heliograph.filters.modes.patterns import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
@@ -27,7 +27,7 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles, wrapped
+from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import check_count
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
@@ -85,7 +85,7 @@ class ParticleFilter(AbstractSizedFilter):
     def init(self) -> Particles:
         """Return the prior in every particle, with modes in proportion to their initial law."""
         start, n = at(self.plant, 0), self.particles
-        parts = repeated(given(start.initial_mean, start.initial_covariance), n)
+        parts = repeat(given(start.initial_mean, start.initial_covariance), n)
         mode = _chosen(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
         return Particles(*parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
 
@@ -97,7 +97,7 @@ class ParticleFilter(AbstractSizedFilter):
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
         drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
         start = start_of(self.plant)
-        parts = jax.vmap(lambda x: predicted(plant, self.transform, x, u, start))(state.parts)
+        parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.parts)
         mode = jnp.where(state.moved, drawn, state.mode)
         parts = parts._replace(mean=together(plant, parts.mean, state.weight))
         return Particles(*parts, mode, state.weight, key, jnp.asarray(True))
@@ -123,7 +123,7 @@ class ParticleFilter(AbstractSizedFilter):
     def estimate(self, state: Particles) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
         mean, covariance = moments_of_mixture(state.mean, state.covariance, state.weight)
-        return Estimate(wrapped(mean, first(self.plant).angles), covariance, self.claim)
+        return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
 
 def _chosen(law: jax.Array, uniform: jax.Array) -> jax.Array:

@@ -11,7 +11,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes
-from heliograph.random_affine.moments.second_moments import divided, symmetric_product, undivided
+from heliograph.random_affine.moments.second_moments import divide_spread, symmetric_product, undivided
 
 
 class SideInformation(Module):
@@ -65,7 +65,7 @@ def _side_information(
     divisor = np.where(chance > 0, chance, 1.0)
     mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
     spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
-    gains, noises = zip(*(divided(part) for row in spread for part in row), strict=True)
+    gains, noises = zip(*(divide_spread(part) for row in spread for part in row), strict=True)
     noise = Columns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
     present = np.array(kinds).reshape(len(kinds), m)
     return SideInformation(before.transition, present, chance, mean, np.reshape(gains, spread.shape), noise, flags)

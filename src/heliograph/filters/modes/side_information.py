@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.factors.columns import (
     Columns,
     below_diagonal,
-    joined,
+    join_columns,
     outer,
     reciprocal,
     rounding_of,
@@ -21,28 +21,28 @@ from heliograph.factors.columns import (
     unit_of,
 )
 from heliograph.factors.gaussian import Innovations, given
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.signal import eliminated_spread, size_of
+from heliograph.filters.gaussian.signal import factor_spread, size_of
 from heliograph.filters.modes.modal import (
-    beside,
     kron,
-    measured_about,
-    moved_about,
-    moved_by_mode,
+    measure_about,
     noise_in_mode,
+    place_beside,
+    predict_about,
+    predict_by_mode,
     sum_of_modes,
     without_common,
 )
 from heliograph.filters.modes.patterns import SideInformation, append_flag, by_pattern, pattern_of
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation, given_bounds
+from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
-from heliograph.numerics.caching import cached
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -122,12 +122,12 @@ class SideInformationFilter(AbstractSizedFilter):
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
         """Predict s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
         plant, channel = at(self.plant, k), at(self.channel, k)
-        move, _, centre = moved_about(plant, u, state.centre)
+        move, _, centre = predict_about(plant, u, state.centre)
         modes, (errors, x, weights) = len(self.initial), _parts(state)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
         law = _law(x, weights) @ rows
         # F e and A~ x~ of each mode, then e+ and x~+ of each transition.
-        errors = jax.vmap(lambda e: moved_by_mode(e, move, rows))(errors)
+        errors = jax.vmap(lambda e: predict_by_mode(e, move, rows))(errors)
         x = jax.vmap(lambda x: move @ x)(x)
 
         def to(chosen: jax.Array, e: jax.Array, x: jax.Array) -> jax.Array:
@@ -139,10 +139,10 @@ class SideInformationFilter(AbstractSizedFilter):
         def into(j: jax.Array, chances: jax.Array, law: jax.Array) -> Columns:
             moved = Columns(jax.vmap(to)(j - rows, errors, x), weights)
             own = Columns(kron(jnp.append(j, 1.0)[:, None], noise.matrix), law * noise.weights)
-            return triangular(joined(side_by_side(moved, chances), own))
+            return triangular(join_columns(side_by_side(moved, chances), own))
 
         moments = jax.vmap(into)(jnp.eye(modes), rows.T, law)
-        mean = moved_by_mode(state.mean[:, None], move, rows)[:, 0]
+        mean = predict_by_mode(state.mean[:, None], move, rows)[:, 0]
         return _make_belief(mean, moments, centre, jnp.asarray(True))
 
     @corrects
@@ -232,18 +232,18 @@ def _describe_received(
 
     Cov(z | zeta) in mode j is T_j(E[y y' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), and the rounding of z.
     """
-    (measure, noise), (_, x, weights) = measured_about(sensor, state.centre), _parts(state)
+    (measure, noise), (_, x, weights) = measure_about(sensor, state.centre), _parts(state)
     law = _law(x, weights)
 
     def noise_of(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
         sent = x.through(measure).covariance + p * noise
-        plain = joined(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
+        plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ jnp.sqrt(size)) ** 2).times(p)
-        return triangular(joined(plain, rounding, eliminated_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
+        return triangular(join_columns(plain, rounding, factor_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
 
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = without_common(gains @ measure, law)
-    output = beside(jnp.where(law[:, None, None] > 0, output, 0.0))
+    output = place_beside(jnp.where(law[:, None, None] > 0, output, 0.0))
     return Received(output, common, jax.vmap(noise_of)(gains, gain_spread, link, Columns(x, weights), law))
 
 
@@ -335,14 +335,14 @@ def side_information_filter(
         for i, row in enumerate(chances):
             probabilities(f"flags in mode {i}", row)
         steps = [replace(step, flags=chances) for step in steps]
-    claim = given_bounds("exact" if is_known else "nominal", plant, sensor, channel)
+    claim = lower_to_upper("exact" if is_known else "nominal", plant, sensor, channel)
     filter = SideInformationFilter(
         plant=plant,
         sensor=sensor,
         channel=over_time(steps) if isinstance(channel, OverTime) else steps[0],
         initial=initial,
         flagged=flags is not None,
-        **sized(claim, first(plant), first(channel).outputs + (flags is not None)),
+        **make_sizes(claim, first(plant), first(channel).outputs + (flags is not None)),
     )
     if flags is not None and len(memories(channel)) != 1:  # of several chains' joint mode: no channel delivers them
         return filter
@@ -350,7 +350,7 @@ def side_information_filter(
     return believing(filter, Premise(plant, sensor, received))
 
 
-@cached
+@cache_by_object
 def _describe(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
     """Describe a channel: law of the first mode, moments at each step, and whether all probabilities are known."""
     steps = [joint_modes(c) for c in unstack(channel)]

@@ -10,24 +10,24 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, joined, triangular
+from heliograph.factors.columns import Columns, join_columns, triangular
 from heliograph.factors.gaussian import Gaussian, of_columns
 from heliograph.filters.base import Step, corrects, predicts
-from heliograph.filters.gaussian.signal import eliminated_spread
+from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.modal import (
     AbstractModalFilter,
     Output,
-    apart_by_mode,
-    beside,
     built_of_modes,
     claim_of_modes,
     known_part,
-    measured_about,
-    moved_about,
-    moved_by_mode,
+    measure_about,
     observe_modes,
+    place_beside,
+    predict_about,
+    predict_by_mode,
     prior_of_modes,
     rounding_of_received,
+    separate_modes,
     without_common,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
@@ -87,11 +87,11 @@ class UncertainModalFilter(AbstractModalFilter):
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
         """Propagate the bound on Sigma-; at the first prediction the mode has its initial law."""
         (rows, radius), x = self._chain(state, k), state.gaussian
-        move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
+        move, noise, centre = predict_about(at(self.plant, k), u, state.centre)
         root, young, fresh = self._moves(state, u, k)
         centred, law = x.mean - known_part(state.law, state.centre), state.law @ rows
-        mean = moved_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
-        after = of_columns(mean, joined(Columns(root, (1 + young) * x.variances), fresh))
+        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
+        after = of_columns(mean, join_columns(Columns(root, (1 + young) * x.variances), fresh))
         # E[x~ x~'] and nominal law one step later.
         second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
         return UncertainBelief(*after, second, centre, law, low, high, jnp.asarray(True))
@@ -104,41 +104,41 @@ class UncertainModalFilter(AbstractModalFilter):
 
     def _moves(self, state: UncertainBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, jax.Array, Columns]:
         """Return F L, b, and the columns of (1 + 1/b) D + W, of Sigma- = (1 + b) F Sigma F' + (1 + 1/b) D + W."""
-        move, (rows, radius) = moved_about(at(self.plant, k), u, state.centre)[0], self._chain(state, k)
+        move, (rows, radius) = predict_about(at(self.plant, k), u, state.centre)[0], self._chain(state, k)
         # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
         carried = move @ state.second @ move.T
         chosen, wandering = (
             _bound_mean(matrices, *_middle_law(state.low, state.high)) for matrices in _bound_moves(rows, radius)
         )
         # Young's inequality, b = root(tr D / tr F Sigma F').
-        root = moved_by_mode(state.gaussian.root, move, rows)
+        root = predict_by_mode(state.gaussian.root, move, rows)
         young = jnp.sqrt(_ratio(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ state.variances)))
         wide = chosen + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * wandering
         # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
         low, high = _bound_next_law(rows, radius, state.low, state.high)
-        among = apart_by_mode(jnp.einsum("jl,ab->jalb", wide[:-1, :-1], carried))
-        own = self.moved_noise(u, k, eliminated_spread(_bound_diagonal(low, high)))
-        return root, young, joined(among, own)
+        among = separate_modes(jnp.einsum("jl,ab->jalb", wide[:-1, :-1], carried))
+        own = self.moved_noise(u, k, factor_spread(_bound_diagonal(low, high)))
+        return root, young, join_columns(among, own)
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
         """Correct with z; the covariance of z given zeta is bounded over the laws of the modes."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
+        gains, (measure, noise) = jnp.asarray(channel.mean), measure_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
         random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
         added = _bound_mean(random + gains @ noise @ gains.swapaxes(1, 2), *_middle_law(state.low, state.high))
         matrix, common = without_common(gains @ measure, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * second)
         centred = state.mean - known_part(state.law, state.centre)
-        output = Output(beside(matrix), common, joined(rounding, eliminated_spread(added)))
+        output = Output(place_beside(matrix), common, join_columns(rounding, factor_spread(added)))
         after, innovation = observe_modes(state.gaussian, centred, output, z)
         return UncertainBelief(*after, *state[3:]), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step; the filter's bound is not proved for smoothed estimates."""
         slopes, young, fresh = self._moves(step.before, step.u, step.k)
-        noise = triangular(joined(Columns(slopes, young * step.before.variances), fresh))
+        noise = triangular(join_columns(Columns(slopes, young * step.before.variances), fresh))
         moved, projection = (slopes, noise), self._projection()
         return smoother_step_of(step.before, step.prior, step.after, moved, "nominal", projection=projection)
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, joined
+from heliograph.factors.columns import Columns, join_columns
 from heliograph.factors.gaussian import Gaussian, of_columns
 from heliograph.filters.base import (
     AbstractSizedFilter,
@@ -15,12 +15,12 @@ from heliograph.filters.base import (
     Step,
     corrects,
     estimates,
+    make_sizes,
     predicts,
-    sized,
 )
 from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
-from heliograph.filters.gaussian.signal import Signal, innovation_covariance, received_noise, signal_of
+from heliograph.filters.gaussian.signal import Signal, innovation_covariance, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation
@@ -30,7 +30,7 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import nearest, wrapped
+from heliograph.numerics.angle import nearest, wrap_angles
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import eigh
@@ -166,7 +166,7 @@ class ClockFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: ClockBelief) -> Estimate:
         """Mean and covariance of the belief, angles between -pi and pi."""
-        return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
+        return Estimate(wrap_angles(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
 
 
 def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:
@@ -186,7 +186,9 @@ def _correct_by_gain(signal: Signal, channel: SecondOrder, gain: jax.Array, inno
     """Correct the mean to m + K e with any gain: the error is then (L - K slopes) xi - K v."""
     prior, slopes = signal.prior, jnp.asarray(channel.mean_gain) @ signal.slopes
     left = Columns(prior.root - gain @ slopes, prior.variances)
-    return of_columns(prior.mean + gain @ innovation, joined(left, received_noise(signal, channel).through(gain)))
+    return of_columns(
+        prior.mean + gain @ innovation, join_columns(left, make_received_noise(signal, channel).through(gain))
+    )
 
 
 @believes
@@ -228,5 +230,5 @@ def clock_filter(
     return ClockFilter(
         base=base,
         offsets=tuple(states.index(name) for name in names),
-        **sized("nominal", base, base.received),
+        **make_sizes("nominal", base, base.received),
     )

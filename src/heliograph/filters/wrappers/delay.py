@@ -18,11 +18,11 @@ from heliograph.filters.base import (
     Step,
     corrects,
     estimates,
+    make_sizes,
     predicts,
-    sized,
 )
 from heliograph.filters.gaussian.signal import link_noise
-from heliograph.filters.linear.belief import LinearBelief, Move, predicted
+from heliograph.filters.linear.belief import LinearBelief, Move, predict_belief
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.patterns import append_flag
 from heliograph.model.bias import driven_by
@@ -36,9 +36,9 @@ from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.combine import Series, known
-from heliograph.random_affine.delay import Delayed, Relayed, on_delay_line, signal_size
+from heliograph.random_affine.delay import Delayed, Relayed, place_on_delay_line, signal_size
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 
@@ -160,10 +160,10 @@ def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int,
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
     spread = link_noise(link, covariance + jnp.outer(mean, mean), mean)
     noise = Columns(jnp.zeros((total, spread.matrix.shape[1])).at[place].set(spread.matrix), spread.weights)
-    return predicted(state, Move(matrix, shift, noise.covariance, noise))
+    return predict_belief(state, Move(matrix, shift, noise.covariance, noise))
 
 
-def with_relays(
+def enlarge_by_relays(
     plant: AnyPlant, sensor: AnySensor, channel: Relayed
 ) -> tuple[AnyPlant, LinearSensor, Channel, tuple[tuple[int, int, int], ...]]:
     """Enlarge the plant by all lines of past signals; return it with sensor, last link, and each relay's places."""
@@ -180,7 +180,7 @@ def with_relays(
         moved = at_each_step(partial(_append_relay_line, relay=i, size=stage.outputs, steps=later.past), moved)
     # The receiver sees the line of the last relay.
     last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
-    return moved, last, on_delay_line(channel.stages[-1]), tuple(lines)
+    return moved, last, place_on_delay_line(channel.stages[-1]), tuple(lines)
 
 
 def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
@@ -195,7 +195,7 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
 def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:
     """Build the filter behind relays from `base`, the filter of all lines."""
     # Only the moments under known probabilities make the filter optimal.
-    links = tuple(second_order(on_delay_line(stage)) for stage in channel.stages[:-1])
+    links = tuple(second_order(place_on_delay_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
     start = first(plant)
@@ -203,7 +203,7 @@ def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, line
         base=base,
         links=links,
         lines=lines,
-        **sized(base.claim, start, channel.outputs),
+        **make_sizes(base.claim, start, channel.outputs),
     )
 
 
@@ -342,7 +342,7 @@ def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
 def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> HeldFilter:
     if not isinstance(channel, Relayed):
         raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
-    larger, last, link, lines = with_relays(plant, sensor, channel)
+    larger, last, link, lines = enlarge_by_relays(plant, sensor, channel)
     return relayed_filter(plant, channel, make(larger, last, link), lines)
 
 
@@ -356,7 +356,7 @@ def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Chann
     return KnownDelayFilter(
         base=base,
         channels=stack([second_order(link) for link in links]),
-        **sized(base.claim, start, channel.outputs),
+        **make_sizes(base.claim, start, channel.outputs),
     )
 
 
@@ -367,7 +367,7 @@ def as_current(channel: Channel) -> Channel:
 
 
 def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    as_maps("channel", [channel])
+    check_maps("channel", [channel])
     if isinstance(channel, Relayed):
         return Series([_deliver_at_once(stage) for stage in channel.stages])
-    return Series([known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1))), on_delay_line(channel)])
+    return Series([known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1))), place_on_delay_line(channel)])

@@ -16,13 +16,13 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter
+from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal, gaussian_filter
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate
-from heliograph.model.centred import predicted_signal
+from heliograph.model.centred import predict_signal
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Estimate, Innovation, given_bounds
+from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -137,7 +137,7 @@ class FedBackFilter(AbstractSizedFilter):
 
     def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
         """Reference r subtracted from y at step k, from the estimate after step k - 1 and the input over step k."""
-        return predicted_signal(at(self.base.plant, k), at(self.base.sensor, k), known, u)
+        return predict_signal(at(self.base.plant, k), at(self.base.sensor, k), known, u)
 
     @in_float64
     def init(self) -> FedBackBelief:
@@ -157,7 +157,7 @@ class FedBackFilter(AbstractSizedFilter):
         y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, state.gaussian, start_of(base.plant, base))
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
-        after, innovation = corrected(sent, at(base.channel, k), base.rule, jnp.asarray(z))
+        after, innovation = correct_signal(sent, at(base.channel, k), base.rule, jnp.asarray(z))
         return FedBackBelief(*after, state.reference), innovation
 
     @estimates
@@ -198,5 +198,5 @@ def fed_back_filter(
     refuse_angles("filter that is fed back", plant, sensor)
     described = base.channel.values if isinstance(base.channel, OverTime) else base.channel
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None
-    claim = given_bounds("exact" if exact else "nominal", plant, sensor, channel)
+    claim = lower_to_upper("exact" if exact else "nominal", plant, sensor, channel)
     return FedBackFilter(base=base, claim=claim, states=base.states, inputs=base.inputs, received=base.received)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, eliminated, square_root
+from heliograph.factors.columns import Columns, eliminate, square_root
 from heliograph.factors.gaussian import given, observe
 from heliograph.numerics.linalg import diagonal, solve, symmetrize, times, transpose
 from heliograph.numerics.over_runs import runs_last
@@ -87,7 +87,7 @@ def correct(
 
     With S = L diag(d) L' the measurements that were made say as much as L' x + v, Cov v = diag(d)^-1.
     """
-    n, said = len(predicted), eliminated(information)
+    n, said = len(predicted), eliminate(information)
     rows = jnp.diag(square_root(said.weights)) @ said.matrix.T
     x = given(np.zeros(n), predicted)
     after, _ = observe(x, rows @ x.root, jnp.zeros(n), Columns(np.eye(n), jnp.ones(n)))

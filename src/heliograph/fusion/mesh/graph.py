@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from heliograph.numerics.check import array, fail, items, scalar, shown, table
+from heliograph.numerics.check import array, fail, items, scalar, show_value, table
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 
 
@@ -82,7 +82,7 @@ def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
         results[name] = mine = tuple(items(f"neighbours of {name!r}", senders, "names"))
         wrong = [sender for sender in mine if not isinstance(sender, str)]
         if wrong:
-            raise fail(f"neighbours of {name!r}", "names", shown(wrong[0]))
+            raise fail(f"neighbours of {name!r}", "names", show_value(wrong[0]))
         if name in mine:
             raise fail(f"neighbours of {name!r}", "other nodes (a node has its own message anyway)", repr(name))
         if len(set(mine)) < len(mine):

@@ -7,8 +7,8 @@ import numpy as np
 
 from heliograph.filters.rows import rows
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, fail, shown
-from heliograph.numerics.masked import unmasked
+from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
@@ -28,7 +28,7 @@ class Data(NamedTuple):
     truth: Float[np.ndarray, "recordings steps n"] | None = None
 
 
-def gathered(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> Data:
+def gather_data(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> Data:
     """Gather all recordings, checked against the network, as `Data`; with true states if they are needed.
 
     Raises:
@@ -76,7 +76,7 @@ def _truths(network: Network, several: Sequence[object], truth: Any, steps: list
         raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
     runs = [
         run
-        for states in (np.asarray(unmasked(part)) for part in listed)
+        for states in (np.asarray(fill_masked(part)) for part in listed)
         for run in (states if states.ndim == 3 else [states])
     ]
     if len(runs) != len(steps):
@@ -92,12 +92,12 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
     # measurements by node
     if not isinstance(held, Mapping):
         if len(network.names) > 1:
-            raise fail("recording", f"measurements by node, of {list(network.names)}", shown(recording))
+            raise fail("recording", f"measurements by node, of {list(network.names)}", show_value(recording))
         held = {network.names[0]: held}
     if set(held) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
     # each run: the nodes' columns side by side, and the inputs
-    runs = _runs([np.asarray(unmasked(held[name])) for name in network.names])
+    runs = _runs([np.asarray(fill_masked(held[name])) for name in network.names])
     results = []
     for run in runs:
         columns: list[np.ndarray] = []

@@ -154,14 +154,14 @@ def _is_sound(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, 
 
 def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
     """Mark lanes that have arrived, and those that are stuck because rounding hides what is left to gain."""
-    counting = moving & ~at_limits(state.x, state.gradient, domains)
+    counting = moving & ~find_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, gain_of(state.gradient, state.information, counting) / 2)
     stuck = state.radius < SMALLEST_RADIUS
     arrived = ~state.done & (2 * remaining < np.where(stuck, NEAR, close))
     return state._replace(remaining=remaining, done=state.done | stuck | arrived, converged=state.converged | arrived)
 
 
-def at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Bool[np.ndarray, "lanes p"]:
+def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Bool[np.ndarray, "lanes p"]:
     """Coordinates on whose way to the end of their domain the likelihood rises, but hardly.
 
     Where v = exp(x) is small l(0) - l(v) = -v l'(v) = -dl/dx to first order.
@@ -173,7 +173,7 @@ def at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Bool[np.
 
 def _step(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
     going = ~state.done
-    counting = moving & ~at_limits(state.x, state.gradient, domains)
+    counting = moving & ~find_at_limits(state.x, state.gradient, domains)
     step, length, foretold = trust_region_step(state.gradient, state.information, state.model, state.radius, counting,
                                                domains.free)  # fmt: skip
     tried = np.where(going[:, None], state.x + step, state.x)

@@ -30,7 +30,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.linalg import solve
 from heliograph.numerics.module import same
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.erasure import arrived
+from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.moments.second_moments import has_known_gain, has_random_gain, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -59,7 +59,7 @@ def _joint_channel(channel: Channel) -> Channel:
     """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
-    complete: Channel = at_each_step(arrived, channel)
+    complete: Channel = at_each_step(condition_on_arrival, channel)
     return complete
 
 
@@ -216,7 +216,7 @@ def sole_filter(network: Network) -> AbstractFilter:
     return items[0]
 
 
-def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
+def evaluate_at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
     """Likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
     count, copies = len(data.measurements), (len(x), 1, 1)

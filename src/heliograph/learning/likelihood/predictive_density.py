@@ -19,12 +19,12 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.erasure import arrived
+from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete, LogNormal, Nakagami, Rayleigh, Rician
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond
@@ -63,7 +63,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
     return Discrete(gains, weights)
 
 
-def with_nodes(channel: Map, count: int) -> Map:
+def discretise_laws(channel: Map, count: int) -> Map:
     """Channel with each gain's law as finitely many values."""
 
     def is_law(leaf: object) -> bool:
@@ -151,12 +151,12 @@ def predictive(
     instance("sensor", sensor, AbstractSensor, "one sensor, that does not vary over time")
     instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     check_forgets("channel of a predictive likelihood", channel)
-    received = arrived(channel)
+    received = condition_on_arrival(channel)
     filter = cubature_filter(plant, sensor, received)
     z = rows("measurements", measurements, None, filter.received, missing=True)
     u = rows("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False)
-    y, spread, near = expected_signals(filter, z, u)
-    return of_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), Parts.of(received, nodes))
+    y, spread, near = expect_signals(filter, z, u)
+    return score_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), Parts.of(received, nodes))
 
 
 class Part(NamedTuple):
@@ -178,7 +178,7 @@ class Parts(tuple[Part, ...]):
     def of(channel: AbstractRandomAffine, nodes: int) -> "Parts":
         """Combinations of each part of a stack, of everything else as a whole."""
         parts = channel.maps if isinstance(channel, Stack) else (channel,)
-        return Parts(_part(atoms_of(with_nodes(affine, nodes))) for affine in parts)
+        return Parts(_part(atoms_of(discretise_laws(affine, nodes))) for affine in parts)
 
 
 def _part(components: list[Component]) -> Part:
@@ -187,8 +187,8 @@ def _part(components: list[Component]) -> Part:
     return Part(np.log(weight), gain, offset, noise)
 
 
-@compiled
-def expected_signals(
+@compile_in_float64
+def expect_signals(
     filter: GaussianFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mean (steps, p) and covariance (steps, p, p) of the signal before each step, and z (angles near them)."""
@@ -206,7 +206,7 @@ def expected_signals(
     return signals[0], signals[1], signals[2]
 
 
-def of_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts) -> Predictive:
+def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts) -> Predictive:
     """Densities and pits of z (steps, m), from the moments (steps, p) and (steps, p, p) of the signals before each."""
     y, spread, z = expected
     blocks = [

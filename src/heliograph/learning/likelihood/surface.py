@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.learning.likelihood.data import Data
 from heliograph.learning.likelihood.maximise import FLAT, Domains, Evaluated, maximise
-from heliograph.learning.likelihood.objective import Evaluation, Objective, at_points
+from heliograph.learning.likelihood.objective import Evaluation, Objective, evaluate_at_points
 from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
 
@@ -47,7 +47,7 @@ class Surface:
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Evaluation at points."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
-            self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data))]
+            self._last[:] = [(np.array(x), evaluate_at_points(self.objective, np.asarray(x), self.data))]
         return self._last[0][1]
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:

@@ -10,7 +10,7 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, PyTree
 
 
-def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
+def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
     """Transform the start of a free number to unbounded ones.
 
     Intervals: v, log(v - low) or logit. Simplexes: log p_i / p_last. Covariances: the entries of Cholesky's factor row
@@ -34,7 +34,7 @@ def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float
     return np.asarray(link(domain, value)).reshape(-1)
 
 
-def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
+def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
     """Number at a point of the line, in operations that JAX traces; of an interval's plain number a plain one."""
     # Simplexes and covariances.
     if domain.kind == "simplex":

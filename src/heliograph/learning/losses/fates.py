@@ -12,7 +12,7 @@ Fates = list[Float[np.ndarray, " packets"]]
 
 
 class CheckedFates(Fates):
-    """Stretches as `as_fates` gives them, with CHOSEN for ends that are no trials: they are not checked again."""
+    """Stretches as `check_fates` gives them, with CHOSEN for ends that are no trials: they are not checked again."""
 
 
 JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
@@ -47,7 +47,7 @@ def is_trial(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
     return np.asarray((fate == 0) | (fate == 1))
 
 
-def as_history(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+def fill_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
     """Fates as far as they are known to those after them: ends have arrived."""
     return np.where(fate == CHOSEN, 0.0, fate)
 
@@ -209,7 +209,7 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
     return fates
 
 
-def as_fates(value: object) -> Fates:
+def check_fates(value: object) -> Fates:
     """Check and list stretches of fates, given one or several; CHOSEN stands for ends that are no trials.
 
     Raises:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.learning.losses.fates import CHOSEN, Fates, as_fates, as_history, ends_alone
+from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, ends_alone, fill_ends
 from heliograph.learning.losses.loss_law import AbstractLossLaw, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
 from heliograph.model.channel import erasure
@@ -43,9 +43,9 @@ class HiddenModeLosses(AbstractLossLaw):
         Raises:
             ValueError: what is no fates.
         """
-        parts = as_fates(fates)
+        parts = check_fates(fates)
         chosen = [ends_alone(fate) for fate in parts if fate[-1] == CHOSEN]
-        whole, ends = Runs.of([as_history(fate) for fate in parts]), Runs.of(chosen) if chosen else None
+        whole, ends = Runs.of([fill_ends(fate) for fate in parts]), Runs.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope = whole.likelihood(x)

@@ -4,7 +4,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from heliograph.learning.losses.fates import CHOSEN, Fates, as_fates, as_history, is_trial
+from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, fill_ends, is_trial
 from heliograph.learning.losses.shares import logits, maximum, shares_at
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
@@ -53,11 +53,11 @@ class AbstractLossLaw(Module):
         Raises:
             ValueError: what is no fates (see `heliograph.learning`).
         """
-        parts = as_fates(fates)
+        parts = check_fates(fates)
         return np.concatenate([self._log_likelihood(stretch) for stretch in parts])
 
     def _log_likelihood(self, fate: Packets) -> Packets:
-        p = self.predicted(as_history(fate))
+        p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):
             logs: Packets = np.where(is_trial(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
         if fate[-1] == CHOSEN and len(fate) > 2:
@@ -89,7 +89,7 @@ class IndependentLosses(AbstractLossLaw):
         Raises:
             ValueError: what is no fates.
         """
-        known = np.concatenate(as_fates(fates))
+        known = np.concatenate(check_fates(fates))
         return IndependentLosses(int(np.sum(known == 1)), int(np.sum(is_trial(known))))
 
     def shares(self) -> dict[str, Share]:
@@ -132,12 +132,12 @@ class MarkovLosses(AbstractLossLaw):
         if check_count("order", order) > 12:
             raise fail("order", "at most 12 packets back", order)
         counts = np.zeros((2**order, 2))
-        parts = as_fates(fates)
+        parts = check_fates(fates)
         for stretch in parts:
-            past, length = _past(as_history(stretch), order)
+            past, length = _past(fill_ends(stretch), order)
             # where a chain is counted given its end, the step to the end counts as well
             full = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
-            np.add.at(counts, (past[full], as_history(stretch)[full].astype(int)), 1.0)
+            np.add.at(counts, (past[full], fill_ends(stretch)[full].astype(int)), 1.0)
         spans = _spans(parts)
         return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 

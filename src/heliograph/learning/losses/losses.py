@@ -8,7 +8,7 @@ import scipy
 from scipy.special import expit, xlogy
 
 from heliograph.learning.intervals import mean_and_error
-from heliograph.learning.losses.fates import CheckedFates, Fates, as_fates, as_history, is_trial
+from heliograph.learning.losses.fates import CheckedFates, Fates, check_fates, fill_ends, is_trial
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
@@ -96,7 +96,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     Raises:
         ValueError: what is no fates, a share outside [0, 1).
     """
-    parts = as_fates(fates)
+    parts = check_fates(fates)
     share = float(scalar("held-out share", held_out, 0.0, 1.0))
     if share == 1.0:
         raise fail("held-out share", "less than 1: something must be fitted", share)
@@ -148,7 +148,7 @@ def loss_memory(fates: object) -> LossMemory:
     ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
     # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
     off, variance = 0.0, 0.0
-    for stretch in as_fates(fates):
+    for stretch in check_fates(fates):
         # of a stretch between arrivals the packets between them, which are exchangeable if losses are independent
         for lost in _unbroken(np.where(is_trial(stretch), stretch, np.nan)):
             n, ones = len(lost), float(lost.sum())
@@ -196,8 +196,8 @@ class RunningRateLosses(AbstractLossLaw):
         Raises:
             ValueError: what is no fates.
         """
-        parts = [stretch[~np.isnan(stretch)] for stretch in as_fates(fates)]
-        trials, parts = [is_trial(stretch) for stretch in parts], [as_history(stretch) for stretch in parts]
+        parts = [stretch[~np.isnan(stretch)] for stretch in check_fates(fates)]
+        trials, parts = [is_trial(stretch) for stretch in parts], [fill_ends(stretch) for stretch in parts]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             share = expit(x)

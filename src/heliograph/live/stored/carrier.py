@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.rows import BEFORE
-from heliograph.live.stored.layout import fits, moved, parts_of, placed, with_covariances
+from heliograph.live.stored.layout import describe_old_layout, fits, parts_of, place_flags, relocate_parts
 from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, plant_bytes, plant_from
 from heliograph.live.stored.snapshot import Identity
 from heliograph.numerics.check import fail
@@ -68,7 +68,7 @@ def _filter_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str
     def columns(state: PyTree) -> dict[str, np.ndarray]:
         """Number the next columns, by the path of each leaf."""
         shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in parts_of(state).items()}
-        shapes = with_covariances(shapes) if covariances else shapes
+        shapes = describe_old_layout(shapes) if covariances else shapes
         return {
             path: np.array([next(free) for _ in range(prod(shape))]).reshape(shape) for path, shape in shapes.items()
         }
@@ -121,7 +121,7 @@ class Carrier:
                 raise fail(what, expected, repr(self.mine.get(name)))
         try:
             self._old = json.loads(other[DESCRIPTION])["layout"]
-            self._old["filters"] = placed(self._old["filters"])
+            self._old["filters"] = place_flags(self._old["filters"])
             lines = changes(self.mine, other)
         except (KeyError, ValueError, TypeError):
             raise fail(what, "a description of the network that it is of", "none") from None
@@ -201,7 +201,7 @@ class Carrier:
             if self._goes_on(name, filters):
                 parts = {path: table[:, begin:end].reshape(len(table), *shape)
                          for path, (shape, begin, end) in old["filters"][name].items()}  # fmt: skip
-                for path, part in moved(parts, new).items():
+                for path, part in relocate_parts(parts, new).items():
                     _, begin, end = new[path]
                     translated[:, begin:end] = part.reshape(len(table), -1) if end > begin else 0.0
         # Inputs held and step number, then measurements by node, inputs and time.

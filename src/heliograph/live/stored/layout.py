@@ -35,7 +35,7 @@ def fits(old: Shapes, new: Shapes) -> bool:
     return shapes == {path: list(shape) for path, shape in new.items()}
 
 
-def moved(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
+def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
     """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
     results, new = dict(parts), list(new)
     for stem in _find_factored(parts, new):
@@ -43,7 +43,7 @@ def moved(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.n
     return {path: results[path] for path in new}
 
 
-def with_covariances(new: Shapes) -> dict[str, list[int]]:
+def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
     """Return the layout that a state of the layout `new` had until version 0.3.0, in its order."""
     results: dict[str, list[int]] = {}
     for path, shape in new.items():
@@ -55,7 +55,7 @@ def with_covariances(new: Shapes) -> dict[str, list[int]]:
     return results
 
 
-def placed(filters: Columns) -> dict[str, dict[str, list[Any]]]:
+def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     """Return the columns of a row's states with each flag in its place, for which versions before 0.3.0 noted 0 or 1.
 
     The parts of a filter stand in their order, and the same part of filters that share a program side by side: so flags

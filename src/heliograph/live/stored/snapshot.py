@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 import heliograph
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.trees.program_text import short_name
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
@@ -62,7 +62,7 @@ def check_same(
 HEAD = "head"
 
 
-def packed(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
+def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Serialise a head and arrays."""
     file = BytesIO()
     written = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
@@ -70,11 +70,11 @@ def packed(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> byte
     return file.getvalue()
 
 
-def unpacked(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read a head and arrays."""
     try:
         with np.load(BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         return json.loads(arrays.pop(HEAD).tobytes()), arrays
     except (BadZipFile, ValueError, KeyError, OSError, EOFError, TypeError):
-        raise fail("snapshot", "what save returned", shown(data)) from None
+        raise fail("snapshot", "what save returned", show_value(data)) from None

@@ -7,11 +7,11 @@ from scipy.optimize import nnls
 
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Float
-from heliograph.planning.budget import PowerLimits, as_budget, power_limits, unlimited
+from heliograph.planning.budget import PowerLimits, check_budget, make_unlimited, power_limits
 from heliograph.planning.descent import ACTIVE, Limits, Problem, Programme, Vector, search
 from heliograph.planning.numbers.problem import Build, NumberProblem, function_of_numbers
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.realised import repeated
+from heliograph.planning.realised import repeat_network
 
 
 class Conditions(NamedTuple):
@@ -61,15 +61,15 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         sensitivity=dict(zip(problem.names, (-conditions.worth.sum(axis=0)).tolist(), strict=True)),
         price=float(np.max(conditions.worth, initial=0.0) * limits.steps),
         numbers=problem.numbers.named(best),
-        realised=repeated(network) if task.criterion.period > 1 else network,
+        realised=repeat_network(network) if task.criterion.period > 1 else network,
     )
 
 
 def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
-        return unlimited(steps, hops)
-    limits = power_limits(as_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
+        return make_unlimited(steps, hops)
+    limits = power_limits(check_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
     if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
     return limits

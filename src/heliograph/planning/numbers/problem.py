@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled
+from heliograph.engine.choice import compile_on_call
 from heliograph.learning.description import Description, describe
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, array, fail, instance, items, table
@@ -83,7 +83,7 @@ class Numbers(NamedTuple):
         return np.where(between, within, np.clip(self.start * factor, self.low, self.high))
 
 
-def as_numbers(free: object) -> Numbers:
+def check_numbers(free: object) -> Numbers:
     """Free numbers from {name: (start, low, high)}; the start may be an array, the ends numbers or of its shape.
 
     Raises:
@@ -129,7 +129,7 @@ def function_of_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
     except TypeError as error:
         raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
     if free is not None:
-        return build, as_numbers(free)
+        return build, check_numbers(free)
     description = describe(build)
     marks = {}
     for mark in description.parameters.every:
@@ -208,7 +208,7 @@ class TracedNetwork:
 @lru_cache(PROGRAMS)
 def programs(network: TracedNetwork) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], Slopes]]:
     """Compiled programs of the system and of the derivatives."""
-    return compiled(network.system), compiled(network.slopes)
+    return compile_on_call(network.system), compile_on_call(network.slopes)
 
 
 class Point(NamedTuple):

@@ -123,7 +123,7 @@ def mode_system(network: Network, error: Error, young: Array | None = None) -> M
     states, b = jnp.stack([jnp.asarray(second) for second in seconds]), None
     if young is not None:
         b = jnp.broadcast_to(young, (steps,))
-    nodes = [received(name, source, states, forever, b) for name, source in sources_of(network).items()]
+    nodes = [describe_reception(name, source, states, forever, b) for name, source in sources_of(network).items()]
     count = prod(node.law.shape[1] for node in nodes)
     if count > MOST_MODES:
         raise fail("modes of a design", f"at most {MOST_MODES} together", count)
@@ -152,7 +152,7 @@ def _stack_nodes(nodes: list[Received]) -> tuple[Array, Array]:
     return jnp.stack(outputs, axis=1), jnp.stack(noises, axis=1)
 
 
-def received(
+def describe_reception(
     name: str, source: Source, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
 ) -> Received:
     """Describe a node's reception of states with E (x, 1)(x, 1)'; steps repeat `forever` or begin with the first.

@@ -57,7 +57,7 @@ def compose(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
     return RiccatiMap(second.a @ through, (g + g.T) / 2, (h + h.T) / 2)
 
 
-def fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
+def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     """Limit of X = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k of them.
 
     Raises:
@@ -84,7 +84,7 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
     # Predicted covariance of the first step: fixed point over the period, or from the start.
     if plants.start is None:
         steps = [RiccatiMap(a[k], information[k - 1], q[k]) for k in (*range(1, len(a)), 0)]
-        predicted = fixed_point(reduce(compose, steps))
+        predicted = solve_fixed_point(reduce(compose, steps))
     else:
         predicted = a[0] @ plants.start @ a[0].T + q[0]
     # The recursion through the steps.
@@ -175,11 +175,11 @@ def independent_paths(
     n, hops, steps = len(a), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1], error.steps
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
-    r = at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
-    fading = at_least(
+    r = check_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
+    fading = check_at_least(
         1.0, "kappa of paths", array("kappa of paths", _broadcast_to_hops(kappa, len(c), hops), (len(c), hops))
     )
-    costs = at_least(
+    costs = check_at_least(
         0.0, "alpha of paths", array("alpha of paths", _broadcast_to_hops(alpha, len(c), hops), (len(c), hops))
     )
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
@@ -204,7 +204,7 @@ def independent_paths(
     )
 
 
-def at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def check_at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Numbers, none below `least`; ValueError if some are."""
     if value.size and np.min(value) < least:
         raise fail(name, f"numbers of at least {least:g}", f"{np.min(value):g}")
@@ -235,7 +235,7 @@ def _along(paths: Paths, values: Powers) -> tuple[Float[np.ndarray, "time path p
     return along, position
 
 
-def passed(powers: Powers, alpha: Powers) -> Powers:
+def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
     """p / (p + alpha) of each hop; zero where neither power nor noise is."""
     total = powers + alpha
     # A hop without noise: any power does.
@@ -244,7 +244,7 @@ def passed(powers: Powers, alpha: Powers) -> Powers:
 
 def path_information(paths: Paths, powers: Powers) -> PathInformation:
     """Information j of each path at each step, and dj/dp of each hop, at these powers (time, hop)."""
-    along, position = _along(paths, passed(powers, paths.alpha))
+    along, position = _along(paths, share_of_signal(powers, paths.alpha))
     # F, and the product of the other hops' factors for its derivative.
     others = np.stack([np.delete(along, h, axis=-1).prod(axis=-1) for h in range(along.shape[-1])], axis=-1)
     product, full = along.prod(axis=-1), paths.second * fading(paths)

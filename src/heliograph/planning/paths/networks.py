@@ -12,7 +12,7 @@ from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.paths.model import Paths, Plants
-from heliograph.planning.transmitters import sent_powers, transmits
+from heliograph.planning.transmitters import compute_sent_powers, transmits
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Stack, maps_in_series
 from heliograph.simulation.network import Network
@@ -176,7 +176,7 @@ def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 
         refuse_angles("design", sensor)
         # Chains, and what their transmitters send at present.
         y, noise = np.asarray(measurement_moment(sensor, state)), np.asarray(sensor.noise.covariance)
-        chains, sends = chains_of(channel, np.eye(len(sensor.outputs), len(y))), sent_powers(channel, y, k)
+        chains, sends = chains_of(channel, np.eye(len(sensor.outputs), len(y))), compute_sent_powers(channel, y, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
         # Each chain is a path: what it carries of the sensor's outputs, then its hops.
         for chain in chains:

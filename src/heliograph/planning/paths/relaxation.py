@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.types import ArrayLike, Bool, Float
-from heliograph.planning.paths.model import Paths, PathValues, Powers, at_least, fading, passed
+from heliograph.planning.paths.model import Paths, PathValues, Powers, check_at_least, fading, share_of_signal
 
 NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
 BISECTIONS = 120
@@ -51,7 +51,7 @@ def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> S
     alpha = np.zeros((*full.shape, max(1, max(len(places) for places in hops))))
     for i, places in enumerate(hops):
         alpha[:, i, : len(places)] = paths.alpha[:, places]
-    factor = passed(fixed, paths.alpha)
+    factor = share_of_signal(fixed, paths.alpha)
     for h in np.flatnonzero(~free):
         i = paths.path[h]
         full[:, i] = np.where(factor[:, h] > 0, full[:, i] / np.maximum(factor[:, h], 1 / DEAD), DEAD)
@@ -85,7 +85,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
 
 def hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
     """Noises of a chain's hops, checked."""
-    noise = at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
+    noise = check_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
     if not len(noise):
         raise fail("alpha of hops", "at least one", "none")
     if np.max(noise) > LARGEST:
@@ -110,7 +110,7 @@ def split(whole: SplitPaths, total: PathValues) -> Split:
     reached = p.sum(axis=-1, keepdims=True)
     p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
     # j = (A / D) / (A - t A / D) and dj/dP = l D / (D - t)^2, in the ratio A / D, which vanishes with a power.
-    ratio = passed(p, alpha).prod(axis=-1)
+    ratio = share_of_signal(p, alpha).prod(axis=-1)
     below = whole.full - whole.signal * ratio
     sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
     slope = np.exp(log[..., 0]) * ratio * whole.full / below**2

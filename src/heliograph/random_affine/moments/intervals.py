@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 
-from heliograph.numerics.caching import cached
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import library, placed, stacked
+from heliograph.numerics.traced import library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import GainAndNoise, Series, Stack, stack_rows
@@ -26,7 +26,7 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
     intervals of the parts are multiplied: sound but not attained.
     """
     check_forgets("channel of a bound", channel)
-    corners = listed_corners(channel)
+    corners = count_corners(channel)
     # Every entry is multilinear in the uncertain probabilities, so corner laws attain its ends.
     if corners is not None and corners <= CORNERS:
         matrices = channel.corner_moments(order)
@@ -47,8 +47,8 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
     raise fail("uncertain channel", f"at most {CORNERS} corner laws", corners)
 
 
-@cached
-def listed_corners(channel: AbstractRandomAffine) -> int | None:
+@cache_by_object
+def count_corners(channel: AbstractRandomAffine) -> int | None:
     """Return the number of corner laws of a channel; None where they are too many to be counted."""
     try:
         return channel.corner_count()
@@ -78,8 +78,8 @@ def _atom_interval(channel: GainAndNoise, law: Discrete, order: int) -> Interval
 
 def _stack_interval(channel: Stack, order: int) -> Interval:
     """Products of the parts' interval polynomials, row by row."""
-    tables = [[stacked(moment_interval(m, k)) if k else None for k in range(order + 1)] for m in channel.maps]
-    rows = stacked(stack_rows(channel, order, tables, _multiply_rows))
+    tables = [[stack_parts(moment_interval(m, k)) if k else None for k in range(order + 1)] for m in channel.maps]
+    rows = stack_parts(stack_rows(channel, order, tables, _multiply_rows))
     return rows[:, 0], rows[:, 1]
 
 
@@ -91,4 +91,6 @@ def _multiply_rows(a: Entries, first: int, b: Entries, second: int, variables: i
     table = product_table(variables, first, second)
     size = (count(variables, first + second),)
     products = a.reshape(-1, 1, a.shape[-1], 1) * b.reshape(1, -1, 1, b.shape[-1])
-    return stacked([placed(size, table, products.min(axis=(0, 1))), placed(size, table, products.max(axis=(0, 1)))])
+    return stack_parts(
+        [scatter(size, table, products.min(axis=(0, 1))), scatter(size, table, products.max(axis=(0, 1)))]
+    )

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_forgets, check_maps
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count,
@@ -35,7 +35,7 @@ class Lift(AbstractWrapper):
 
     def __init__(self, base: AbstractRandomAffine, degree: int):
         check_count("degree of the lift", degree)
-        (base,) = as_maps("lift", [base])
+        (base,) = check_maps("lift", [base])
         if base.erases:
             raise fail("lift", "a channel without erasures", "one that erases")
         self.base, self.degree = base, degree

@@ -13,10 +13,10 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.numerics.caching import cached_arrays
+from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import placed
+from heliograph.numerics.traced import scatter
 from heliograph.numerics.types import Float
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
@@ -48,7 +48,7 @@ def count(variables: int, degree: int) -> int:
     return comb(variables + degree - 1, degree)
 
 
-@cached_arrays
+@cache_arrays
 def factors(variables: int, degree: int) -> np.ndarray:
     """Variables that each monomial of `exponents` multiplies, in order: (count, degree)."""
     choices = combinations_with_replacement(range(variables), degree)
@@ -90,7 +90,7 @@ def monomials(y: Numbers, degree: int) -> Numbers:
     return jnp.stack([jnp.asarray(t, dtype=float) for t in terms])
 
 
-@cached_arrays
+@cache_arrays
 def _raise_table(variables: int, degree: int) -> np.ndarray:
     """Entry (i, c): position at degree - 1 of monomial i divided by variable c; one past the end if it has no c."""
     lower = position(variables, degree - 1)
@@ -102,7 +102,7 @@ def _raise_table(variables: int, degree: int) -> np.ndarray:
     return table
 
 
-@cached_arrays
+@cache_arrays
 def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
     table = _raise_table(variables, degree)
@@ -137,7 +137,7 @@ def _append_zero_column(a: Numbers) -> Numbers:
     return jnp.pad(a, ((0, 0), (0, 1)))
 
 
-@cached_arrays
+@cache_arrays
 def product_table(variables: int, first: int, second: int) -> np.ndarray:
     """Entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
     a, b = factors(variables, first), factors(variables, second)
@@ -149,16 +149,16 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
 def multiply(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
     """Product of two homogeneous polynomials given by coefficients."""
     terms = a[:, None] * b
-    return placed((count(variables, first + second),), product_table(variables, first, second), terms)
+    return scatter((count(variables, first + second),), product_table(variables, first, second), terms)
 
 
-@cached_arrays
+@cache_arrays
 def degrees(dimension: int, order: int) -> np.ndarray:
     """Degree of each monomial in the variables other than 1."""
     return np.array([order - powers[-1] for powers in exponents(dimension + 1, order)])
 
 
-@cached_arrays
+@cache_arrays
 def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
     places, terms = position(dimension + 1, order), []
@@ -201,13 +201,13 @@ class Moments(Module):
         return self.matrix @ y_moments
 
 
-@cached_arrays
+@cache_arrays
 def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
     """Return positions of monomials of degree `low` in (z, 1) and (y, 1), times powers of 1, among degree `high`."""
     return np.ix_(*(times_one(size + 1, low, high) for size in (outputs, inputs)))
 
 
-@cached_arrays
+@cache_arrays
 def times_one(variables: int, low: int, high: int) -> np.ndarray:
     """Positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
     chosen = factors(variables, low)

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.caching import cached_arrays
+from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import is_traced, plain, stacked
+from heliograph.numerics.traced import is_traced, plain, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, gain_moments, homogeneous
@@ -64,7 +64,7 @@ def _(channel: Series, order: int, moments: Array1) -> Array1:
 @push.register
 def _(channel: Mixture, order: int, moments: Array1) -> Array1:
     parts = [push(affine, order, moments) for affine in channel.maps]
-    return channel.choice.probabilities @ stacked(parts)
+    return channel.choice.probabilities @ stack_parts(parts)
 
 
 def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
@@ -110,7 +110,7 @@ def _(noise: Tabulated, order: int) -> Array1:
     return noise.table[_lower(noise.dimension, order, noise.order)]
 
 
-@cached_arrays
+@cache_arrays
 def _lower(dimension: int, order: int, above: int) -> np.ndarray:
     """Return the positions of monomials of total degree `order` in (n, 1) among those of degree `above`."""
     places = position(dimension + 1, above)
@@ -133,7 +133,7 @@ def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -
     return moments
 
 
-@cached_arrays
+@cache_arrays
 def _one_place(variables: int, degree: int) -> np.ndarray:
     """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
     table = product_table(variables, degree, degree).reshape(-1)

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of
-from heliograph.numerics.caching import cached
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.linalg import contract, diagonal, diagonal_of, summed
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import is_traced, is_zero, library, stacked
+from heliograph.numerics.traced import is_traced, is_zero, library, stack_parts
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, fold
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, fold
 from heliograph.random_affine.combine import GainAndNoise, Series, Stack
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.moments.intervals import CORNERS, listed_corners, moment_interval
+from heliograph.random_affine.moments.intervals import CORNERS, count_corners, moment_interval
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments, product_table
 from heliograph.random_affine.superposed import Superposed
 
@@ -79,15 +79,15 @@ class SecondOrder(Module):
     uncertain: bool = eqx.field(static=True)
 
 
-def described_by(
+def describe_second_moments(
     mean: Matrix, spread: QuadraticMap, shift: QuadraticMap, power: QuadraticMap, nominal: QuadraticMap, uncertain: bool
 ) -> SecondOrder:
     """Second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise."""
-    gain, noise = divided(nominal.center)
+    gain, noise = divide_spread(nominal.center)
     return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
 
 
-def divided(spread: Tensor) -> tuple[Tensor, Columns]:
+def divide_spread(spread: Tensor) -> tuple[Tensor, Columns]:
     """Spread of the gain alone, and m columns of Cov n, from the spread of both; of none where they are correlated."""
     xp, covariance = library(spread), spread[..., -1, -1]
     apart = xp.all(spread[..., :-1, -1] == 0)
@@ -100,7 +100,7 @@ def divided(spread: Tensor) -> tuple[Tensor, Columns]:
 
 
 def undivided(gain: Tensor, noise: Columns) -> Tensor:
-    """Spread of gain and noise together, from what `divided` returns; both may have leading axes."""
+    """Spread of gain and noise together, from what `divide_spread` returns; both may have leading axes."""
     xp = library(gain, noise)
     covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
     corner = np.zeros(gain.shape[-2:])
@@ -140,7 +140,7 @@ def has_known_gain(channel: AbstractRandomAffine) -> bool:
     return holds
 
 
-@cached
+@cache_by_object
 def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """Return mean and second moments of z = G y + n, bounded over the polytope of uncertain probabilities.
 
@@ -154,9 +154,9 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
     """
-    as_maps("channel of a filter", [channel])
+    check_maps("channel of a filter", [channel])
     check_forgets("channel of a filter", channel)
-    return described_by(*_bounds(channel), uncertain=listed_corners(channel) != 1)
+    return describe_second_moments(*_bounds(channel), uncertain=count_corners(channel) != 1)
 
 
 class Bounds(NamedTuple):
@@ -170,7 +170,7 @@ class Bounds(NamedTuple):
 
 
 def _bounds(channel: AbstractRandomAffine) -> Bounds:
-    corners = listed_corners(channel)
+    corners = count_corners(channel)
     listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
     if isinstance(channel, Superposed) and (corners == 1 or not listed):
         return _bound_sum(channel, [_bounds(affine) for affine in channel.maps])
@@ -188,7 +188,7 @@ def _bounds(channel: AbstractRandomAffine) -> Bounds:
             Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
         )
         stacks = zip(*(_tensors(corner, mean) for corner in laws), strict=True)
-        parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
+        parts = [_dominate(stack_parts(tensors), mean) for tensors in stacks]
     else:
         parts = _bound_from_intervals(channel, nominal, mean)
     spread, shift, power = parts

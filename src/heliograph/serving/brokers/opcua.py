@@ -15,7 +15,7 @@ from asyncua.ua.uaerrors import UaError
 
 from heliograph.files.inspection import Topic, note
 from heliograph.model.trigger import SendOnDelta
-from heliograph.numerics.check import fail, items, shown, text
+from heliograph.numerics.check import fail, items, show_value, text
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import Batch, Retry, nothing
@@ -254,7 +254,7 @@ def _message(node: Node, value: object, data: DataChangeNotif) -> tuple[str, byt
     sample = data.monitored_item.Value
     good = sample.StatusCode is None or sample.StatusCode.is_good()
     content = {
-        "value": value if good and isinstance(value, bool | int | float) else None if not good else shown(value),
+        "value": value if good and isinstance(value, bool | int | float) else None if not good else show_value(value),
         "source_time": _iso(sample.SourceTimestamp),
         "server_time": _iso(sample.ServerTimestamp),
     }

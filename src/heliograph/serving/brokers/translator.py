@@ -5,10 +5,10 @@ from collections.abc import Collection
 from datetime import UTC, datetime, timedelta
 
 from heliograph.files.event_columns import YEAR
-from heliograph.files.fields import arrived, decoded
+from heliograph.files.fields import decode_json, parse_arrival
 from heliograph.files.message_files import log_line, of_log
 from heliograph.files.sources import Reading, Sources
-from heliograph.numerics.check import InputError, fail, shown
+from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.serving.message import LONGEST, Message
 from heliograph.simulation.network import Network
 
@@ -64,7 +64,7 @@ class Translator:
         that names neither a topic nor a node is of the only topic of the sources, such as a line of a file.
         """
         try:
-            content = decoded(payload[:LONGEST], "line")
+            content = decode_json(payload[:LONGEST], "line")
         except InputError:
             content = None
         logged = of_log(content)
@@ -78,7 +78,7 @@ class Translator:
             return [payload]
         topic, inner, came, stored = logged
         try:
-            arrival = None if came is None else moment(arrived(came, f"{topic}, arrival"))
+            arrival = None if came is None else moment(parse_arrival(came, f"{topic}, arrival"))
         except InputError as error:
             return [str(error)]
         return list(self._read(topic, inner.encode(), arrival, stored, again=False))
@@ -119,7 +119,9 @@ class Translator:
 
     def _message(self, topic: str, reading: Reading, known: datetime | None, again: bool) -> Message:
         if len(reading.plant) > NAME or "\0" in reading.plant:
-            raise fail(f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", shown(reading.plant))
+            raise fail(
+                f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", show_value(reading.plant)
+            )
         arrival = datetime.now(UTC) if known is None else known
         reading = self.sources.original(reading, None if known is None else (arrival - EPOCH) // MICROSECOND * 1000)
         time: datetime | float = arrival
@@ -176,4 +178,4 @@ def moment(nanoseconds: int) -> datetime:
 def _decode(payload: bytes, topic: str) -> object:
     if len(payload) > LONGEST:
         raise fail(topic, f"at most {LONGEST} bytes", len(payload))
-    return decoded(payload, topic)
+    return decode_json(payload, topic)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import LinearStep
-from heliograph.fusion.cross_covariance import Factors, initial_factors, joint_of, weighted_sources
+from heliograph.fusion.cross_covariance import Factors, initial_factors, joint_of, weigh_sources
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
-from heliograph.fusion.weights import factored_weights, matrix_weights
+from heliograph.fusion.weights import matrix_weights, solve_factored_weights
 from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
@@ -69,7 +69,7 @@ class CrossCovariances:
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """Best unbiased weights W and the covariance W P W' of their error; linear in nodes where P allows it."""
         weights = _weights(self.shared, self.independent)
-        shared, independent = weighted_sources(weights, self.shared, self.independent)
+        shared, independent = weigh_sources(weights, self.shared, self.independent)
         return weights, np.asarray(shared @ shared.T + independent)
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
@@ -96,7 +96,7 @@ class CrossCovariances:
         for names in relays.values():
             mine = [index[name] for name in names]
             shared, independent = self.shared[mine], self.independent[mine]
-            parts.append(weighted_sources(_weights(shared, independent), shared, independent))
+            parts.append(weigh_sources(_weights(shared, independent), shared, independent))
         shared, independent = (np.stack(leaves) for leaves in zip(*parts, strict=True))
         bias = np.zeros((len(relays), len(self.mean)))
         return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, independent)
@@ -106,7 +106,9 @@ def _weights(shared: np.ndarray, apart: np.ndarray) -> Float[np.ndarray, "n node
     scale = np.sqrt(np.einsum("iaa->ia", apart) + np.einsum("ias,ias->ia", shared, shared))
     scale = np.where(scale > 0, scale, 1.0)
     least = np.linalg.eigvalsh(apart / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-    return np.asarray(factored_weights(shared, apart) if least > REGULAR else matrix_weights(joint_of(shared, apart)))
+    return np.asarray(
+        solve_factored_weights(shared, apart) if least > REGULAR else matrix_weights(joint_of(shared, apart))
+    )
 
 
 def cross_covariances(

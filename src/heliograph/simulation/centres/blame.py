@@ -11,12 +11,12 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement, why_values
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.side_by_side import filter_step, over_all
+from heliograph.simulation.side_by_side import filter_step, map_all
 
 Candidate = TypeVar("Candidate")
 
 
-def blamed(
+def find_blamed(
     candidates: Sequence[Candidate], size: Callable[[Candidate], float], plausible_without: Callable[[Candidate], bool]
 ) -> Candidate:
     """Return the first, from the largest on, without which a row is plausible; the largest if there is none."""
@@ -26,7 +26,7 @@ def blamed(
     return next((one for one in ordered if plausible_without(one)), ordered[0])
 
 
-def refused_centrally(
+def refuse_centrally(
     filters: Mapping[str, AbstractFilter],
     before: Mapping[str, PyTree],
     z: Mapping[str, Float[np.ndarray, "steps m"]],
@@ -59,7 +59,7 @@ def refused_centrally(
     refused = dict[str, dict[int, str]]()
     for k, reason in why.items():
         if candidates := [removal for removal in removals if removal[0] == k]:
-            _, name = blamed(
+            _, name = find_blamed(
                 candidates, lambda removal: float(np.nanmax(np.abs(z[removal[1]][removal[0]]))), plausible.__getitem__
             )
             refused.setdefault(name, {})[k] = reason
@@ -89,4 +89,4 @@ def _judgement(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array
 
 @quickly_compiled
 def _all_by_xla(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree, count: int) -> PyTree:
-    return over_all(lambda *row: _judgement(filter, *row), count)(state, z, u, k)
+    return map_all(lambda *row: _judgement(filter, *row), count)(state, z, u, k)

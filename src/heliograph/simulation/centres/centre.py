@@ -13,7 +13,7 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import homogeneous
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import Linearised, LinearStep, is_linear_filter, linear_step
-from heliograph.fusion.all_reports import Knowledge, begin, fused_estimate, moved, receive_reports
+from heliograph.fusion.all_reports import Knowledge, begin, estimate_state, propagate_errors, receive_reports
 from heliograph.fusion.cross_covariance import (
     Errors,
     ErrorStep,
@@ -24,21 +24,21 @@ from heliograph.fusion.cross_covariance import (
     advance_factors,
     error_step,
     initial_errors,
-    moved_state,
+    propagate_state,
 )
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds, weakest
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper, weakest
 from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, structure, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles, without_output_names
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, PyTree
-from heliograph.random_affine.erasure import arrived
+from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 
@@ -152,7 +152,7 @@ class Centre(Module):
         """Motion of plant and errors at step k, and the measurement noise, for a plant with these moments."""
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
-        observation = self.observation_model.observe(*moved_state(mean, covariance, motion), k)
+        observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
         return motion, error_step(filters, motion, observation), observation.noise
 
     def factors(
@@ -215,20 +215,21 @@ def gathered(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrice
 def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:
     """Stack nodes of one structure."""
     return ObservationModel(
-        stack([without_output_names(sensor) for sensor in sensors]), stack([described(channel) for channel in channels])
+        stack([without_output_names(sensor) for sensor in sensors]),
+        stack([describe_channel(channel) for channel in channels]),
     )
 
 
-def described(channel: Channel) -> SecondOrder | OverTime:
+def describe_channel(channel: Channel) -> SecondOrder | OverTime:
     """Second moments of the channel where all of it arrives, for each step where it varies."""
-    moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(arrived(step)), channel)
+    moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(condition_on_arrival(step)), channel)
     return moments
 
 
 Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
 
 
-def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
+def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
     """Claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
 
     `shared`: whether the nodes receive parts of one channel.
@@ -246,7 +247,7 @@ def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Cl
         return "nominal"
     _check_linear(rule, plant, nodes)
     known: Claim = "nominal" if any(_uncertain(channel) for _, channel, _ in nodes.values()) else "exact"
-    return given_bounds(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
+    return lower_to_upper(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
 def along_estimates(nodes: Parts) -> bool:
@@ -276,7 +277,7 @@ def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
         seen.add(structure(filter))
 
 
-def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
+def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
     """Lower a claim where the nodes' reports travel over uplinks; `complete`: nodes that lose nothing.
 
     Raises:
@@ -296,7 +297,7 @@ def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[st
 def _uncertain(channel: Channel) -> bool:
     """Test whether probabilities of the channel's laws are known up to a radius only."""
     try:
-        return any(arrived(step).corner_count() > 1 for step in unstack(channel))
+        return any(condition_on_arrival(step).corner_count() > 1 for step in unstack(channel))
     except ValueError:  # too many corners to list
         return True
 
@@ -341,7 +342,7 @@ class CentreFilter(AbstractSizedFilter):
     widest: int = eqx.field(static=True)
     quantized: bool = eqx.field(static=True)
 
-    @compiled
+    @compile_in_float64
     def init(self) -> CentreBelief:
         """Return the state before any report."""
         states, _, _, known, *_ = self.filters.init()
@@ -355,7 +356,7 @@ class CentreFilter(AbstractSizedFilter):
         filters: LinearStep = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
         happened = centre.moved(state.errors, filters, u, step)
         following = self.filters.followed(state.nodes, u, step)
-        return CentreBelief(following, happened.errors, moved(state.known, happened, at(self.links, k)))
+        return CentreBelief(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
 
     @corrects
     def correct(self, state: CentreBelief, z: ArrayLike, k: Step = 0) -> tuple[CentreBelief, Innovation]:
@@ -369,4 +370,4 @@ class CentreFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: CentreBelief) -> Estimate:
         """Best linear estimate of the plant's state."""
-        return Estimate(*fused_estimate(state.known, len(self.states)), self.claim)
+        return Estimate(*estimate_state(state.known, len(self.states)), self.claim)

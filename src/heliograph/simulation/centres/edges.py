@@ -12,13 +12,13 @@ from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
-from heliograph.numerics.check import array, fail, instance, of_each
+from heliograph.numerics.check import array, fail, instance, spread_over_names
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, plain
 from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps
 from heliograph.random_affine.delay import Delayed, signal_size
-from heliograph.random_affine.erasure import Erasure, arrived
+from heliograph.random_affine.erasure import Erasure, condition_on_arrival
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.uplinks import SentReports
@@ -139,7 +139,9 @@ def edges_of(fusion: Fusion, graph: Graph) -> Edges:
 def edge_links(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
     """Return the link of each edge by its name "SENDER to RECEIVER", receiver after receiver."""
     names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
-    return dict(zip(names, of_each("links between neighbours", link, names, "edge SENDER to RECEIVER"), strict=True))
+    return dict(
+        zip(names, spread_over_names("links between neighbours", link, names, "edge SENDER to RECEIVER"), strict=True)
+    )
 
 
 def check_edge(what: str, link: Channel) -> None:
@@ -200,6 +202,6 @@ def _is_perfect(channel: AbstractRandomAffine) -> bool:
     """Test whether a channel delivers what is sent."""
     if channel.inputs != channel.outputs:
         return False
-    moments = second_order(arrived(channel))
+    moments = second_order(condition_on_arrival(channel))
     same = np.array_equal(moments.mean_gain, np.eye(channel.inputs)) and not np.any(moments.offset)
     return same and not np.any(moments.nominal.center)

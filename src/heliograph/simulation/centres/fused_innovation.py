@@ -104,7 +104,7 @@ def following_prior(estimate: Estimate) -> Gaussian:
     return given(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
 
 
-def fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
+def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
     """Tests of the network's fusions of estimates, by name, where there is one.
 
     There is none where a filter's state is more than a mean and a covariance of the plant's states, such as a mixture,

@@ -12,7 +12,7 @@ from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, first, stack, structure
-from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.centre import (
@@ -21,14 +21,14 @@ from heliograph.simulation.centres.centre import (
     CentreFilter,
     Together,
     along_estimates,
-    described,
+    describe_channel,
     observation_model,
 )
 from heliograph.simulation.centres.linearised import LinearisedCentre
 from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.side_by_side import initial_state, over_all
+from heliograph.simulation.side_by_side import initial_state, map_all
 
 
 class Fused(Module):
@@ -51,7 +51,7 @@ class Fused(Module):
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape
-        return over_all(over_all(lambda quantizer: at(quantizer, 0).init(n), nodes), fusions)(self.quantizers)
+        return map_all(map_all(lambda quantizer: at(quantizer, 0).init(n), nodes), fusions)(self.quantizers)
 
     def step(
         self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
@@ -64,16 +64,16 @@ class Fused(Module):
         # Quantized means, and covariances widened by the quantizers' errors.
         if self.quantizers is not None:
             fusions, nodes = self.order.shape
-            send = over_all(over_all(lambda q, s, mean: at(q, k).step(s, mean), nodes), fusions)
+            send = map_all(map_all(lambda q, s, mean: at(q, k).step(s, mean), nodes), fusions)
             states, sent = send(self.quantizers, states, means)
             means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
             for i, name in enumerate(self.names):
                 uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
         # Angles near those of the first node, then the rules in parallel.
         means = nearest(means, means[:, :1], self.angles)
-        combine = over_all(lambda rule, *parts: rule.combine(*parts), len(self.names))
+        combine = map_all(lambda rule, *parts: rule.combine(*parts), len(self.names))
         mean, covariance = combine(self.rules, means, covariances)
-        mean = wrapped(mean, self.angles)
+        mean = wrap_angles(mean, self.angles)
         items = enumerate(zip(self.names, self.claims, strict=True))
         return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
 
@@ -192,7 +192,7 @@ def _observe(
     if network.common is not None:
         rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
-        return Together(network.common.sensor, described(network.common.channel), np.array(padded))
+        return Together(network.common.sensor, describe_channel(network.common.channel), np.array(padded))
     parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
     items = tuple(observation_model([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
     return Apart(items, order, size)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import Linearised, linearised_step
+from heliograph.filters.linear.plan import Linearised, linearise_step
 from heliograph.fusion.all_reports import AllReports, Knowledge
 from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, advance, initial_errors
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
@@ -44,7 +44,7 @@ class LinearisedCentre(Module):
     size: int = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
 
-    read = staticmethod(linearised_step)
+    read = staticmethod(linearise_step)
 
     def init(self, starts: Sequence[jax.Array]) -> dict[str, Followed]:
         """Return the state before the first step, from the initial means of each source's filters."""

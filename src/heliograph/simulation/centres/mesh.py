@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.cross_covariance import Motion, Observation, moved_state
+from heliograph.fusion.cross_covariance import Motion, Observation, propagate_state
 from heliograph.fusion.intersection import inverse
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of
 from heliograph.fusion.mesh.graph import graph_of
@@ -24,7 +24,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
 from heliograph.simulation.centres.centre import Apart, ObservationModel, observation_model
 from heliograph.simulation.centres.edges import Edges, edges_of
-from heliograph.simulation.centres.messages import Messages, OnTheWay, messages_of, moved_beyond, one_step_on
+from heliograph.simulation.centres.messages import Messages, OnTheWay, messages_of, one_step_on, test_moved_beyond
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -185,7 +185,7 @@ class Mesh(Module):
         if state.sent is None or self.alpha is None:
             return now
         information = jax.vmap(inverse)(state.covariance)[self.senders]
-        moved = moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
+        moved = test_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 
     def parts(
@@ -199,7 +199,7 @@ class Mesh(Module):
         plant: LinearPlant = at(self.plant, jnp.asarray(k))
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
-        after = moved_state(jnp.asarray(moments[0]), jnp.asarray(moments[1]), motion)
+        after = propagate_state(jnp.asarray(moments[0]), jnp.asarray(moments[1]), motion)
         exchanges = []
         for number in range(self.edges.rounds - 1):
             exchanges.append(self._map_nodes(_weights, covariance, None, arrived[:, number]))

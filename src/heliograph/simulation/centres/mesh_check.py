@@ -16,10 +16,10 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
-from heliograph.numerics.check import fail, instance, of_each
-from heliograph.random_affine.erasure import arrived
+from heliograph.numerics.check import fail, instance, spread_over_names
+from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.simulation.centres.centre import informed_claim
+from heliograph.simulation.centres.centre import claim_of_informed
 from heliograph.simulation.centres.edges import arrival_chance, edge_links, edges_of, loss_rate
 from heliograph.simulation.node import HasNodes, Node
 
@@ -69,7 +69,7 @@ def error_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     parts = {node: (n.sensor, n.channel, n.filters[fusion.filter])
              for node in network.mesh_nodes(name)
              if isinstance(n := network.nodes[node], Node)}  # fmt: skip
-    return informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
+    return claim_of_informed(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
 
 
 def mesh_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
@@ -121,7 +121,7 @@ def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) 
         raise fail(what, expected, "events" if fusion.rounds == 1 else f"{fusion.rounds} rounds")
     if fusion.quantizer is not None:
         fusion.check(graph.nodes, len(network.states))
-        for lossy in of_each("quantizers", fusion.quantizer, graph.nodes):
+        for lossy in spread_over_names("quantizers", fusion.quantizer, graph.nodes):
             instance("quantizer between neighbours", lossy, UniformQuantizer, "one with a bound on its error whatever "
                      "was sent and lost before (UniformQuantizer)")  # fmt: skip
 
@@ -227,7 +227,7 @@ def _scale_rows(h: np.ndarray) -> np.ndarray:
 
 def _model(node: Node) -> tuple[np.ndarray, np.ndarray]:
     """Matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
-    sensor, channel = first(node.sensor), second_order(arrived(first(node.channel)))
+    sensor, channel = first(node.sensor), second_order(condition_on_arrival(first(node.channel)))
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
     gain = np.asarray(channel.mean_gain)
     noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
@@ -262,7 +262,7 @@ def _is_steady(node: Node) -> bool:
     """Test whether a node's measurement is the same at every step, and no signal adds to its noise."""
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False
-    return not np.any(np.asarray(second_order(arrived(node.channel)).nominal.center)[:, :, :-1, :-1])
+    return not np.any(np.asarray(second_order(condition_on_arrival(node.channel)).nominal.center)[:, :, :-1, :-1])
 
 
 def check_decay(

@@ -141,7 +141,7 @@ def errors_over_time(
         blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if follows else None
         with jax.enable_x64(True):
             parts = to_numpy(_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
-        joint = moved(mesh, joint, parts, arrived)
+        joint = propagate(mesh, joint, parts, arrived)
         covariance, moments = parts.gains.covariance, parts.plant
         error = np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy()
         yield joint, error, error if follows else covariance
@@ -156,7 +156,7 @@ def _parts(
     return mesh.parts(covariance, blocks, moments, there, arrived, u, k)
 
 
-def moved(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> np.ndarray:
+def propagate(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> np.ndarray:
     """Joint covariance (N, N) after a step."""
     gains, present, senders = parts.gains, mesh.edges.present, mesh.senders
     # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).

@@ -42,7 +42,7 @@ class Messages(NamedTuple):
     fresh: Bool[jax.Array, "node rounds degree"]
 
 
-def moved_beyond(
+def test_moved_beyond(
     alpha: Array, off: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
     senders: np.ndarray, present: np.ndarray,
 ) -> Bool[jax.Array, " node"]:  # fmt: skip
@@ -56,7 +56,7 @@ def moved_beyond(
     return jnp.zeros(len(off), dtype=int).at[senders[:, 1:]].add(moving.astype(int)) > 0
 
 
-def quantized(
+def quantize_estimate(
     quantizer: AbstractQuantizer, mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Return what a node sends of an estimate: quantized, and wider; NaN where it is beyond the amplitude."""
@@ -76,7 +76,7 @@ def messages_of(
     """
     sent = mean, covariance
     if quantizer is not None:
-        sent = eqx.filter_vmap(quantized, in_axes=(eqx.if_array(0), 0, 0))(quantizer, *sent)
+        sent = eqx.filter_vmap(quantize_estimate, in_axes=(eqx.if_array(0), 0, 0))(quantizer, *sent)
     means, covariances = (
         jnp.concatenate([alone, now, late.reshape(-1, *alone.shape[1:])])
         for alone, now, late in zip((mean, covariance), sent, way, strict=True)

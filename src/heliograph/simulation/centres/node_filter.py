@@ -19,18 +19,18 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.premise import believing
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
 from heliograph.simulation.centres.centre import Apart, observation_model
 from heliograph.simulation.centres.edges import Edges
 from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
-from heliograph.simulation.centres.messages import OnTheWay, quantized
+from heliograph.simulation.centres.messages import OnTheWay, quantize_estimate
 from heliograph.simulation.claims import premise_at
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 
-_quantized = compiled(quantized)  # each message of a service: one program, not twenty
+_quantized = compile_in_float64(quantize_estimate)  # each message of a service: one program, not twenty
 
 
 class NodeState(NamedTuple):

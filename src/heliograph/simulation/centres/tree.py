@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.cross_covariance import initial_factors, joint_of, weighted_sources
+from heliograph.fusion.cross_covariance import initial_factors, joint_of, weigh_sources
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import matrix_weights
@@ -21,7 +21,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of
-from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, described
+from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, describe_channel
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.side_by_side import StackedFilters
@@ -144,7 +144,7 @@ def _propagate_leaves(
     # All leaves of the block from their numbers.
     nodes = eqx.filter_vmap(node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
-    channels = eqx.filter_vmap(lambda values: described(node(values).channel))(numbers)
+    channels = eqx.filter_vmap(lambda values: describe_channel(node(values).channel))(numbers)
     alike = StackedFilters(nodes.filters[name], 0, 1, count)
     size = nodes.filters[name].received
     observe = Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size)
@@ -182,7 +182,7 @@ def _relay(children: Level) -> tuple[jax.Array, Level]:
 def _fuse(children: Level) -> tuple[jax.Array, Level]:
     shared, independent = jnp.asarray(children.shared), jnp.asarray(children.independent)
     weights = matrix_weights(joint_of(shared, independent))
-    return weights, Level(*weighted_sources(weights, shared, independent))
+    return weights, Level(*weigh_sources(weights, shared, independent))
 
 
 def _spread(level: Level) -> Array:

@@ -18,7 +18,7 @@ from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import SecondOrder
-from heliograph.simulation.centres.centre import described
+from heliograph.simulation.centres.centre import describe_channel
 from heliograph.simulation.draws import CHANNEL, draw_key
 from heliograph.simulation.shared_fading import ChannelGroup, channel_groups
 
@@ -193,7 +193,7 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     return Uplinks(
         groups=channel_groups(named) if random else (),
         quantizers=stack(quantizers) if quantizers else None,
-        links=_model_links([described(channel) for channel in channels], received, error),
+        links=_model_links([describe_channel(channel) for channel in channels], received, error),
         delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in mine]),
         every=np.array([link.every for link in mine], float),  # numbers of a program: other intervals share it
         received=received,

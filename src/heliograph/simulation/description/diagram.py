@@ -12,7 +12,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
-from heliograph.numerics.traced import in_single, is_traced
+from heliograph.numerics.traced import describe_rounded, is_traced
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, fold, memories
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, DelayLine
@@ -21,7 +21,7 @@ from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.claims import beliefs
-from heliograph.simulation.description.single import rounded_parts
+from heliograph.simulation.description.single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
 from heliograph.simulation.shared_fading import memory_places
 
@@ -46,16 +46,18 @@ def diagram(network: HasNodes) -> list[Part]:
     alike: dict[str, list[str]] = {}
     for name in network.names:
         alike.setdefault(_node(network, name, claims[name]), []).append(name)
-    parts += [Part(listed(names), words) for words, names in alike.items()]
+    parts += [Part(join_names(names), words) for words, names in alike.items()]
     # Fused estimates, then what several nodes share.
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
             words = f"{type(fusion).__name__} of all measurements"
         else:
-            words = f"{type(fusion.rule).__name__} of {fusion.filter!r} of {listed(network.nodes_with(fusion.filter))}"
+            words = (
+                f"{type(fusion.rule).__name__} of {fusion.filter!r} of {join_names(network.nodes_with(fusion.filter))}"
+            )
         parts.append(Part(f"fused {name}", f"{words} ({claims[FUSED][name]})"))
-    parts += [Part("shared", words) for words in shared(network)]
-    parts += [Part("digits", words) for words in rounded_in_words(network)]
+    parts += [Part("shared", words) for words in list_shared(network)]
+    parts += [Part("digits", words) for words in list_rounded(network)]
     return [Part(visible(line.name), visible(line.words)) for line in parts]
 
 
@@ -81,10 +83,10 @@ def _node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
 
 def _senders(relays: RelayNetwork | None, name: str) -> str:
     slots = () if relays is None else relays.slots
-    return listed(list(dict.fromkeys(sender for slot in slots for sender in slot.get(name, {}))))
+    return join_names(list(dict.fromkeys(sender for slot in slots for sender in slot.get(name, {}))))
 
 
-def shared(network: HasNodes) -> list[str]:
+def list_shared(network: HasNodes) -> list[str]:
     """Return what several nodes share, in words: a common channel, or the memory of their links."""
     if network.common is not None:
         return [f"sensor and channel of all nodes: {link_in_words(network.common.channel)}"]
@@ -97,18 +99,18 @@ def shared(network: HasNodes) -> list[str]:
         for row, memory in zip(places[name].tolist(), memories(channel).values(), strict=True):
             nodes.setdefault(row, []).append(name)
             names[row] = type(memory).__name__ if memory.name is None else repr(memory.name)
-    return [f"fading {names[row]}: {listed(of)}" for row, of in nodes.items() if len(of) > 1]
+    return [f"fading {names[row]}: {join_names(of)}" for row, of in nodes.items() if len(of) > 1]
 
 
-def rounded_in_words(network: HasNodes) -> list[str]:
+def list_rounded(network: HasNodes) -> list[str]:
     """Return which numbers came in rounded to single precision, with the parts that hold them."""
     return [
-        f"rounded to single precision before they came in: {in_single(rounded)} ({listed(names)})"
-        for rounded, names in rounded_parts(network).items()
+        f"rounded to single precision before they came in: {describe_rounded(rounded)} ({join_names(names)})"
+        for rounded, names in find_rounded_parts(network).items()
     ]
 
 
-def listed(names: Sequence[str]) -> str:
+def join_names(names: Sequence[str]) -> str:
     """Return names on a line; of many, the first few and their number."""
     if len(names) <= 2 * NAMED:
         return ", ".join(names)

@@ -22,7 +22,7 @@ from heliograph.random_affine.modes import forgetful
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
-from heliograph.simulation.description.diagram import listed, rounded_in_words, shared
+from heliograph.simulation.description.diagram import join_names, list_rounded, list_shared
 from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import wide_at_the_start
 from heliograph.simulation.network import Network
@@ -50,11 +50,11 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines = [*_unobservable(network), *_doubt_boundedness(network), *_unheard(network)]
     lines += [*_forgotten(network), *_other_worlds(network)]
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]
-    lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in rounded_in_words(network)]
-    lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
+    lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
+    lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     parts = separate_nodes(network)
     if len(parts) > 1:
-        words = f"independent: nothing couples what {listed([repr(names[0]) for names in parts])} measure"
+        words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
         lines.append(
             Doubt(False, f"{words}; a plant of each, a fleet, is estimated as well, starts sooner, costs less")
         )
@@ -154,7 +154,7 @@ def _unheard(network: Network) -> Iterator[Doubt]:
             continue
         silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
         if silent:
-            yield Doubt(False, f"unheard: {listed(silent)} at {name!r}: of mean gain 0, which only adds noise")
+            yield Doubt(False, f"unheard: {join_names(silent)} at {name!r}: of mean gain 0, which only adds noise")
 
 
 def _other_worlds(network: Network) -> Iterator[Doubt]:
@@ -166,14 +166,14 @@ def _other_worlds(network: Network) -> Iterator[Doubt]:
             continue  # said already, with what to do
         alike.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
     for (lowered, _, _), of in alike.items():
-        more = f" (and at {listed([repr(belief.node) for belief in of[1:]])})" if len(of) > 1 else ""
+        more = f" (and at {join_names([repr(belief.node) for belief in of[1:]])})" if len(of) > 1 else ""
         yield Doubt(lowered, f"another world: {of[0].words}{more}{', so that its claim is nominal' * lowered}")
 
 
 def _forgotten(network: Network) -> Iterator[Doubt]:
     """Yield filters that take draws as independent over time behind a link whose gains are not."""
     for label, names in _forgetful(network).items():
-        words = f"ignored memory: {label!r} of {listed(names)} takes a link for one without memory"
+        words = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
         yield Doubt(
             True, f"{words}, another channel than its own; linear_filter or mixture_filter of the link knows it"
         )

@@ -9,19 +9,19 @@ import numpy as np
 from heliograph.model.over_time import first
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import InputError
-from heliograph.numerics.traced import constants, is_traced, rounded_to_single
+from heliograph.numerics.traced import constants, find_rounded_to_single, is_traced
 from heliograph.simulation.node import HasNodes, Node
 
 Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]
 
 
-def rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
+def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
     """Return rounded numbers, as they were meant and as they are, with the parts of the network that hold them."""
     parts: dict[tuple[float, float], list[str]] = {}
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _models(network):
         if id(model) not in seen:
-            seen[id(model)] = next(filter(None, map(rounded_to_single, _arrays(model, functions))), None)
+            seen[id(model)] = next(filter(None, map(find_rounded_to_single, _arrays(model, functions))), None)
         rounded = seen[id(model)]
         if rounded is not None:
             parts.setdefault(rounded, []).append(name)

@@ -63,7 +63,7 @@ def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[st
     }
 
 
-def weighed_of(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
+def collect_weighed(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
     """Innovations by component of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
     parts = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
@@ -74,7 +74,7 @@ def weighed_of(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]
     return weighed | ({FUSED: central} if central else {})
 
 
-def by_name(
+def split_by_name(
     network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:
     """Results of `read` by node and filter: each kind's part split at its axes (filter, node), the first at `axis`.

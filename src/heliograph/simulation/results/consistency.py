@@ -8,9 +8,9 @@ import numpy as np
 import scipy
 
 from heliograph.model.plant import AnyPlant, angles_among
-from heliograph.numerics.angle import angles_at, wrapped
+from heliograph.numerics.angle import angles_at, wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -76,7 +76,9 @@ def nees(
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
-    return _square_normalised(wrapped(x - m, angles_among(angles, x.shape[-1])), _broadcast_to_steps(covariance, x), x)
+    return _square_normalised(
+        wrap_angles(x - m, angles_among(angles, x.shape[-1])), _broadcast_to_steps(covariance, x), x
+    )
 
 
 def nis(
@@ -101,7 +103,7 @@ def nis(
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
     return _square_normalised(
-        wrapped(e, angles_at(angles, e.shape[-1])), _broadcast_to_steps(covariance, e), np.zeros_like(e)
+        wrap_angles(e, angles_at(angles, e.shape[-1])), _broadcast_to_steps(covariance, e), np.zeros_like(e)
     )
 
 
@@ -131,7 +133,7 @@ def _square_normalised(
     return np.asarray(np.where(there.any(axis=-1), value, np.nan))
 
 
-@compiled
+@compile_in_float64
 def _distance(a: Array, x: Array, size: Array) -> Array:
     return squared_distance(jnp.asarray(a), jnp.asarray(x), size)
 

@@ -139,7 +139,7 @@ MEANING = {
 }
 
 
-def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
+def check_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
     """Check units by the state's name, and of `time`; empty ones are left out.
 
     Raises:
@@ -153,7 +153,7 @@ def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, 
     return {name: unit for name, unit in by_name.items() if unit}
 
 
-def placed(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) -> tuple[list[str], list[Placed[T]]]:
+def place_filters(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) -> tuple[list[str], list[Placed[T]]]:
     """Return the names of all filters, and each filter's value with its place (node, filter) in an array."""
     filters = list(dict.fromkeys(name for by_filter in by_node.values() for name in by_filter))
     places: list[Placed[T]] = [((nodes.index(node), filters.index(name)), value)
@@ -161,7 +161,7 @@ def placed(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) -> tupl
     return filters, places
 
 
-def filled(lead: Shape, places: Shape, tail: Shape, parts: Sequence[Placed[np.ndarray]]) -> np.ndarray:
+def fill_places(lead: Shape, places: Shape, tail: Shape, parts: Sequence[Placed[np.ndarray]]) -> np.ndarray:
     """Fill an array (*lead, *places, *tail) with parts (*lead, *up to tail) at their places; NaN elsewhere."""
     arrays = np.full((*lead, *places, *tail), np.nan)
     ahead: tuple[slice, ...] = (slice(None),) * len(lead)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.disk.quoting import in_figure
+from heliograph.disk.quoting import quote_for_figure
 from heliograph.numerics.check import fail
 
 # Okabe and Ito's palette, which people with colour blindness can tell apart; then grey.
@@ -50,7 +50,7 @@ def panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, str])
         _, grid = plt.subplots(
             count, 1, squeeze=False, sharex=True, layout="constrained", figsize=(6.4, 1 + 1.8 * count)
         )
-        grid[-1, 0].set_xlabel("time" if time.dtype.kind == "M" else with_unit("time", units))
+        grid[-1, 0].set_xlabel("time" if time.dtype.kind == "M" else label_with_unit("time", units))
         return list(grid[:, 0])
     given = list(np.ravel(np.asarray(axes, dtype=object)))
     if len(given) != count:
@@ -68,6 +68,6 @@ def colour_of(number: int) -> str:
     return COLOURS[number % len(COLOURS)]
 
 
-def with_unit(name: str, units: Mapping[str, str]) -> str:
+def label_with_unit(name: str, units: Mapping[str, str]) -> str:
     """Label of a state or of time, with its unit if it has one."""
-    return in_figure(f"{name} ({units[name]})" if name in units else name)
+    return quote_for_figure(f"{name} ({units[name]})" if name in units else name)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.quoting import in_figure
+from heliograph.disk.quoting import quote_for_figure
 from heliograph.filters.innovation import InnovationSummary, Weighed, summarise_innovations
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
@@ -24,9 +24,9 @@ from heliograph.simulation.results.labelled import (
     claims_of,
     claims_text,
     dataset_of,
-    filled,
+    fill_places,
     names_of,
-    placed,
+    place_filters,
     record_fields,
     record_frame,
     units_of,
@@ -37,10 +37,10 @@ from heliograph.simulation.results.labelled import (
 from heliograph.simulation.results.plots import (
     chosen_filters,
     colour_of,
+    label_with_unit,
     legend_outside,
     panels,
     state_places,
-    with_unit,
 )
 from heliograph.simulation.results.saved import Saved
 
@@ -201,24 +201,24 @@ class Record(Saved):
             ModuleNotFoundError: without xarray (extra "results").
         """
         nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
-        filters, results = placed(nodes, self.estimates)
+        filters, results = place_filters(nodes, self.estimates)
         lead, axes = (*([] if self.runs is None else [self.runs]), len(self.time)), [] if self.runs is None else ["run"]
         n, sizes = len(self.states), (len(nodes), len(filters))
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         most = max((z.shape[-1] for _, z in received), default=0)
         # Variables, NaN where a node has no such filter or component.
         variables = {
-            "measurement": ([*axes, TIME, "node", "received"], filled(lead, (len(nodes),), (most,), received)),
+            "measurement": ([*axes, TIME, "node", "received"], fill_places(lead, (len(nodes),), (most,), received)),
             "length": (["node"], _list_by_node(nodes, {node: z.shape[-1] for node, z in self.measurements.items()})),
             "estimated": (["node"], np.array([node in self.estimates for node in nodes], dtype=bool)),
             "claim": (["node", "filter"], claims_of(sizes, results)),
             "mean": (
                 [*axes, TIME, "node", "filter", "state"],
-                filled(lead, sizes, (n,), [(position, np.asarray(e.mean)) for position, e in results]),
+                fill_places(lead, sizes, (n,), [(position, np.asarray(e.mean)) for position, e in results]),
             ),
             "covariance": (
                 [*axes, TIME, "node", "filter", "state", "other"],
-                filled(lead, sizes, (n, n), [(position, np.asarray(e.covariance)) for position, e in results]),
+                fill_places(lead, sizes, (n, n), [(position, np.asarray(e.covariance)) for position, e in results]),
             ),
             **uplink_variables(self.uplinks, [*axes, TIME], n),
         }
@@ -319,13 +319,13 @@ class Record(Saved):
                 estimate, colour = self.estimates[node][name], colour_of(number)
                 mean = np.asarray(estimate.mean)[which][..., i]
                 variance = np.asarray(estimate.covariance)[which][..., i, i]
-                panel.plot(self.time, mean, color=colour, label=in_figure(name))
+                panel.plot(self.time, mean, color=colour, label=quote_for_figure(name))
                 if estimate.claim != "none":
                     band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
                     panel.fill_between(self.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
             if self.truth is not None:
                 panel.plot(self.time, self.truth[which][..., i], color="0.25", linestyle=":", label="truth")
-            panel.set_ylabel(with_unit(self.states[i], self.units))
+            panel.set_ylabel(label_with_unit(self.states[i], self.units))
         legend_outside(drawn[0])
         return drawn
 

@@ -15,12 +15,12 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import (
-    by_name,
+    collect_weighed,
     measurements_of,
     reports_by_name,
+    split_by_name,
     transmissions_of,
     uplinks_by_name,
-    weighed_of,
 )
 from heliograph.simulation.results.record import Record
 
@@ -80,7 +80,7 @@ class AbstractReducer(Module, Generic[Result]):
         raise fail("keep", "Statistics() or Trajectories(), to keep smoothed estimates", type(self).__name__)
 
 
-def of_rows(reducer: AbstractReducer[Result], rows: PyTree) -> OfStep:
+def reduce_rows(reducer: AbstractReducer[Result], rows: PyTree) -> OfStep:
     """Reduce a run from its steps (time, ...): stacked over time, but for flags that hold if true at any step."""
     _, items = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), rows)
     return items._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), items.ever))
@@ -121,8 +121,8 @@ class Trajectories(AbstractReducer[Record]):
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
     """Record from the scan's output; nodes in the network's order."""
     measurements = measurements_of(network, batch["measurements"])
-    mean = by_name(network, batch, lambda e: np.asarray(e.mean), -3)
-    covariance = by_name(network, batch, lambda e: np.asarray(e.covariance), -4)
+    mean = split_by_name(network, batch, lambda e: np.asarray(e.mean), -3)
+    covariance = split_by_name(network, batch, lambda e: np.asarray(e.covariance), -4)
     estimates = {
         node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
         for node, claims in network.claims().items()
@@ -130,5 +130,6 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
     uplinks, reports = uplinks_by_name(network, batch["uplinks"]), reports_by_name(network, batch["reports"])
     return Record(
         time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports,
-        transmissions=transmissions_of(network, batch.get("transmissions", {})), weighed=weighed_of(network, batch),
+        transmissions=transmissions_of(network, batch.get("transmissions", {})),
+        weighed=collect_weighed(network, batch),
     )  # fmt: skip

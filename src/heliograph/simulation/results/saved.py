@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from heliograph.disk.quoting import from_file, in_file
+from heliograph.disk.quoting import quote_for_file, unquote_file
 from heliograph.disk.whole_file import check_output, check_replaceable, whole_file, whole_folder
 from heliograph.numerics.check import fail, file_path
-from heliograph.simulation.results.labelled import checked_units
+from heliograph.simulation.results.labelled import check_units
 
 if TYPE_CHECKING:  # an extra
     import xarray as xr
@@ -36,7 +36,7 @@ class Saved:
         """
         smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
         changed = copy(self)
-        vars(changed).update(units=checked_units(units, self.states), smoothed=smoothed)
+        vars(changed).update(units=check_units(units, self.states), smoothed=smoothed)
         return changed
 
     def to_xarray(self) -> "xr.Dataset":
@@ -81,7 +81,7 @@ class Saved:
             ValueError: no such file, or another one.
             ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
         """
-        return cls.from_xarray(opened(path))
+        return cls.from_xarray(open_dataset(path))
 
 
 def save(dataset: "xr.Dataset", path: str | Path) -> None:
@@ -95,7 +95,9 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
     kind = _kind(path)
     import_module(kind)
     # Names as text that any file can hold; floats without a fill value.
-    plain = dataset.assign_coords({name: (c.dims, _map_names(in_file, c), c.attrs) for name, c in _texts(dataset)})
+    plain = dataset.assign_coords(
+        {name: (c.dims, _map_names(quote_for_file, c), c.attrs) for name, c in _texts(dataset)}
+    )
     encoding: Any = {name: {"_FillValue": None} for name in plain.variables if plain[name].dtype.kind == "f"}
     if dataset["time"].dtype.kind == "M":
         encoding["time"] = {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
@@ -111,7 +113,7 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
         plain.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
 
 
-def opened(path: str | Path) -> "xr.Dataset":
+def open_dataset(path: str | Path) -> "xr.Dataset":
     """Read a dataset into memory.
 
     Raises:
@@ -130,7 +132,7 @@ def opened(path: str | Path) -> "xr.Dataset":
             dataset = stored.load()
     except (OSError, ValueError, KeyError) as error:
         raise fail(str(path), "a file of results that can be read", f"{type(error).__name__}: {error}") from None
-    return dataset.assign_coords({name: (c.dims, _map_names(from_file, c), c.attrs) for name, c in _texts(dataset)})
+    return dataset.assign_coords({name: (c.dims, _map_names(unquote_file, c), c.attrs) for name, c in _texts(dataset)})
 
 
 def _kind(path: Path) -> str:
@@ -148,7 +150,7 @@ def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
 
 def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
     changed = [change(str(name)) for name in names.values]
-    if change is in_file:
+    if change is quote_for_file:
         return np.array(changed, dtype="U")
     texts = np.empty(len(changed), dtype=object)
     texts[:] = changed

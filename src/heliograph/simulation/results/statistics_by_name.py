@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from heliograph.disk.quoting import in_figure
+from heliograph.disk.quoting import quote_for_figure
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
@@ -18,9 +18,9 @@ from heliograph.simulation.results.labelled import (
     claims_of,
     claims_text,
     dataset_of,
-    filled,
+    fill_places,
     names_of,
-    placed,
+    place_filters,
     units_of,
     uplink_variables,
     uplinks_from,
@@ -30,10 +30,10 @@ from heliograph.simulation.results.plots import (
     FAR,
     chosen_filters,
     colour_of,
+    label_with_unit,
     legend_outside,
     panels,
     state_places,
-    with_unit,
 )
 from heliograph.simulation.results.saved import Saved
 from heliograph.simulation.results.statistics import ErrorStatistics, matrices
@@ -76,7 +76,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             ModuleNotFoundError: without xarray (extra "results").
         """
         nodes = list(self)
-        filters, every = placed(nodes, self)
+        filters, every = place_filters(nodes, self)
         if not every:
             raise fail("statistics", "those of one filter at least", "none")
         sizes, n, first = (len(nodes), len(filters)), len(self.states), every[0][1]
@@ -86,7 +86,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             lead: tuple[int, ...], tail: tuple[int, ...], value: Callable[[ErrorStatistics], ArrayLike]
         ) -> np.ndarray:
             """Return a value of each filter's statistics, at its place."""
-            return filled(lead, sizes, tail, [(position, np.asarray(value(score))) for position, score in every])
+            return fill_places(lead, sizes, tail, [(position, np.asarray(value(score))) for position, score in every])
 
         def variances(matrices: np.ndarray) -> np.ndarray:
             return np.diagonal(matrices, axis1=-2, axis2=-1)
@@ -197,9 +197,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
                 # Solid: actual; dashed: claimed.
                 score, colour = self[node][name], colour_of(number)
                 claimed = score.claimed()[:, i, i]
-                panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=in_figure(name))
+                panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=quote_for_figure(name))
                 panel.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
-            panel.set_ylabel(f"RMSE of {with_unit(self.states[i], self.units)}")
+            panel.set_ylabel(f"RMSE of {label_with_unit(self.states[i], self.units)}")
             # A log axis where one is far larger than another.
             ends = [float(np.sqrt(self[node][name].actual()[-1, i, i])) for name in filters]
             if min(ends) > 0 and np.isfinite(max(ends)) and max(ends) > FAR * min(ends):

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.numerics.check import fail, instance, shown
+from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.uplinks import Uplink
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.results.by_name import by_name, uplinks_by_name
+from heliograph.simulation.results.by_name import split_by_name, uplinks_by_name
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.reducer import AbstractReducer, OfStep, of_rows
+from heliograph.simulation.results.reducer import AbstractReducer, OfStep, reduce_rows
 from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
 from heliograph.simulation.results.statistics_by_name import StatisticsByName
 from heliograph.simulation.runs.over_runs import over_runs
@@ -120,7 +120,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         kinds = len(every)
         named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
         axes = enumerate((-3, -2, -3, -2, -2))
-        items = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
+        items = [split_by_name(network, named, itemgetter(i), axis) for i, axis in axes]
         # Statistics with their claims, then those of the quantizers.
         statistics = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
@@ -205,7 +205,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     # The filter's estimates.
     known = [(element, of) for element, filters in record.estimates.items() for of in filters]
     if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
-        raise fail("node and filter", f"one of {known}", shown((node, name)))
+        raise fail("node and filter", f"one of {known}", show_value((node, name)))
     estimate = record.estimates[node][name]
     # The sums of a simulation, in which this is the only estimate; runs are dealt to batches.
     arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
@@ -222,7 +222,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
 def _reduce_run(truth: Array, mean: Array, covariance: Array) -> OfStep:
     """Reduce one run of a record."""
     steps = {"truth": truth, "estimates": (), "fused": {"": Estimate(mean, covariance, "none")}, "uplinks": {}}
-    return of_rows(Statistics(), steps)
+    return reduce_rows(Statistics(), steps)
 
 
 def _sum_batches(values: np.ndarray) -> np.ndarray:

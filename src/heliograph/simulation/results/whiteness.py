@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.engine.choice import computed
+from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import HALF
 from heliograph.filters.rows import data_of, over_rows
@@ -91,8 +91,8 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
     # Correlations and their standard errors by lag: the same in any unit, so in one whose squares are numbers.
     unit = 2.0 ** (int(np.frexp(np.nanmax(np.abs(white)))[1]) - 1)
     white = white / unit
-    size, size_error = correlated_mean(_average_components(white**2))
-    parts = [correlated_mean(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
+    size, size_error = average_correlated(_average_components(white**2))
+    parts = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
     # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
     p_value = (
@@ -143,7 +143,7 @@ def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray
     return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
 
 
-def correlated_mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """Mean of the values that are not NaN, and its standard error by Bartlett's weights, of values correlated in time.
 
     The weights reach over the cube root of the length.
@@ -165,7 +165,7 @@ def innovations_of(
 
     NaN where it did not arrive, counted less than half, or the components before it determine it.
     """
-    likelihoods, white = computed(_innovations, _by_xla, (filter, z, u))
+    likelihoods, white = compute_once(_innovations, _by_xla, (filter, z, u))
     return likelihoods, white
 
 

@@ -10,7 +10,7 @@ from heliograph.model.estimate import Claim
 from heliograph.numerics.trees.flat import Flat
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.results.by_name import by_name
+from heliograph.simulation.results.by_name import split_by_name
 
 
 class JudgementAt(NamedTuple):
@@ -57,8 +57,8 @@ class FilterColumns(NamedTuple):
 def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
     """Locate each filter's estimate, by reading a row that holds its own column numbers as a row of estimates."""
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
-    mean = by_name(network, numbered, lambda estimate: np.asarray(estimate.mean), -3)
-    covariance = by_name(network, numbered, lambda estimate: np.asarray(estimate.covariance), -4)
+    mean = split_by_name(network, numbered, lambda estimate: np.asarray(estimate.mean), -3)
+    covariance = split_by_name(network, numbered, lambda estimate: np.asarray(estimate.covariance), -4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
     tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
@@ -85,7 +85,7 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
     """Return the columns of each part of a judgement, by node and filter."""
     judged = {"estimates": outcome["judged"], "fused": {}}
-    parts = [by_name(network, judged, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
+    parts = [split_by_name(network, judged, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
     by_node = {
         node: {name: JudgementAt(*(int(field[node][name]) for field in parts)) for name in filters}
         for node, filters in parts[0].items()

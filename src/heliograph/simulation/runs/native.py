@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import attempted, threads
+from heliograph.engine.choice import threads, try_native
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.medium import medium_of
@@ -24,7 +24,7 @@ from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Resul
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import BLOCK, LANES, Progress, batch_counts, in_chunks
 from heliograph.simulation.runs.memory import Needed, check_memory
-from heliograph.simulation.smoothed import Part, Recorded, Smoother, finished, reduced_run
+from heliograph.simulation.smoothed import Part, Recorded, Smoother, finish, reduce_run
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
@@ -186,7 +186,7 @@ def _collect_smoothed(
         return _step_world(world, state, key, row)
 
     _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
-    return reduced_run(reducer, later, outputs)
+    return reduce_run(reducer, later, outputs)
 
 
 def natively(
@@ -208,16 +208,16 @@ def natively(
     # Smoothing, few nodes, or nodes that share something: one program.
     whole = smoothing is not None or len(network.names) <= NODES or not _is_apart(network)
     if whole or type(reducer).joined is AbstractReducer.joined:
-        code = attempted(lambda: _code(network, inputs, key, reducer, runs, smoothing))
+        code = try_native(lambda: _code(network, inputs, key, reducer, runs, smoothing))
         return (
             None
             if code is None
-            else finished(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
+            else finish(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
         )
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
     for number, some in enumerate(parts):
-        code = attempted(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts)))  # noqa: B023
+        code = try_native(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts)))  # noqa: B023
         if code is None:
             return None
 
@@ -225,7 +225,7 @@ def natively(
             if progress is not None:
                 progress((number * total + done) // len(parts), total)  # noqa: B023
 
-        results.append(finished(reducer, _run_chunks(code, first_run, runs, chunk, shown), some, None))
+        results.append(finish(reducer, _run_chunks(code, first_run, runs, chunk, shown), some, None))
     return reducer.joined(results, network)
 
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from heliograph.engine.choice import chosen, threads
-from heliograph.numerics.check import check_count, fail, shown
+from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import fully_optimised, to_numpy
 from heliograph.numerics.types import PyTree
 
@@ -31,7 +31,7 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
         ValueError: no arrays, or arrays with different numbers of runs.
     """
     if not callable(function):
-        raise fail("function over runs", "a function of one run's arrays", shown(function))
+        raise fail("function over runs", "a function of one run's arrays", show_value(function))
     check_count("width", width)
     # Arrays of numbers with one leading axis.
     values = [_numbers(a) for a in arrays]
@@ -74,9 +74,9 @@ def _numbers(value: PyTree) -> np.ndarray:
     try:
         values = np.asarray(value)
     except ValueError:  # rows of different lengths
-        raise fail("arrays over runs", "arrays of numbers", shown(value)) from None
+        raise fail("arrays over runs", "arrays of numbers", show_value(value)) from None
     if values.dtype.kind not in "biufc":
-        raise fail("arrays over runs", "arrays of numbers", shown(value))
+        raise fail("arrays over runs", "arrays of numbers", show_value(value))
     return values
 
 
