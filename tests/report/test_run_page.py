@@ -283,6 +283,11 @@ def test_several_rates_are_no_doubt():
     z["b"][np.arange(600) % 4 != 0] = np.nan
     health = examine(network, hg.run(network, z), np.zeros((600, 0)))
     assert health.warnings() == [] and health.links[1].period == 4.0
+    most = z | {"b": np.where(np.arange(600)[:, None] % 4 == 0, np.nan, z["a"])}  # three of each four rows
+    regular = examine(network, hg.run(network, most), np.zeros((600, 0)))
+    assert not any(line.startswith("b: ") for line in regular.warnings())
+    (link,) = run_summary(regular)["links"]["b"].values()
+    assert link == {"arrived": 1.0, "longest_gap": 0, "due": "3 of 4 rows"}
     periodic = hg.Network(plant, {"b": hg.Node(sensor, hg.perfect(), nodes["b"].filters, trigger=hg.Periodic(4))})
     z["b"][np.arange(600) % 40 == 0] = np.nan
     link = examine(periodic, hg.run(periodic, {"b": z["b"]}), np.zeros((600, 0))).links[0]

@@ -118,7 +118,7 @@ def learn(
 
 
 def _fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
-    """Return the fates of each node's messages; of one that is slower than the rows, of those that were due.
+    """Return the fates of each node's messages; of one that is not due in each row, of those that were due.
 
     None of a node that nobody knows to be due: where rows are messages, of one without a rate of its own.
     """
@@ -132,7 +132,7 @@ def _fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
         name = arrivals.node if arrivals.node in fates else f"{arrivals.node}.{component}"
         if arrivals.due is None:
             fates.pop(name, None)
-        elif arrivals.period is not None and name in fates and arrivals.arrived.any():
+        elif arrivals.due_in != "each row" and name in fates and arrivals.arrived.any():
             fates[name] = fates_of_sequence(arrivals.numbers)
     return fates
 

@@ -9,6 +9,7 @@ from scipy.special import ndtri
 
 from heliograph.filters.innovation import independent_count
 from heliograph.numerics.types import Bool, Float, Int
+from heliograph.report.pattern import Pattern, find_pattern
 
 FEW = 8  # arrivals from which a rate of its own can be told
 NEAR = 0.25  # of a period: how far an interval may be from whole periods
@@ -63,29 +64,65 @@ class Arrivals:
         apart = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
         return period if np.mean(apart <= NEAR) >= REGULAR else None
 
-    @property
-    def due(self) -> int | None:
-        """Number of messages that were due: one a row, or one a period from the first arrival to the last row.
+    @cached_property
+    def slots(self) -> Bool[np.ndarray, " slots"] | None:
+        """Whether a message came in each slot that it may have: the rows, or one a period from the first arrival.
 
         None where rows are messages of other nodes and this one has no period: then nobody knows.
         """
         if self.period is None:
-            return None if self.of_messages and not self.arrived.all() else len(self.arrived)
+            return None if self.of_messages and not self.arrived.all() else self.arrived
         clock = _clock(self.time)
         came = clock[self.arrived]
         if not len(came):
-            return max(int((clock[-1] - clock[0]) / self.period), 1)
-        # Those up to the last arrival, and those that were due after it.
-        return 1 + int(self.numbers[-1]) + self._due_since(clock, came)
+            return np.zeros(max(int((clock[-1] - clock[0]) / self.period), 1), dtype=bool)
+        # Whole periods from each to the next; then those that are late by more than is usual.
+        apart = np.maximum(np.round(np.diff(came) / self.period), 1).astype(np.int64)
+        since = max(int((clock[-1] - came[-1]) / self.period - NEAR), 0)
+        slots = np.zeros(1 + int(apart.sum()) + since, dtype=bool)
+        slots[np.concatenate([[0], np.cumsum(apart)])] = True
+        return slots
+
+    @cached_property
+    def pattern(self) -> Pattern | None:
+        """The slots in which it is due, where these return as a pattern, such as 3 of each 4; None if it is in each.
+
+        A sender that says when it is due has none.
+        """
+        return None if self.slots is None or self.declared_period is not None else find_pattern(self.slots)
+
+    @property
+    def due_slots(self) -> Bool[np.ndarray, " due"] | None:
+        """Whether a message came in each slot in which one was due; None where nobody knows."""
+        return self.slots if self.slots is None or self.pattern is None else self.slots[self.pattern.rows]
+
+    @property
+    def due_in(self) -> str:
+        """The rows or times in which it is due, in words."""
+        if self.slots is None:
+            return "not known"
+        some = "" if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
+        if self.period is None:
+            return f"{some} rows" if some else "each row"
+        return f"{some}, each {self.period:.4g}" if some else f"each {self.period:.4g}"
+
+    @property
+    def lost_rows(self) -> Bool[np.ndarray, " time"]:
+        """Mask of the rows in which it was due and did not come; none of a sender that is slower than the rows."""
+        if self.slots is None or self.period is not None:
+            return np.zeros(len(self.arrived), dtype=bool)
+        return ~self.arrived if self.pattern is None else ~self.arrived & self.pattern.rows
+
+    @property
+    def due(self) -> int | None:
+        """Number of messages that were due; None where nobody knows."""
+        return None if self.due_slots is None else len(self.due_slots)
 
     @property
     def numbers(self) -> Int[np.ndarray, " arrivals"]:
-        """Running number of each message that arrived, from 0: the rows or the whole periods since the first."""
-        if self.period is None:
-            rows = np.flatnonzero(self.arrived)
-            return rows - rows[:1]
-        periods = np.maximum(np.round(np.diff(_clock(self.time)[self.arrived]) / self.period), 1)
-        return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
+        """Running number of each message that arrived, from 0, among those that were due; of rows if nobody knows."""
+        there = np.flatnonzero(self.arrived if self.due_slots is None else self.due_slots)
+        return there - there[:1]
 
     @property
     def share(self) -> float:
@@ -98,29 +135,20 @@ class Arrivals:
         Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a).
         """
         p = self.stated_share
-        if p is None or self.due is None or not 0 < p < 1:
+        if p is None or self.due_slots is None or not 0 < p < 1:
             return False
-        independent = self.due if self.period is not None else independent_count(self.arrived.astype(float))
+        came = self.due_slots.astype(float)
+        independent = len(came) if self.period is not None else independent_count(came)
         deviation = np.sqrt(p * (1 - p) / independent)
         return bool(abs(self.share - p) > max(-ndtri(level / 2) * deviation, LEAST_SHARE))
 
     @property
     def longest_gap(self) -> int | None:
         """Greatest number of messages in a row that were due and did not arrive; None where nobody knows."""
-        if self.due is None:
+        if self.due_slots is None:
             return None
-        if self.period is None:
-            ends = np.flatnonzero(np.concatenate([[True], self.arrived, [True]]))
-            return int(np.max(np.diff(ends)) - 1)
-        clock = _clock(self.time)
-        came = clock[self.arrived]
-        intervals = np.round(np.diff(came) / self.period) - 1
-        return max(int(np.max(intervals, initial=0)), self._due_since(clock, came) if len(came) else self.due)
-
-    def _due_since(self, clock: np.ndarray, came: np.ndarray) -> int:
-        """Return the number of messages that were due since the last arrival, and are late by more than is usual."""
-        assert self.period is not None  # only then is it asked
-        return max(int((clock[-1] - came[-1]) / self.period - NEAR), 0)
+        ends = np.flatnonzero(np.concatenate([[True], self.due_slots, [True]]))
+        return int(np.max(np.diff(ends)) - 1)
 
 
 def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:

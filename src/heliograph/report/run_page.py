@@ -126,8 +126,7 @@ def _links(health: Health) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
     axes = figure.subplots()
     for row, link in enumerate(links):
-        # A sender that is slower than the rows loses nothing in those between.
-        lost = link.time[~link.arrived] if link.period is None and link.due is not None else link.time[:0]
+        lost = link.time[link.lost_rows]
         came = link.time[link.arrived]
         axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
         axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
@@ -291,14 +290,14 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
         mean, deviation = _moments(link.values)
         known = "may be lost" if link.may_be_lost else "never lost"
         name = visible(f"{link.node}: {link.component}")
-        regular = "each row" if link.period is None else f"each {link.period:.4g}"
-        sent, gap = ("not known", "–") if link.due is None else (regular, str(link.longest_gap))
-        rows.append([name, sent, _share(link, "{:.1%}", "–"), gap, known, mean, deviation])
+        gap = "–" if link.due is None else str(link.longest_gap)
+        rows.append([name, link.due_in, _share(link, "{:.1%}", "–"), gap, known, mean, deviation])
     headers = ["received", "due", "arrived", "longest gap", "the network says", "mean", "std. deviation"]
     unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
     slower = (
         f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "
-        "found. Where each row is a message of some node, nobody knows when another without such an interval is due. A "
+        "found. One that is due in some of so many rows or intervals is so by a pattern that losses would not leave. "
+        "Where each row is a message of some node, nobody knows when another without such an interval is due. A "
         "**gap** counts what was due and did not come."
     )
     came, lost = any(link.arrived.any() for link in health.links), not all(link.arrived.all() for link in health.links)
@@ -308,7 +307,7 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
     missing = not_drawn(left, "Their numbers are in the table.")
     return [
-        Table(headers, rows, slower if any(link.period is not None for link in health.links) else ""),
+        Table(headers, rows, slower if any(link.due_in != "each row" for link in health.links) else ""),
         *picture,
         *missing,
         *shared_text(health.shared),
@@ -366,8 +365,10 @@ def run_summary(health: Health) -> dict[str, Json]:
     for link in health.links:
         share = None if link.due is None else link.share
         numbers: dict[str, Json] = {"arrived": share, "longest_gap": link.longest_gap}
-        period: dict[str, Json] = {} if link.period is None else {"period": link.period}
-        links.setdefault(link.node, {})[link.component] = numbers | period
+        regular: dict[str, Json] = {} if link.period is None else {"period": link.period}
+        if link.pattern is not None:
+            regular |= {"due": link.due_in}
+        links.setdefault(link.node, {})[link.component] = numbers | regular
     return {
         "rows": len(health.record.time),
         "warnings": health.warnings(),
