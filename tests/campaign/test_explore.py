@@ -12,7 +12,7 @@ from heliograph import cli
 from heliograph.campaign import explore, open_results
 from heliograph.campaign.explore import Detail, details
 from heliograph.campaign.run import run_campaign
-from heliograph.campaign.store import STORE, load_campaign
+from heliograph.campaign.store import STORE, restore_campaign
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from tests.campaign.example import CAMPAIGN, NETWORK, write
 
@@ -22,7 +22,7 @@ HOSTILE = "</script><img src=x onerror=alert(1)> $$x$$"
 
 @pytest.fixture(scope="module")
 def campaign(finished):
-    return load_campaign(finished / "results.zarr")
+    return restore_campaign(finished / "results.zarr")
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from heliograph.campaign.store import (
     STORE,
     Labels,
     done_chunks,
-    load_campaign,
     parameter_values,
     read_labels,
+    restore_campaign,
 )
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from heliograph.numerics.check import fail, file_path
@@ -133,7 +133,7 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
     for name in (STORE, SUMMARY):
         if not (folder / name).exists():
             raise fail(f"results folder {folder}", f"{STORE} and {SUMMARY}, as `heliograph sweep` writes", f"no {name}")
-    campaign, scores = load_campaign(folder / STORE), read_summary(folder / SUMMARY)
+    campaign, scores = restore_campaign(folder / STORE), read_summary(folder / SUMMARY)
     if not scores:
         raise fail(f"results folder {folder}", "at least one score", "none yet")
     text = explore_page(campaign, scores, partial(details, folder / STORE, campaign))

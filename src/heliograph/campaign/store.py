@@ -275,7 +275,7 @@ def read_labels(path: Path) -> Labels:
     return labels_from(stored)
 
 
-def load_campaign(path: Path) -> Campaign:
+def restore_campaign(path: Path) -> Campaign:
     """Return the campaign that the store was created with; its file is assumed to be next to the store."""
     attributes: Any = _attributes(path)
     stored = read_campaign(attributes["campaign"], attributes["network_source"], path.parent / "campaign.toml")
