@@ -35,8 +35,24 @@ def test_a_gate_that_refuses_all_is_doubted():
     gate = hg.robust_filter(PLANT, SENSOR, hg.perfect(), hg.filters.Gate(9.0))
     network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {"gate": gate})})
     z = 1000 + np.random.default_rng(1).standard_normal((STEPS, 1))
-    (line,) = health_of(network, {"a": z}).warnings()
-    assert line.startswith(f"a/gate left out {STEPS} of {STEPS} values of y")
+    with pytest.warns(UserWarning, match="a/gate left out") as said:
+        health = health_of(network, {"a": z})
+    (line,) = health.warnings()
+    assert line.startswith(f"a/gate left out {STEPS} of {STEPS} values of y") and [str(w.message) for w in said] == [
+        line
+    ]
+
+
+def test_a_gate_in_the_centre_that_refuses_one_node_is_doubted_of_that_output():
+    joint = hg.model.joint_sensor({"a": SENSOR, "b": SENSOR})
+    gate = hg.robust_filter(PLANT, joint, hg.perfect(2), hg.filters.Gate(16.0))
+    network = hg.Network(PLANT, {name: hg.Node(SENSOR, hg.perfect(), {}) for name in "ab"}, {"gate": gate})
+    z = np.random.default_rng(1).standard_normal((2, STEPS, 1))
+    with pytest.warns(UserWarning) as said:
+        record = hg.run(network, {"a": z[0], "b": z[1] + 100})
+    (line,) = [str(w.message) for w in said]
+    assert line.startswith(f"fused/gate left out {STEPS} of {STEPS} values of b: y")
+    assert np.max(np.abs(record.estimates["fused"]["gate"].mean)) < 10
 
 
 def test_each_output_is_judged_by_itself():

@@ -148,6 +148,7 @@ class Weighed(NamedTuple):
 
 HALF = 0.5  # weight below which a component counts as down-weighted
 NORMAL = 1.96  # quantile of a 95 % interval
+MOST = 0.5  # share of values left out that outliers do not have
 
 
 @readable
@@ -185,6 +186,15 @@ class InnovationSummary(NamedTuple):
         share = f"({100 * self.share.low:.2g} % to {100 * self.share.high:.2g} %)"
         half = (self.bias_high - self.bias_low) / 2
         return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {self.bias:.2g} +- {half:.1g}"
+
+    def describe_left_out(self, filter: str, output: str) -> list[str]:
+        """Say in a line that a filter left out most values of an output, which outliers are not; nothing elsewhere."""
+        if not self.share.low > MOST:
+            return []
+        return [
+            f"{filter} left out {self.down_weighted} of {self.received} values of {output}: more than outliers would "
+            "be; it may be wrong itself, by its start or after an outage, and then it does not come back"
+        ]
 
 
 def summarise_innovations(innovations: Weighed) -> tuple[InnovationSummary, ...]:

@@ -125,14 +125,11 @@ class Health:
             )
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
-        """Say of which outputs a filter that weighs left out more than half: of outliers it would be less."""
+        """Say of which outputs a filter that weighs left out most, as `heliograph.run` does."""
         for output in self.outputs:
-            summary, mine = output.judged.summary, (output.node, output.filter) == (health.node, health.filter)
-            if mine and output.weighs and summary.share.low > 0.5:
-                yield (
-                    f"{health.node}/{health.filter} left out {summary.down_weighted} of {summary.received} values of "
-                    f"{output.judged.output}: more than outliers would be; it may be wrong itself, by its start or "
-                    "after an outage, and then it does not come back"
+            if output.weighs and (output.node, output.filter) == (health.node, health.filter):
+                yield from output.judged.summary.describe_left_out(
+                    f"{health.node}/{health.filter}", output.judged.output
                 )
 
 

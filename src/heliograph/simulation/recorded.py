@@ -1,7 +1,7 @@
 """Recordings: every filter of a network over recorded measurements."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import jax
@@ -19,7 +19,7 @@ from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.description.wide_angles import beyond_a_turn, wide_in_rows
-from heliograph.simulation.network import Network
+from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.plausible_step import (
     Judges,
@@ -56,7 +56,8 @@ def run(
 
     Values beyond a node's limits, and those that are implausible for all filters of a node
     (`heliograph.filters.plausibility`), count as not arrived; each is warned of, with its rows from 1.
-    A value that the rule of its sender forbids is warned of and used.
+    A value that the rule of its sender forbids is warned of and used. Filters that left out most of what arrived,
+    such as one with a gate about a wrong start, are warned of.
 
     Args:
         network: the network.
@@ -113,7 +114,7 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
-    for line in wide_in_rows(network, record):
+    for line in (*wide_in_rows(network, record), *_describe_left_out(network, record)):
         warnings.warn(line, stacklevel=2)
     return record if true is None else add_truth(record, network.plant, true, smooth)
 
@@ -128,6 +129,16 @@ def _drop_beyond_limits(
     came, said = int(np.count_nonzero(~np.isnan(z))), node.limits.why(z[row], node.received_names)
     warnings.warn(f"node {name!r}: {count} of {came} values count as not arrived; row {row + 1}: {said}", stacklevel=3)
     return np.where(outside, np.nan, z)
+
+
+def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
+    """Say of which outputs filters that weigh left out most, a line each."""
+    names = {node: list(network.nodes[node].received_names) for node in record.measurements}
+    names[FUSED] = [f"{node}: {name}" for node in record.measurements for name in names[node]]
+    for node, filters in record.weighed.items():
+        for filter in filters:
+            for name, summary in zip(names[node], record.outputs(node, filter), strict=True):
+                yield from summary.describe_left_out(f"{node}/{filter}", name)
 
 
 def _warn_of_forbidden(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> None:
