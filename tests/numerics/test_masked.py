@@ -38,8 +38,25 @@ DOORS = {  # of measurements (steps, 1): an array that shows that they were used
     "step": lambda z: KALMAN.step(KALMAN.init(), z[3])[1].mean,
     "recording": lambda z: hg.files.read_recording({"time": np.arange(30.0), "flow": z[:, 0]}, NETWORK)[0]["a"],
     "fates": lambda z: hg.learning.learn_losses(np.sign(z[:, 0]) - 1).packets,
+    "fused": lambda z: fused(hg.model.Estimate(z, np.ones((30, 1, 1)), "exact")).mean,
+    "fused variances": lambda z: fused(hg.model.Estimate(np.ones((30, 1)), z[..., None], "exact")).mean,
+    "over runs": lambda z: hg.simulation.over_runs(twice, z),
+    "quantizer": lambda z: hg.fusion.UniformQuantizer(101, 3e3).step((), z[:, 0])[1].value,
+    "another": lambda z: hg.fusion.EscapeQuantizer(101, 1e3, 0.5, 0.5, 1.0).step(*begun(z[:, 0]))[1].value,
     "nees": lambda z: hg.nees(z, np.ones((30, 1)), np.ones((30, 1, 1))),
 }
+
+
+def fused(estimate):
+    return hg.fusion.fuse(hg.CovarianceIntersection(), [estimate] * 2)
+
+
+def twice(x):
+    return 2 * x
+
+
+def begun(z):
+    return hg.fusion.EscapeQuantizer(101, 1e3, 0.5, 0.5, 1.0).init(len(z)), z
 
 
 def pushed(z):
@@ -102,6 +119,15 @@ def test_what_must_be_there_is_refused_where_it_is_masked():
     dates = np.ma.array(np.arange(3).astype("datetime64[D]"), mask=[False, True, False])
     with pytest.raises(ValueError, match="1 of them missing"):
         hg.run(NETWORK, {"a": np.zeros(3)}, time=dates)
+
+
+@pytest.mark.parametrize("absent", [None, pd.NA, np.ma.masked, np.nan])
+def test_one_number_that_is_absent_did_not_arrive(absent):
+    two = hg.kalman_filter(PLANT, hg.LinearSensor([[1.0], [1.0]], 15099.0 * np.eye(2)))
+    for item, value, expected in [(KALMAN, [absent], [np.nan]), (two, [absent, 900.0], [np.nan, 900.0])]:
+        columns = [value, tuple(value)] + [pd.Series(value, dtype=object)] * (absent is not np.ma.masked)
+        for column in columns:
+            assert hg.Stream(item).push(column).mean == hg.Stream(item).push(expected).mean
 
 
 def test_masks_within_a_list_are_kept():

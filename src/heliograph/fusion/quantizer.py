@@ -13,6 +13,7 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail, rank
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
@@ -186,7 +187,9 @@ class UniformQuantizer(AbstractQuantizer):
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the fixed amplitude."""
-        return state, _quantize_as_published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
+        return state, _quantize_as_published(
+            jnp.asarray(fill_masked(value), dtype=float), self.amplitude, self.levels, self.scale
+        )
 
     def error(self, n: int) -> Float[Array, " n"]:
         """Half of a segment's length."""
@@ -304,7 +307,7 @@ class EscapeQuantizer(AbstractQuantizer):
     @in_float64
     def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
         """Encode a value (n,), from the amplitude that both ends know, or from the first one."""
-        x = jnp.asarray(value, dtype=float)
+        x = jnp.asarray(fill_masked(value), dtype=float)
         anew = jnp.broadcast_to(self._restarts(state.number) | restart, x.shape)
         amplitude = self._amplitude(state, anew)
         # m = ceil(log2(|x| / d)) by exponents, without rounding.

@@ -1,6 +1,6 @@
 """Reports from nodes to the fusion centre: rate, channel and delay, and sending on events."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.quantizer import AbstractQuantizer, Quantized
+from heliograph.fusion.quantizer import AbstractQuantizer, Quantized, Quantizer
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.estimate import Claim, weakest
-from heliograph.model.over_time import first
+from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import array, check_count, fail, instance, probabilities, rank
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.module import Module, readable, same
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -71,7 +72,7 @@ class EventSending(AbstractQuantizer):
     @in_float64
     def step(self, state: LastSent, value: ArrayLike) -> tuple[LastSent, Quantized]:
         """Send or stay silent; return what the receiver has after this step, NaN where it takes silence for a loss."""
-        x = jnp.asarray(value, dtype=float)
+        x = jnp.asarray(fill_masked(value), dtype=float)
         there = ~jnp.any(jnp.isnan(x))
         sent = there & (~state.any | jnp.any(jnp.abs(x - state.value) > self.threshold))
         held = LastSent(jnp.where(sent, x, state.value), state.any | sent)
@@ -144,6 +145,19 @@ class ReportLink(Module):
 
 
 ReportLinks = ReportLink | Mapping[str, ReportLink]  # one for all nodes, or by their names
+
+
+def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], n: int) -> None:
+    """Raise ValueError unless the links of the nodes, and their quantizers or none, fit reports of n numbers."""
+    for link in links:
+        instance("report link", link, ReportLink, "a ReportLink").check(n)
+    for link, quantizer in zip(links, quantizers, strict=False):
+        if isinstance(quantizer, OverTime):
+            raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
+        quantizer.error(n)
+        if quantizer.holds and not link.delivers(n):
+            raise fail(f"reports through {type(quantizer).__name__}, whose silence is understood", "a report link "
+                       "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip
 
 
 class Links(NamedTuple):

@@ -21,7 +21,7 @@ from heliograph.fusion.intersection import (
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
 from heliograph.fusion.mesh.graph import Graph, Neighbours, neighbours_of
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
-from heliograph.fusion.report_link import ReportLink, ReportLinks
+from heliograph.fusion.report_link import ReportLink, ReportLinks, check_reports
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
@@ -37,6 +37,7 @@ from heliograph.numerics.check import (
     scalar,
     spread_over_names,
 )
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -118,11 +119,11 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
         raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
     rule.check(len(estimates))
     # Angles within half a turn of those of the first estimate.
-    means = np.stack([np.asarray(e.mean) for e in estimates], axis=-2)
+    means = np.stack([np.asarray(fill_masked(e.mean)) for e in estimates], axis=-2)
     which = angles_among(angles, means.shape[-1])
     means = nearest(means, means[..., :1, :], which)
     # The rule, over all leading axes; the claim from those of the inputs.
-    covariances = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)
+    covariances = np.stack([np.asarray(fill_masked(e.covariance)) for e in estimates], axis=-3)
     mean, covariance = _combine_all(rule, means, covariances)
     return Estimate(wrap_angles(np.asarray(mean), which), covariance, rule.claim([e.claim for e in estimates]))
 
@@ -355,26 +356,17 @@ class Fusion(Module):
                 expected = "a rule that uses reports (AllReports)"
                 raise fail(f"fusion through {type(first(quantizer)).__name__}", expected, type(self.rule).__name__)
         if self.by_report:
-            self._check_reports(nodes, n)
+            if not self.rule.uses_reports:
+                raise fail(
+                    "fusion over report links", "a rule that uses reports (AllReports)", type(self.rule).__name__
+                )
+            check_reports(self.links(nodes), self._quantizers(nodes), n)
         self.uplinks(nodes)
 
     @property
     def by_report(self) -> bool:
         """True where the reports that arrive may differ from those that were sent."""
         return self.uplink is not None or (self.rule.uses_reports and self.quantizer is not None)
-
-    def _check_reports(self, nodes: Sequence[str], n: int) -> None:
-        if not self.rule.uses_reports:
-            raise fail("fusion over report links", "a rule that uses reports (AllReports)", type(self.rule).__name__)
-        for link in self.links(nodes):
-            instance("report link", link, ReportLink, "a ReportLink").check(n)
-        for link, quantizer in zip(self.links(nodes), self._quantizers(nodes), strict=False):  # none, or one for each
-            if isinstance(quantizer, OverTime):
-                raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
-            quantizer.error(n)
-            if quantizer.holds and not link.delivers(n):
-                raise fail(f"reports through {type(quantizer).__name__}, whose silence is understood", "a report link "
-                           "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
         """Report links of these nodes."""

@@ -9,6 +9,7 @@ import numpy as np
 from heliograph.engine.choice import chosen, threads
 from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import fully_optimised, to_numpy
+from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.types import PyTree
 
 WIDTH = 128  # runs in parallel: the smoother steps of a hundred steps of them stay in the cache
@@ -72,7 +73,7 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
 
 def _numbers(value: PyTree) -> np.ndarray:
     try:
-        values = np.asarray(value)
+        values = np.asarray(fill_masked(value))
     except ValueError:  # rows of different lengths
         raise fail("arrays over runs", "arrays of numbers", show_value(value)) from None
     if values.dtype.kind not in "biufc":
