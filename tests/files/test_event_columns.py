@@ -106,15 +106,15 @@ def test_the_count_of_numbered_transmissions_says_what_was_lost(tmp_path):
 
 def test_a_link_counts_what_was_lost_around_the_wrap_of_a_count():
     """Of 4 bits, also where one had only been overtaken; of 16 a small one long before the end is a new start."""
-    from heliograph.live.plant import Link
+    from heliograph.live.plant import LinkCounts
 
-    link = Link()
+    link = LinkCounts()
     for time, number in enumerate([13, 14, 0, 1]):
         link.count("used", number, float(time), 16)
     assert link.lost == 1
     link.count("used", 15, 1.5, 16)
     assert link.lost == 0
-    link = Link()
+    link = LinkCounts()
     for time, number in enumerate([17, 18, 0, 1, 3]):
         link.count("used", number, float(time), 1 << 16)
     assert (link.lost, link.first) == (1, 0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic_core import to_json
 
-from heliograph.live.plant import Link
+from heliograph.live.plant import LinkCounts
 from heliograph.serving.output import Output
 from heliograph.serving.page import Door, door, shown
 from heliograph.serving.running_nis import used_nis
@@ -78,7 +78,7 @@ def test_counters_do_not_follow_what_is_in_memory():
     watch.note([Output(None, "p0", "refused", b"{}")], None)
     after = watch.links()["<b>node"]
     assert after["used"] == 901 and after["lost"] == 1
-    gone.links["<b>node"] = Link(used=3)  # begun anew
+    gone.links["<b>node"] = LinkCounts(used=3)  # begun anew
     watch.note([Output(None, "p0", "refused", b"{}")], None)
     assert watch.links()["<b>node"]["used"] == 901
 

@@ -16,7 +16,7 @@ import heliograph as hg
 
 pytest.importorskip("uvicorn")
 from heliograph.files.sources import Sources
-from heliograph.live.plant import Link
+from heliograph.live.plant import LinkCounts
 from heliograph.numerics.types import NameWithUnit
 from heliograph.serving.page import Door, Tallies, door, shown
 from heliograph.serving.running_nis import DOUBT, MEMORY, RunningNis
@@ -186,7 +186,7 @@ def test_what_is_lost_of_messages_without_a_count_is_not_counted():
     uncounted = Sources(sources, network).uncounted
     assert uncounted == {"a"}
     watch = watch_of(network, "house", uncounted)
-    watch.totals.add("", {name: Link(used=3, lost=0) for name in "ab"})
+    watch.totals.add("", {name: LinkCounts(used=3, lost=0) for name in "ab"})
     assert {name: link["lost"] for name, link in watch.links().items()} == {"a": None, "b": 0}
     said = Tallies(watch).text().decode()
     assert 'heliograph_lost{node="b"} 0' in said and 'heliograph_lost{node="a"}' not in said

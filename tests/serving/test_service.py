@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
-from heliograph.live.plant import Link
+from heliograph.live.plant import LinkCounts
 from heliograph.serving.output import AnyOutput
 from heliograph.serving.page import Tallies
 from heliograph.serving.service import Service
@@ -253,7 +253,7 @@ def test_no_plant_begins_with_a_wrong_clock():
 @given(st.randoms(use_true_random=False), st.floats(0, 0.6))
 def test_lost_is_what_never_came_in_whatever_order_the_rest_did(chance, loss):
     """Between the first and the last that were received; then the node is started again, and counts from 0."""
-    link, lost = Link(), 0
+    link, lost = LinkCounts(), 0
     for boot in range(2):
         received = [k for k in range(1, 20) if chance.random() > loss]
         chance.shuffle(received)
@@ -266,7 +266,7 @@ def test_lost_is_what_never_came_in_whatever_order_the_rest_did(chance, loss):
 
 
 def test_a_wrong_clock_or_a_copy_loses_nothing():
-    link = Link()
+    link = LinkCounts()
     for verdict, sequence, time in [
         ("used", 0, 0.0), ("future", 1, 1e9), ("used", 2, 2.0), ("duplicate", 0, 0.0), ("used", 4, 4.0),
         ("conflict", 0, 0.0), ("late", 3, 3.0),

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic_core import to_json
 
-from heliograph.live.plant import Link
+from heliograph.live.plant import LinkCounts
 from heliograph.serving.output import Output
 
 
 @dataclass
 class OnePlant:
-    links: dict[str, Link] = field(default_factory=dict)
+    links: dict[str, LinkCounts] = field(default_factory=dict)
 
 
 @dataclass
@@ -56,7 +56,7 @@ class Scripted:
         for payload in payloads:
             i = int(payload)
             for name in names:
-                links.setdefault(name, Link()).used += 1
+                links.setdefault(name, LinkCounts()).used += 1
             nis = self.scale * float(np.random.default_rng(i).chisquare(2))
             covariance = [[0.04 * (1 + 4 / (1 + i)), 0.0], [0.0, 0.01]]
             message = {"mean": [np.sin(i / 20), np.cos(i / 20)], "covariance": covariance}

@@ -10,7 +10,7 @@ from heliograph.filters.gaussian.signal import homogeneous
 from heliograph.fusion.cross_covariance import Errors, observation_noise
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.quantizer import widen
-from heliograph.fusion.report_link import Links
+from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fused, Means
 from heliograph.fusion.weights import RANK
 from heliograph.numerics.lapack import pseudo_solve
@@ -30,7 +30,7 @@ class Past(NamedTuple):
     error: jax.Array
 
 
-class Knowledge(NamedTuple):
+class ReportsBelief(NamedTuple):
     """Estimate of the centre, of zeta = (x, e_1, ..., e_nodes, reports sent one step ago, two steps ago, ...).
 
     mean (N,) and covariance (N, N), N = (1 + nodes + nodes delays) n; `spill` bounds the square of the part of the
@@ -64,24 +64,24 @@ class AllReports(AbstractInformedFusion):
         """True: it uses reports that fade, are late, or never arrive."""
         return True
 
-    def start(self, errors: Errors) -> Knowledge:
+    def start(self, errors: Errors) -> ReportsBelief:
         """Return the state before the first report, over lossless links."""
         return begin(errors, 0, errors.bias.shape[1], quantized=False)
 
-    def use(self, state: Knowledge, happened: Happened, means: Means) -> tuple[Knowledge, Fused]:
+    def use(self, state: ReportsBelief, happened: Happened, means: Means) -> tuple[ReportsBelief, Fused]:
         """Move the plant and all errors, then use the reports; one that is NaN did not arrive."""
         nodes, n = means.shape
         after, _ = receive_reports(propagate_errors(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
         return after, estimate_state(after, n)
 
 
-def faithful(nodes: int, n: int) -> Links:
+def faithful(nodes: int, n: int) -> ReportModel:
     """Lossless links, which deliver what is sent."""
     zero = np.zeros((nodes, n))
-    return Links(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
+    return ReportModel(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
 
 
-def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowledge:
+def begin(errors: Errors, delays: int, received: int, quantized: bool) -> ReportsBelief:
     """Return the state before the first report, for so many `delays` and `received` numbers per report."""
     nodes, n = errors.bias.shape
     size = nodes * n
@@ -91,10 +91,10 @@ def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowle
     mean = jnp.pad(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), later)
     shapes = (received, n), (received,), (received, received), (n,)
     past = Past(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
-    return Knowledge(mean, covariance, past, jnp.zeros_like(covariance) if quantized else None)
+    return ReportsBelief(mean, covariance, past, jnp.zeros_like(covariance) if quantized else None)
 
 
-def propagate_errors(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
+def propagate_errors(state: ReportsBelief, happened: Happened, links: ReportModel) -> ReportsBelief:
     """Predict x- = A x + b + w and e+ = T e + G x + g + B w - K nu together; then each node sends x- - e+."""
     motion, step, noise, _ = happened
     nodes, n, _ = step.transition.shape
@@ -115,7 +115,7 @@ def propagate_errors(state: Knowledge, happened: Happened, links: Links) -> Know
         stored = _make_shift_matrix(nodes, n, later)
         transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), stored])
         new, drift = jnp.pad(new, (0, later)), jnp.pad(drift, (0, later))
-    return Knowledge(
+    return ReportsBelief(
         transition @ state.mean + drift,
         symmetric(transition @ state.covariance @ transition.T + new),
         _prepend_present(state.past, happened, links),
@@ -130,7 +130,7 @@ class Expected(NamedTuple):
     covariance: Float[jax.Array, "M M"]
 
 
-def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -> tuple[Knowledge, Expected]:
+def receive_reports(state: ReportsBelief, reports: Float[jax.Array, "age node m"]) -> tuple[ReportsBelief, Expected]:
     """Correct with the reports that arrived, by their age in steps; NaN for those that did not arrive now.
 
     With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
@@ -155,16 +155,16 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     spill = None
     if state.spill is not None:
         spill = symmetric(_sum(keep @ state.spill @ keep.T, _within(gain @ push, jnp.ravel(state.past.error))))
-    return Knowledge(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
+    return ReportsBelief(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
 
 
-def estimate_state(state: Knowledge, n: int) -> Fused:
+def estimate_state(state: ReportsBelief, n: int) -> Fused:
     """Estimate of x, with the covariance of its error or a bound on it."""
     covariance = state.covariance[:n, :n]
     return state.mean[:n], covariance if state.spill is None else _sum(covariance, state.spill[:n, :n])
 
 
-def _prepend_present(past: Past, happened: Happened, links: Links) -> Past:
+def _prepend_present(past: Past, happened: Happened, links: ReportModel) -> Past:
     """Put the present reports before those of earlier steps."""
     errors = happened.errors
     mean = errors.mean - errors.bias

@@ -160,7 +160,7 @@ def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], 
                        "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip
 
 
-class Links(NamedTuple):
+class ReportModel(NamedTuple):
     """Reports of one step as the centre models them, z_i = G_i m_i + n_i, quantizers' errors on m_i within error_i.
 
     Shapes: gain E[G] (node, m, n), offset E[n] (node, m), spread (node, m, m, n + 1, n + 1), which takes second moments

@@ -10,7 +10,7 @@ import scipy
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
 from heliograph.learning.intervals import long_run_deviation
-from heliograph.learning.likelihood.predictive_density import NODES, Parts, expect_signals, score_signals
+from heliograph.learning.likelihood.predictive_density import NODES, StackDensities, expect_signals, score_signals
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import readable, same
@@ -139,7 +139,7 @@ def _ratios(
     said = []
     for channel in (true, other):
         received = condition_on_arrival(channel)
-        filter, parts = cubature_filter(network.plant, node.sensor, received), Parts.of(received, nodes)
+        filter, parts = cubature_filter(network.plant, node.sensor, received), StackDensities.of(received, nodes)
         y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in _side_by_side(filter, z, u))
         said.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
     return np.asarray(said[0] - said[1])

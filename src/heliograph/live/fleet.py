@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.lanes import Lanes
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
-from heliograph.live.plant import Plant, Withdrawn
+from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.pool import Pool, legs_of, rounds_of
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
@@ -46,7 +46,7 @@ class Finalised(NamedTuple):
     `withdrawn`: events that had been used, of a clock that has turned out wrong.
     """
 
-    plant: Plant
+    plant: PlantState
     final: list[HeldRow]
     newest: HeldRow
     left: list[int]
@@ -103,21 +103,21 @@ class Fleet:
         """Return whether all events of one time form one row."""
         return self._joint
 
-    def begin(self, name: str, time: float, origin: datetime | None) -> Plant:
+    def begin(self, name: str, time: float, origin: datetime | None) -> PlantState:
         """Add a plant, whose continuous time starts at `time`."""
         begun = -1.0 if self.lanes.dt is None else time
         slot = self.pool.take()
         self.pool.start(slot, begun)
         base = HeldRow((begun, BEFORE, 0), slot, self.width)
         base.numbers[-1] = begun
-        return Plant(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
+        return PlantState(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
 
-    def end(self, plant: Plant) -> None:
+    def end(self, plant: PlantState) -> None:
         """Remove a plant and free its slots."""
         self.end_silence(plant)
         self.pool.give(plant.slots)
 
-    def pass_silence(self, plants: Iterable[tuple[Plant, float]]) -> None:
+    def pass_silence(self, plants: Iterable[tuple[PlantState, float]]) -> None:
         """Predict each plant to a step at which nothing came; `silence` of the plant is the row there.
 
         It goes on from the silence before, is no row of the history, and ends with the next event that is used.
@@ -133,7 +133,7 @@ class Fleet:
             chains.append([before, plant.silence])
         self._run(chains)
 
-    def end_silence(self, plant: Plant) -> None:
+    def end_silence(self, plant: PlantState) -> None:
         """Forget the silence of a plant."""
         if plant.silence is not None:
             self.pool.give([plant.silence.slot])
@@ -205,7 +205,7 @@ class Fleet:
         return event._replace(values=np.where(outside, nan, values).tolist()), int(outside.sum()), said
 
     def take(
-        self, plant: Plant, event: Known, given: bool = False, wall: float | None = None, clock: str | None = None
+        self, plant: PlantState, event: Known, given: bool = False, wall: float | None = None, clock: str | None = None
     ) -> Verdict:
         """Judge an event and hold it if it is used.
 
@@ -238,7 +238,7 @@ class Fleet:
         plant.pass_time(clock, said, now, leap, sure)
         return verdict
 
-    def advance(self, plant: Plant, now: float) -> None:
+    def advance(self, plant: PlantState, now: float) -> None:
         """Advance the time of a plant by a clock; a leap that contradicts it is withdrawn."""
         leap, most = plant.leap, self.options.leap
         if leap is not None and (found := find_leap(leap, plant.now, now, most)) is not None and found[0].now > -inf:
@@ -247,12 +247,12 @@ class Fleet:
             plant.leap = None
         plant.now = max(plant.now, now)
 
-    def undo(self, plant: Plant, clock: tuple[float, Leap | None]) -> None:
+    def undo(self, plant: PlantState, clock: tuple[float, Leap | None]) -> None:
         """Restore a plant, with its `clock`, to its state before the events taken since the last call of `finalise`."""
         self.pool.give(plant.undo())
         plant.clock = clock
 
-    def finalise(self, touched: Iterable[Plant], all_: bool = False) -> list[Finalised]:
+    def finalise(self, touched: Iterable[PlantState], all_: bool = False) -> list[Finalised]:
         """Step what is due, and let what is older than the window, or all, become final."""
         plants = list(touched)
         self.step(plants)
@@ -261,7 +261,7 @@ class Fleet:
         return [Finalised(plant, final, plant.rows.held[-1], left + slots, events)
                 for plant, (final, left), (events, slots) in zip(plants, ends, withdrawn, strict=True)]  # fmt: skip
 
-    def step(self, plants: Iterable[Plant]) -> None:
+    def step(self, plants: Iterable[PlantState]) -> None:
         """Step what is due, for all plants at once."""
         chains = [chain for plant in plants if (chain := plant.chain())]
         if rows := [row for chain in chains for row in chain]:
@@ -291,7 +291,7 @@ class Fleet:
         self.step_row(row, HeldRow((float(time), 0, 0), slot, self.width))
 
     def trial(
-        self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
+        self, plants: Sequence[PlantState | None], given: Float[np.ndarray, "plant given"]
     ) -> Float[np.ndarray, "plant outputs"]:
         """Estimates of each plant (None: one that has not begun) with these inputs, NaN: as they were.
 
@@ -305,7 +305,7 @@ class Fleet:
         """Return the outputs of the filters after the rows in these slots."""
         return self.pool.table[np.array(slots, dtype=int), self.pool.outputs]
 
-    def senders(self, plant: Plant) -> dict[str, SenderStatus]:
+    def senders(self, plant: PlantState) -> dict[str, SenderStatus]:
         """Return the status of each sender of a plant that decides when to send: what its silence means by now."""
         final, now = max(plant.confirmed - self.options.window, -1.0), int(np.floor(min(plant.now, self.end_step)))
         links = {name: plant.links.get(name) for name in self.deciding}

@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement, Reason, why_inputs, why_values
 from heliograph.live.event import Known
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import Plant
+from heliograph.live.plant import PlantState
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.model.estimate import Estimate
 from heliograph.model.faults import function_fault
@@ -24,7 +24,9 @@ TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
-Candidate: TypeAlias = tuple[int, Plant, Known, HeldRow]  # an event that was used, its message's number, and its row
+Candidate: TypeAlias = tuple[
+    int, PlantState, Known, HeldRow
+]  # an event that was used, its message's number, and its row
 
 
 class Judges:
@@ -43,7 +45,7 @@ class Judges:
         self._faults: dict[tuple[str, str], tuple[int, str]] = {}  # by node and filter: how often tried, what was found
 
     def implausible_inputs(
-        self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
+        self, plants: Sequence[PlantState | None], given: Float[np.ndarray, "plant given"]
     ) -> list[str | None]:
         """Explain which inputs are implausible, by the prediction over one step or unit of time that they lead to."""
         if not plants:
@@ -173,7 +175,7 @@ class FleetAngles:
                 variances = fleet.pool.outputs.start + place.covariance + np.arange(n) * (n + 1)
                 self._watched.append((f"{place.node}/{place.filter}", variances, angles))
 
-    def said_of(self, plants: Sequence[Plant]) -> list[tuple[str, str]]:
+    def said_of(self, plants: Sequence[PlantState]) -> list[tuple[str, str]]:
         """Return the name of a plant and a line for each angle that is wide in a newest row for the first time."""
         self._watched = [watched for watched in self._watched if watched[-1].states]
         if not self._watched:

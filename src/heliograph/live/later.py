@@ -19,7 +19,7 @@ from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.fusions import Fused
+from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.plausible_step import reasons
 from heliograph.simulation.rows.row_step import NetworkStep
@@ -69,7 +69,7 @@ class Sweep(Module):
     """The filters of a network that can be smoothed, by `kinds`, and their fusions."""
 
     network_step: NetworkStep
-    fusions: tuple[Fused, ...]
+    fusions: tuple[StackedFusions, ...]
     kinds: tuple[int, ...] = eqx.field(static=True)
 
     def step(
@@ -198,7 +198,7 @@ class Sweeper:
         self._run, self._by_xla = sweep_back(static, dt)
         self._programs = dict[tuple[int, str], Callable[[History, np.ndarray], PyTree]]()
 
-    def _fuses(self, fusion: Fused, kinds: tuple[int, ...]) -> bool:
+    def _fuses(self, fusion: StackedFusions, kinds: tuple[int, ...]) -> bool:
         return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
     def _program(self, history: History) -> Callable[[History, np.ndarray], PyTree]:

@@ -14,7 +14,7 @@ GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRa
 
 
 @dataclass
-class Link:
+class LinkCounts:
     """Counts of the messages of a node by verdict, and its running count, in which gaps are lost messages.
 
     The running count of the node goes from `first` to `newest`, which was measured at time `at`. A smaller number with
@@ -123,7 +123,7 @@ class Aside(NamedTuple):
 
 
 @dataclass
-class Plant:
+class PlantState:
     """State of one plant: its rows, of which those from `dirty` on have to be stepped again.
 
     Attributes:
@@ -149,7 +149,7 @@ class Plant:
     version: int = 0
     dirty: int | None = None
     forced: int = 0
-    links: dict[str, Link] = field(default_factory=dict)
+    links: dict[str, LinkCounts] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
     leap: Leap | None = None
     silence: HeldRow | None = None
@@ -306,11 +306,11 @@ class Plant:
         del self.changes[count:]
         return slots
 
-    def link(self, node: str) -> Link:
+    def link(self, node: str) -> LinkCounts:
         """Return the counts of a node."""
         link = self.links.get(node)
         if link is None:
-            link = self.links[node] = Link()
+            link = self.links[node] = LinkCounts()
         return link
 
     def chain(self) -> list[HeldRow]:

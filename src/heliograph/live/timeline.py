@@ -13,7 +13,7 @@ from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numb
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import FleetAngles, Judges
 from heliograph.live.lanes import shared_lanes
-from heliograph.live.plant import Link
+from heliograph.live.plant import LinkCounts
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.senders import SenderStatus
 from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, description
@@ -138,14 +138,14 @@ class Timeline:
         """Return the number of each verdict by node, and under "inputs"."""
         links = self._plant.links
         return {
-            name: {verdict: getattr(links.get(name, Link()), verdict) for verdict in VERDICTS}
+            name: {verdict: getattr(links.get(name, LinkCounts()), verdict) for verdict in VERDICTS}
             for name in self._fleet.sizes
         }
 
     @property
     def dropped(self) -> dict[str, int]:
         """Return the number of single values beyond each node's limits."""
-        return {name: self._plant.links.get(name, Link()).dropped for name in self.network.names}
+        return {name: self._plant.links.get(name, LinkCounts()).dropped for name in self.network.names}
 
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.

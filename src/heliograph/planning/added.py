@@ -36,7 +36,7 @@ ALIKE = 1e-12  # relative: rows of one signal, noises that are independent
 HALVINGS = 200  # of an interval that holds a multiplier
 
 
-class Links(NamedTuple):
+class SummedLinks(NamedTuple):
     """Links of a sum: rows B, noise D, power t of a unit amplitude, noise N, and the amplitudes at present."""
 
     rows: Float[np.ndarray, "links n"]
@@ -116,7 +116,7 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
     )
 
 
-def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[Links, Superposed]:
+def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
     """The links of a node's sum, and the sum with all amplitudes 1."""
     sensor, channel = node.sensor, node.channel
     if not isinstance(sensor, LinearSensor) or sensor.circular:
@@ -143,7 +143,7 @@ def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[Links, Sup
     present = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
     signs = np.array([np.sign(float(d.mean_gain[0, 0])) for d in now]) * np.sign(mean)
     rows = mean[:, None] * np.asarray(sensor.matrix)[places]
-    return Links(rows, noise, power, floor, np.where(signs == 0, 1.0, signs) * present), unit
+    return SummedLinks(rows, noise, power, floor, np.where(signs == 0, 1.0, signs) * present), unit
 
 
 def _unfit(got: str) -> ValueError:
@@ -165,7 +165,7 @@ def steady_error(
     return np.asarray(prior - prior @ output.T @ gain)
 
 
-def solve_closed_form(links: Links, total: float, caps: Vector) -> Vector | None:
+def solve_closed_form(links: SummedLinks, total: float, caps: Vector) -> Vector | None:
     """Best amplitudes of one scalar signal under a total, or under limits of each where noises are independent."""
     _, sizes, right = np.linalg.svd(links.rows)
     if len(sizes) > 1 and sizes[1] > ALIKE * sizes[0]:
@@ -218,7 +218,7 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
 
 
 def search_amplitudes(
-    links: Links, total: float, caps: Vector, value: Callable[[Vector], float], starts: int, seed: int
+    links: SummedLinks, total: float, caps: Vector, value: Callable[[Vector], float], starts: int, seed: int
 ) -> Vector:
     """Amplitudes of the least error that searches from random starts find; signs matter."""
     generator, best, found = np.random.default_rng(seed), links.present, np.inf
@@ -242,7 +242,7 @@ def search_amplitudes(
     return best
 
 
-def _limit(links: Links, limits: PowerLimits, caps: Vector) -> Float[np.ndarray, "n n"]:
+def _limit(links: SummedLinks, limits: PowerLimits, caps: Vector) -> Float[np.ndarray, "n n"]:
     """Information that no amplitudes within the limits exceed: with the total, or with all that each may send."""
     most = float(caps**2 @ links.unit)
     return links.best_information(min(limits.total, most))

@@ -6,12 +6,12 @@ import numpy as np
 from pydantic_core import to_json
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import Plant
+from heliograph.live.plant import PlantState
 from heliograph.live.rows import HeldRow
 from heliograph.serving.output import Output
 from heliograph.simulation.centres.node_filter import NodeFilter
 
-Moment = Callable[[Plant, float], float | str]
+Moment = Callable[[PlantState, float], float | str]
 
 
 class Exchange:
@@ -36,13 +36,13 @@ class Exchange:
         """Return whether this is a node that sends messages to its neighbours."""
         return self._node is not None
 
-    def messages(self, plants: Iterable[Plant]) -> list[Output]:
+    def messages(self, plants: Iterable[PlantState]) -> list[Output]:
         """Return the messages that the events taken since the last finalisation make due, after their steps."""
         if self._node is None:
             return []
         return [output for plant in plants for row in self._due(plant) for output in self._send_row(plant, row)]
 
-    def _due(self, plant: Plant) -> list[HeldRow]:
+    def _due(self, plant: PlantState) -> list[HeldRow]:
         """Return rows that are whole now and were not before: measured, or with a row after them."""
         assert self._node is not None
         before: dict[int, bool] = {}  # of each row with changes whether it was measured; of new ones none
@@ -63,7 +63,7 @@ class Exchange:
         assert self._node is not None
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
-    def _send_row(self, plant: Plant, row: HeldRow) -> list[Output]:
+    def _send_row(self, plant: PlantState, row: HeldRow) -> list[Output]:
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])

@@ -14,7 +14,7 @@ from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
 from heliograph.live.judging import FleetAngles
 from heliograph.live.lanes import Lanes as Lanes
-from heliograph.live.plant import Plant, Withdrawn
+from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.rows import HeldRow
 from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.numerics.check import instance, show_value
@@ -78,7 +78,7 @@ class Service:
     ):
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
-        self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
+        self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._writer, self._using = EstimateWriter(fleet.lanes), Using(fleet, self.plants)
         self._exchange, self._silence = Exchange(fleet, self._moment), Silence(fleet, every)
@@ -252,7 +252,7 @@ class Service:
             self._say(f"warning: {what}: {why}; such messages are reported as refused and counted, and not said again")
             self._say = None
 
-    def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:
+    def _commit(self, touched: dict[str, PlantState], entries: Sequence[Entry], malformed: int) -> list[Output]:
         """Commit the changed plants. If that fails, forget them in memory: the store is authoritative."""
         stored = {}
         if self.store.keeps:
@@ -295,14 +295,14 @@ class Service:
         names = (plant.name for plant, _ in rows)
         return [*map(Entry._make, zip(names, repeat("final"), self._lines(b"final", rows)))]
 
-    def _withdrawn(self, plant: Plant, events: Iterable[Withdrawn]) -> Iterator[Entry]:
+    def _withdrawn(self, plant: PlantState, events: Iterable[Withdrawn]) -> Iterator[Entry]:
         """Yield a refusal of each event that was used before its clock turned out wrong."""
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             parts = {"node": name, "sequence": sequence, "time": self._moment(plant, time)}
             yield _write_refusal(plant.name, parts, "future", LEAPT)
 
-    def _provisional(self, rows: Sequence[tuple[Plant, HeldRow]]) -> list[Output]:
+    def _provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return the provisional estimates after these rows, and what the senders' silence means."""
         outputs = []
         self._silence.told(rows)
@@ -314,12 +314,12 @@ class Service:
             outputs.append(Output(None, plant.name, "provisional", body))
         return outputs
 
-    def _lines(self, kind: bytes, rows: Sequence[tuple[Plant, HeldRow]]) -> list[bytes]:
+    def _lines(self, kind: bytes, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[bytes]:
         moments = [(plant.name, row.key[0] if plant.origin is None else self._moment(plant, row.key[0]))
                    for plant, row in rows]  # fmt: skip
         return self._writer.lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
 
-    def _moment(self, plant: Plant, at: float) -> float | str:
+    def _moment(self, plant: PlantState, at: float) -> float | str:
         """Return the time of a row as messages have it."""
         unit = self.fleet.options.step or 1.0
         return at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()

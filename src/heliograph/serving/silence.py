@@ -8,7 +8,7 @@ from time import monotonic
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import Plant
+from heliograph.live.plant import PlantState
 from heliograph.live.rows import HeldRow
 
 MOVED = 0.1  # deviations by which a mean, and share by which a deviation has to move to be told
@@ -38,9 +38,9 @@ class Silence:
         """Note plants that a service goes on with, of which messages may wait somewhere."""
         self._resumed.update(names)
 
-    def due(self, plants: Iterable[Plant], now: datetime) -> list[tuple[Plant, float]]:
+    def due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
         """Return the plants of which another step has begun by now, with its number."""
-        step, due = self.fleet.options.step, list[tuple[Plant, float]]()
+        step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
             return due
         if self._resumed and monotonic() > self._begun + GRACE:
@@ -54,7 +54,7 @@ class Silence:
                     due.append((plant, float(passed)))
         return due
 
-    def told(self, rows: Sequence[tuple[Plant, HeldRow]]) -> None:
+    def told(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
         """Note that the estimates after these rows were told."""
         if self.fleet.options.step is not None and self.fleet.deciding:
             outputs = self.fleet.outputs([row.slot for _, row in rows])
@@ -66,12 +66,12 @@ class Silence:
         """Forget a plant that leaves the memory."""
         self._told.pop(name, None)
 
-    def worth_telling(self, rows: Sequence[tuple[Plant, HeldRow]]) -> list[tuple[Plant, HeldRow]]:
+    def worth_telling(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[tuple[PlantState, HeldRow]]:
         """Return the rows whose estimates differ from what was told, or which are due again."""
         outputs = self.fleet.outputs([row.slot for _, row in rows])
         return [pair for pair, output in zip(rows, outputs, strict=True) if self._differs(*pair, output)]
 
-    def _differs(self, plant: Plant, row: HeldRow, output: np.ndarray) -> bool:
+    def _differs(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
         told = self._told.get(plant.name)
         if told is None or told[1] != self._dead(plant):
             return True
@@ -83,11 +83,11 @@ class Silence:
         moved = np.abs(output[self._means] - told[0][self._means]) > MOVED * before
         return bool((moved | (np.abs(now - before) > MOVED * before)).any())
 
-    def _dead(self, plant: Plant) -> tuple[str, ...]:
+    def _dead(self, plant: PlantState) -> tuple[str, ...]:
         return tuple(name for name, status in self.fleet.senders(plant).items() if status.dead)
 
 
-def dead_by_plant(fleet: Fleet, plants: Mapping[str, Plant]) -> dict[str, list[str]]:
+def dead_by_plant(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
     """Return the dead senders of each plant that has one."""
     dead = {
         name: [node for node, status in fleet.senders(plant).items() if status.dead]

@@ -10,7 +10,7 @@ COUNTS = (*VERDICTS, "dropped")  # which never fall
 FIELDS = (*COUNTS, "lost")
 
 
-class Link(Protocol):
+class LinkTotals(Protocol):
     """Counts of the messages of a node.
 
     Attributes:
@@ -39,7 +39,7 @@ class Totals:
         self.by_node: dict[str, Counter[str]] = {}
         self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
 
-    def add(self, plant: str, links: Mapping[str, Link]) -> None:
+    def add(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
         """Add what has changed in a plant's counts since they were added last."""
         for node, link in links.items():
             now = tuple(getattr(link, name) for name in FIELDS)

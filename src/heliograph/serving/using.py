@@ -12,13 +12,13 @@ from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.judging import Candidate, Judges
 from heliograph.live.leap import ARRIVAL, Leap, beginning, find_leap
-from heliograph.live.plant import Link, Plant, Withdrawn
+from heliograph.live.plant import LinkCounts, PlantState, Withdrawn
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, seconds
 
 # Of a message: its plant (None if it began none), a verdict (None if it could not be read), the reason, and notes on
 # parts that were left out of a used message.
-Outcome: TypeAlias = tuple[Plant | None, Verdict | None, str, Sequence[str]]
+Outcome: TypeAlias = tuple[PlantState | None, Verdict | None, str, Sequence[str]]
 NOTHING: Outcome = None, None, "", ()
 
 
@@ -33,13 +33,13 @@ class Before(NamedTuple):
 class Using:
     """Distribution of messages to their plants; `plants` are those in memory, by name."""
 
-    def __init__(self, fleet: Fleet, plants: OrderedDict[str, Plant]):
+    def __init__(self, fleet: Fleet, plants: OrderedDict[str, PlantState]):
         self.fleet, self.plants, self._judges = fleet, plants, Judges(fleet)
         self._refused: dict[tuple[int, bool], str] = {}  # why, by the number of a message and whether it is its inputs
         self._before: dict[str, Before] = {}
         self._taken: list[Candidate] = []
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
-        self.replaced: list[tuple[Plant, list[Withdrawn]]] = []  # these as they were, with their events
+        self.replaced: list[tuple[PlantState, list[Withdrawn]]] = []  # these as they were, with their events
 
     def use(self, messages: Sequence[AnyMessage | str], damaged: Container[str], wall: datetime) -> list[Outcome]:
         """Give messages to their plants, but for damaged ones, and step these; return the outcome of each message.
@@ -136,7 +136,7 @@ class Using:
             notes.append(f"{beyond}; the rest is used")
         return plant, verdict, why, notes
 
-    def _remember(self, plant: Plant, begun: float) -> Plant:
+    def _remember(self, plant: PlantState, begun: float) -> PlantState:
         """Return the plant, and store once in a batch what it was before; a new one joins the others."""
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
@@ -151,7 +151,7 @@ class Using:
         at, step = seconds(moment, origin, plant), self.fleet.options.step
         return at if origin is None or step is None else floor(at / step + 0.5)
 
-    def _going_on(self, message: AnyMessage, wall: datetime) -> Plant | None:
+    def _going_on(self, message: AnyMessage, wall: datetime) -> PlantState | None:
         """Return the plant of a message; None if it has to begin, or to begin anew since its first clock was wrong.
 
         That is so where the message goes on from before the leap with which the plant began, and where that is in the
@@ -173,7 +173,7 @@ class Using:
                 return None
         return plant
 
-    def _begin(self, name: str, at: float, origin: datetime | None, leap: Leap) -> Plant:
+    def _begin(self, name: str, at: float, origin: datetime | None, leap: Leap) -> PlantState:
         """Begin a plant, whose first moment is not sure yet; one that begins anew is withdrawn."""
         plant, old = self.fleet.begin(name, at, origin), self.plants.pop(name, None)
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
@@ -188,7 +188,9 @@ class Using:
             self.fleet.end(old)
         return plant
 
-    def _take(self, number: int, plant: Plant, event: Known, given: bool, wall: float | None, clock: str) -> Verdict:
+    def _take(
+        self, number: int, plant: PlantState, event: Known, given: bool, wall: float | None, clock: str
+    ) -> Verdict:
         verdict = self.fleet.take(plant, event, given, wall, clock)
         if verdict == "used":
             self._taken.append((number, plant, event, plant.changes[-1][0]))
@@ -199,7 +201,7 @@ class Using:
         plant, (known, clock, links) = self.plants[name], self._before[name]
         if known:
             self.fleet.undo(plant, clock)
-            plant.links = {name: Link(*counts) for name, counts in links.items()}
+            plant.links = {name: LinkCounts(*counts) for name, counts in links.items()}
         else:
             self.fleet.end(self.plants.pop(name))
 

@@ -22,7 +22,7 @@ from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.overview import Overview, Wrong
 from heliograph.serving.running_nis import MEMORY, RunningNis, used_nis
-from heliograph.serving.totals import Link, Totals
+from heliograph.serving.totals import LinkTotals, Totals
 from heliograph.simulation.description.diagram import join_names
 from heliograph.simulation.network import FUSED, Network
 
@@ -46,11 +46,11 @@ COUNTED = {  # of a node's messages
 }
 
 
-class Plant(Protocol):
+class WatchedPlant(Protocol):
     """A plant as the page needs it."""
 
     @property
-    def links(self) -> Mapping[str, Link]:
+    def links(self) -> Mapping[str, LinkTotals]:
         """Return the counts of the plant's links, by node."""
 
 
@@ -74,7 +74,7 @@ class Serves(Takes, Protocol):
     """A service as the page needs it."""
 
     @property
-    def plants(self) -> Mapping[str, Plant]:
+    def plants(self) -> Mapping[str, WatchedPlant]:
         """Return the plants in memory, by name."""
 
     @property
@@ -202,12 +202,12 @@ class Watch:
             if not self._dead[plant]:
                 del self._dead[plant]
 
-    def plants(self) -> Iterator[tuple[str, Plant]]:
+    def plants(self) -> Iterator[tuple[str, WatchedPlant]]:
         """Yield all plants of all services."""
         for service in self.services:
             yield from service.plants.items()
 
-    def _iterate_plants(self, names: Collection[str]) -> Iterator[tuple[str, Plant]]:
+    def _iterate_plants(self, names: Collection[str]) -> Iterator[tuple[str, WatchedPlant]]:
         """Yield the plants of these names."""
         for service in self.services:
             yield from ((name, service.plants[name]) for name in names if name in service.plants)
@@ -292,7 +292,7 @@ class Watch:
 
     def _warnings(
         self,
-        plants: Sequence[Plant],
+        plants: Sequence[WatchedPlant],
         tests: Mapping[tuple[str, str], RunningNis],
         senders: Mapping[str, Mapping[str, Any]],
     ) -> Iterator[str]:
@@ -362,7 +362,7 @@ def _root(variance: float | None) -> float | None:
     return None if variance is None else math.sqrt(max(variance, 0.0))
 
 
-def _add_counts(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int]]:
+def _add_counts(plants: Iterator[WatchedPlant] | Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
     """Sum the counts of several plants, by node."""
     results: dict[str, dict[str, int]] = {}
     for plant in plants:

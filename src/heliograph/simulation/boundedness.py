@@ -57,7 +57,7 @@ class Boundedness(NamedTuple):
     bound: Float[np.ndarray, "n n"] | None
 
 
-class Links(NamedTuple):
+class JointLinks(NamedTuple):
     """Joint model of all links: a chain of modes, the outcomes of each, and the stacked sensors."""
 
     initial: Float[np.ndarray, "modes"]
@@ -106,7 +106,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
 
 
-def _links(network: Network, states: int) -> Links:
+def _links(network: Network, states: int) -> JointLinks:
     """Join all nodes: sensors stacked, channels in parallel."""
     if network.relays is not None:
         raise fail("boundedness", "nodes that receive the sensors over channels", "relays that filter")
@@ -127,7 +127,7 @@ def _links(network: Network, states: int) -> Links:
     outputs = [outcomes(m) for m, ever in zip(modes.maps, happens, strict=True) if ever]
     noise = scipy.linalg.block_diag(*noises)
     links = initial[happens], chain[np.ix_(happens, happens)], outputs
-    return Links(*links, np.concatenate(matrices), np.concatenate(means), noise)
+    return JointLinks(*links, np.concatenate(matrices), np.concatenate(means), noise)
 
 
 def _constant(channel: Channel) -> AbstractRandomAffine:
@@ -166,7 +166,7 @@ class KnownLosses(NamedTuple):
         return {kind: k @ outcome.combine for kind, k, outcome in zip(self.kinds, gains, self.parts, strict=True)}
 
 
-def _group_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> KnownLosses:
+def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[np.ndarray, "n d"]) -> KnownLosses:
     """Group the outcomes by set of losses, each with the sums of what arrives whose gain on a subspace of x is known.
 
     Modes that look the same to the receiver are one kind: a gain that differs between them is unknown.
@@ -198,7 +198,7 @@ class Certain(NamedTuple):
     exact: bool
     random: bool
 
-    def noise(self, outcome: Outcome, links: Links) -> Float[np.ndarray, "r r"]:
+    def noise(self, outcome: Outcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
         """Covariance of these sums at x = 0, about the mean of their kind."""
         mean, second = second_moments(outcome.map)
         v = np.append(links.sensor_mean, 1.0)
@@ -210,7 +210,7 @@ class Certain(NamedTuple):
         return np.asarray(self.combine @ (total + np.outer(about, about)) @ self.combine.T)
 
 
-def _certain(alike: Sequence[Outcome], links: Links, space: Float[np.ndarray, "n d"]) -> Certain:
+def _certain(alike: Sequence[Outcome], links: JointLinks, space: Float[np.ndarray, "n d"]) -> Certain:
     """Find the sums of known gain: the null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same.
 
     Y is a basis of the subspace `space`.
@@ -244,7 +244,7 @@ def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
 
 
 def _judge_unseen(
-    network: Network, links: Links, growing: np.ndarray, channel: KnownLosses, unseen: Unseen, radius: float
+    network: Network, links: JointLinks, growing: np.ndarray, channel: KnownLosses, unseen: Unseen, radius: float
 ) -> tuple[Verdict, str]:
     """Return "impossible" if an unobserved eigenvector grows and noise keeps exciting it, else "undecided"."""
     if unseen.growth < 1:
@@ -256,7 +256,7 @@ def _judge_unseen(
     return "impossible", reason
 
 
-def _why(links: Links, system: KnownLossSystem, unseen: Unseen) -> str:
+def _why(links: JointLinks, system: KnownLossSystem, unseen: Unseen) -> str:
     value = unseen.eigenvalue
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
     if len(unseen.modes) < len(system.chain):

@@ -28,7 +28,7 @@ from heliograph.simulation.runs.by_run import each_run, read_by, trajectories
 from heliograph.simulation.runs.lanes import (
     BLOCK,
     LANES,
-    Lanes,
+    RunLanes,
     Shared,
     added,
     batch_counts,
@@ -166,7 +166,7 @@ class _Job(Module):
 def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
     """Sums over all runs, and what is collected of them, chunk by chunk."""
     with jax.enable_x64(True):
-        lanes = Lanes(
+        lanes = RunLanes(
             lambda blocks, carry: _lane((job, blocks), carry),
             partial(_all_lanes, job),
             partial(_initial, job),

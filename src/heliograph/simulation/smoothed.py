@@ -20,7 +20,7 @@ from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.fusions import Fused
+from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import FUSED, Claims, Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import (
@@ -42,7 +42,7 @@ class Smoother(Module):
     """
 
     smoothing: AbstractSmoothing
-    fusions: tuple[Fused, ...]
+    fusions: tuple[StackedFusions, ...]
     kinds: tuple[int, ...] = eqx.field(static=True)
     groups: tuple[int, ...] = eqx.field(static=True)
 
@@ -87,7 +87,7 @@ class Smoother(Module):
         return {"estimates": estimates, "fused": {name: near(e, every) for name, e in known["fused"].items()}}
 
 
-def _fuse_at_each_time(fusion: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
+def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
     """Fuse estimates (time, filter, node, ...) at each time."""
     fused: dict[str, Estimate] = jax.vmap(lambda parts: fusion.step((), parts, jnp.asarray(0))[1])(estimates)
     return fused
@@ -106,7 +106,7 @@ def reduce_run(reducer: AbstractReducer[Result], later: Smoother | None, outputs
     )
 
 
-class Part(NamedTuple):
+class SmoothedPart(NamedTuple):
     """Smoothed part of a network: places of its kinds and groups among the network's, and the claims."""
 
     network: Network
@@ -120,7 +120,7 @@ class Part(NamedTuple):
         return Smoother(self.smoothing, filters.fusions, self.kinds, self.groups)
 
 
-def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> Part:
+def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> SmoothedPart:
     """Select the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
 
     Raises:
@@ -148,7 +148,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
         }
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
-    return Part(smoothed, smoothing, kinds, groups, claims)
+    return SmoothedPart(smoothed, smoothing, kinds, groups, claims)
 
 
 def _claim_of_smoother(filter: AbstractFilter) -> Claim:
@@ -181,7 +181,7 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
         warn_of(f"{FUSED}/{name}", np.asarray(sums))
 
 
-def record_of(network: Network, smoothing: Part | None, outputs: PyTree, time: np.ndarray) -> Record:
+def record_of(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, time: np.ndarray) -> Record:
     """Record of a recording, with its smoothed part."""
     if smoothing is None:
         return trajectories_record(network, {"truth": None, **outputs}, time)
@@ -221,7 +221,9 @@ class Recorded(NamedTuple):
     collected: PyTree
 
 
-def finish(reducer: AbstractReducer[Result], recorded: Recorded, network: Network, smoothing: Part | None) -> Result:
+def finish(
+    reducer: AbstractReducer[Result], recorded: Recorded, network: Network, smoothing: SmoothedPart | None
+) -> Result:
     """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
     sums, common, count, collected = recorded
     # Without smoothing the result of the network alone.

@@ -27,7 +27,7 @@ from heliograph.simulation.centres.centre import (
     CentreState,
 )
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
-from heliograph.simulation.centres.fusions import Fused, Reporting, centres_of, fusions_of, sources_of
+from heliograph.simulation.centres.fusions import Reporting, StackedFusions, centres_of, fusions_of, sources_of
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
 from heliograph.simulation.centres.mesh import Mesh, meshes_of
 from heliograph.simulation.centres.uplinks import uplinks_of
@@ -45,7 +45,7 @@ class AllFilters(Module):
     """
 
     alike: tuple[StackedFilters, ...]
-    fusions: tuple[Fused, ...]
+    fusions: tuple[StackedFusions, ...]
     centres: tuple[Centre | LinearisedCentre, ...]
     reporting: dict[str, Reporting]
     meshes: dict[str, Mesh]

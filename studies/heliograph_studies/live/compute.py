@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
-from heliograph.live.plant import Link
+from heliograph.live.plant import LinkCounts
 from heliograph.live.stored.plant_codec import plant_from
 from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.serving.storage.store import Store
@@ -26,7 +26,7 @@ from heliograph_studies.live.mower import PLANT, Drive, network, read_drive
 from heliograph_studies.live.server import Server, find_server
 from heliograph_studies.live.speed import in_memory, many_plants, through
 
-Links = dict[str, Link]  # by node, what the store says that came from it
+Links = dict[str, LinkCounts]  # by node, what the store says that came from it
 
 
 @dataclass(frozen=True)

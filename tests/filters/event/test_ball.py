@@ -7,7 +7,7 @@ import pytest
 
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.event.ball import ball_moments, cut_to_ball
-from heliograph.filters.event.parts import Parts
+from heliograph.filters.event.parts import GaussianSum
 from heliograph.numerics.float64 import compile_in_float64
 
 # One program for each side and number of components, whatever the numbers.
@@ -61,7 +61,7 @@ def test_three_components_are_those_of_draws():
 def test_inside_and_outside_are_the_whole_and_what_is_known_stays():
     random = np.random.default_rng(1)
     law = Gaussian(random.normal(size=(1, 4)), random.normal(size=(1, 6)), random.uniform(0.5, 4, size=(1, 4)))
-    parts = Parts(np.zeros(1), law, np.ones((1, 1, 1)))
+    parts = GaussianSum(np.zeros(1), law, np.ones((1, 1, 1)))
     directions = np.eye(4)[:2] - np.eye(4)[2:]
     near, far = compile_in_float64(lambda r: tuple(cut_to_ball(parts, directions, r, side) for side in (True, False)))(
         1.5
@@ -76,7 +76,7 @@ def test_inside_and_outside_are_the_whole_and_what_is_known_stays():
     whole = np.einsum("s,sij->ij", share, covariances + apart[:, :, None] * apart[:, None])
     np.testing.assert_allclose(whole, law.covariance[0], atol=1e-7)
     still = Gaussian(np.array([[0.5, 0.2, 0.0, 0.0]]), np.zeros((1, 6)), np.zeros((1, 4)))
-    known = Parts(np.zeros(1), still, np.ones((1, 1, 1)))
+    known = GaussianSum(np.zeros(1), still, np.ones((1, 1, 1)))
     known_inside = compile_in_float64(lambda radius: cut_to_ball(known, directions, radius, True))
     assert known_inside(1.0).log_weight[0] == pytest.approx(0, abs=1e-8) and known_inside(0.5).log_weight[0] < -1e3
     np.testing.assert_array_equal(known_inside(1.0).gaussian.mean, still.mean)

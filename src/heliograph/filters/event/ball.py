@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, eliminate, join_columns, nothing
 from heliograph.factors.gaussian import Gaussian, observe, of_columns
-from heliograph.filters.event.parts import CERTAIN, Parts
+from heliograph.filters.event.parts import CERTAIN, GaussianSum
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.lapack import eigh
 
@@ -59,7 +59,7 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     return _join_pieces(BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True))))
 
 
-def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: bool) -> Parts:
+def cut_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
     """Cut each Gaussian to |D x| <= radius, or to where it is more, and take the Gaussian of the same moments.
 
     With Cov(D x) = V diag(s) V', e = V' D x has independent components. Of those that are known to vary, x is given
@@ -84,7 +84,7 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
         return moments.log_mass, of_columns(mean, join_columns(given.columns, spread))
 
     log_mass, after = jax.lax.map(cut_one, parts.gaussian)
-    return Parts(parts.log_weight + log_mass, after, parts.label)
+    return GaussianSum(parts.log_weight + log_mass, after, parts.label)
 
 
 def _cut_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:

@@ -14,10 +14,10 @@ from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian, append_rows, given, leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import cut_to_ball
-from heliograph.filters.event.moments import Link, arriving, augment, condition_parts, pin, predict_jointly
+from heliograph.filters.event.moments import LinkMoments, arriving, augment, condition_parts, pin, predict_jointly
 from heliograph.filters.event.parts import (
     FLOOR,
-    Parts,
+    GaussianSum,
     cut,
     cut_away,
     join,
@@ -68,12 +68,12 @@ class EventBelief(NamedTuple):
         return self.gaussian.covariance
 
     @property
-    def parts(self) -> Parts:
+    def parts(self) -> GaussianSum:
         """The sum, with the logarithms of its weights."""
-        return Parts(safe_log(self.weight), self.gaussian, self.label)
+        return GaussianSum(safe_log(self.weight), self.gaussian, self.label)
 
     @staticmethod
-    def of(parts: Parts, begun: jax.Array, moved: jax.Array) -> "EventBelief":
+    def of(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """The state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
         return EventBelief(jnp.exp(parts.log_weight), *parts.gaussian, parts.label, begun, moved)
 
@@ -134,14 +134,14 @@ class EventFilter(AbstractSizedFilter):
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        prior_sum = Parts(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
+        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
         begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
         return EventBelief.of(self._pad_sum(prior_sum), begun, jnp.asarray(False))
 
-    def _pad_sum(self, one: Parts) -> Parts:
+    def _pad_sum(self, one: GaussianSum) -> GaussianSum:
         """Pad a sum of one Gaussian with others that have no weight."""
         count = self._known_slots + (self.lost if self.follows else 0)
-        every: Parts = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
+        every: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
         return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
 
     @property
@@ -203,26 +203,26 @@ class EventFilter(AbstractSizedFilter):
         return EventBelief.of(parts, begun, state.moved), innovation
 
     def _condition_on_sender(
-        self, wide: Parts, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
-    ) -> tuple[Parts, jax.Array, jax.Array]:
+        self, wide: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+    ) -> tuple[GaussianSum, jax.Array, jax.Array]:
         """Condition on a sender's value or on its silence; return the mean and covariance expected of a value too."""
 
-        def silent(wide: Parts) -> tuple[Parts, jax.Array, jax.Array]:
+        def silent(wide: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
             return (
                 self._condition_on_silence(wide, channel, lost, s, begun),
                 jnp.zeros_like(z),
                 jnp.zeros((len(z), len(z))),
             )
 
-        def came(wide: Parts) -> tuple[Parts, jax.Array, jax.Array]:
+        def came(wide: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
             return self._condition_on_value(wide, channel, z, lost, s, begun)
 
-        used: tuple[Parts, jax.Array, jax.Array] = jax.lax.cond(jnp.any(~jnp.isnan(z)), came, silent, wide)
+        used: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(jnp.any(~jnp.isnan(z)), came, silent, wide)
         return used
 
     def _condition_on_silence(
-        self, wide: Parts, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array
-    ) -> Parts:
+        self, wide: GaussianSum, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array
+    ) -> GaussianSum:
         """Condition the sum on silence: nothing was sent, or it was sent and lost."""
         n, m, sender = len(self.states), self.outputs, self.senders[s]
         as_it_was, label = np.r_[0 : n + m], wide.label[:, s]
@@ -254,8 +254,8 @@ class EventFilter(AbstractSizedFilter):
         return self._or_nothing(together([slots.keep(as_it_was), few]), wide)
 
     def _condition_on_value(
-        self, wide: Parts, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
-    ) -> tuple[Parts, jax.Array, jax.Array]:
+        self, wide: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+    ) -> tuple[GaussianSum, jax.Array, jax.Array]:
         """Condition on a value: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
         # Probability that this pattern of values arrives, by mode.
         sender, arrived = self.senders[s], ~jnp.isnan(z)
@@ -273,7 +273,7 @@ class EventFilter(AbstractSizedFilter):
             only = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
             mode = jnp.argmax(chance > 0) if self.alike else j
             moments = channel.mean, channel.gain_spread, channel.noise
-            links.append(Link(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
+            links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
             before.append(wide.labelled(s, only))
             used.append(condition_parts(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers))
         # Restricted to where the sender had to send.
@@ -285,14 +285,14 @@ class EventFilter(AbstractSizedFilter):
         signals = []
         for sent, link in zip(map(join, by_mode[count:]), links, strict=True):
             received = arriving(sent.gaussian, link, sender, self.outputs)
-            signals.append(Parts(sent.log_weight, received, jnp.zeros((1, 1))))
+            signals.append(GaussianSum(sent.log_weight, received, jnp.zeros((1, 1))))
         # One sum again, with a new reference.
         whole = join(together(by_mode[:count]).keep(self._find_new_reference(sender)))
         whole = whole.labelled(s, _relabel_sent(whole.label[:, s], False))
         signal = join(together(signals)).gaussian
         return self._pad_sum(whole), signal.mean[0], signal.covariance[0]
 
-    def _select_sent(self, used: Parts, s: int, begun: jax.Array) -> Parts:
+    def _select_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
         """Select where the sender had to send, all Gaussians time after time: outside, or anywhere if it was due."""
         waiting, due = self._label_sending(used.label[:, s], begun)
         event = used.labelled(s, waiting)
@@ -330,7 +330,7 @@ class EventFilter(AbstractSizedFilter):
         unit = jnp.eye(n + 2 * m)
         return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
 
-    def _cut_to_region(self, parts: Parts, others: Parts, sender: slice) -> tuple[Parts, Parts]:
+    def _cut_to_region(self, parts: GaussianSum, others: GaussianSum, sender: slice) -> tuple[GaussianSum, GaussianSum]:
         """Cut to the region: `parts` to each part of its first component's interval, joined; `others` to all of it."""
         (direction, delta), *rest = self._errors(sender)
         size, edges = len(parts.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
@@ -348,7 +348,7 @@ class EventFilter(AbstractSizedFilter):
         count = size * self.known
         return join(every.some(0, count), self.known), every.some(count)
 
-    def _cut_to_outside(self, parts: Parts, sender: slice, scale: float) -> Parts:
+    def _cut_to_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
         """Cut to what is outside, all one time after the other, `_outside` times.
 
         The first component that is, above or below, those before it inside; of a ball these are what is outside of the
@@ -362,16 +362,16 @@ class EventFilter(AbstractSizedFilter):
                 parts = cut(parts, direction, -edge, edge)
         return together([*outside, self._cut_to_ball(parts, sender, scale, False)] if self.ball else outside)
 
-    def _cut_to_ball(self, parts: Parts, sender: slice, scale: float, inside: bool) -> Parts:
+    def _cut_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
         directions, deltas = zip(*self._errors(sender), strict=True)
         return cut_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
 
-    def _or_nothing(self, parts: Parts, before: Parts) -> Parts:
+    def _or_nothing(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
         """Return the sum, or where the rule forbids what came the sum before, with a floor as its likelihood."""
         stays = before.keep(np.arange(parts.gaussian.mean.shape[1]))
         stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
         forbidden = ~jnp.isfinite(log_total(parts.log_weight))
-        either: Parts = jax.tree.map(lambda x, y: jnp.where(forbidden, x, y), stays, parts)
+        either: GaussianSum = jax.tree.map(lambda x, y: jnp.where(forbidden, x, y), stays, parts)
         return either
 
     @estimates

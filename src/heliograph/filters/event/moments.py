@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, below_diagonal, join_columns, outer, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns
-from heliograph.filters.event.parts import Parts
+from heliograph.filters.event.parts import GaussianSum
 from heliograph.filters.gaussian.belief import image_of, process_noise
 from heliograph.filters.gaussian.signal import gain_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
@@ -16,23 +16,23 @@ from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 
 
-class Link(NamedTuple):
+class LinkMoments(NamedTuple):
     """Moments of z = G y + n: E[(G, n)] (m, p + 1), spread of the gain and noise as in `SecondOrder`."""
 
     mean: jax.Array
     gain_spread: jax.Array
     noise: Columns
 
-    def of_sender(self, sender: slice, m: int) -> "Link":
+    def of_sender(self, sender: slice, m: int) -> "LinkMoments":
         """Take the outputs that carry a sender's components: all, unless each component has its own sender."""
         rows = slice(None) if sender == slice(0, m) else sender
         noise = Columns(self.noise.matrix[rows], self.noise.weights)
-        return Link(self.mean[rows], self.gain_spread[rows, rows], noise)
+        return LinkMoments(self.mean[rows], self.gain_spread[rows, rows], noise)
 
 
 def augment(
-    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: Parts, start: jax.Array
-) -> Parts:
+    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: GaussianSum, start: jax.Array
+) -> GaussianSum:
     """Augment each Gaussian of (x, r) by y = h(x) + v; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
 
@@ -66,14 +66,14 @@ def pin(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
 
 
 def condition_parts(
-    parts: Parts,
+    parts: GaussianSum,
     z: jax.Array,
     arrived: jax.Array,
-    link: Link,
+    link: LinkMoments,
     sender: slice,
     m: int,
     delivers: bool,
-) -> Parts:
+) -> GaussianSum:
     """Condition each Gaussian of (x, r, y) on z = G y + n, and weigh it by its density."""
     size = parts.gaussian.mean.shape[1]
 
@@ -85,10 +85,10 @@ def condition_parts(
         return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
 
     after, density = jax.vmap(update_one)(parts.gaussian)
-    return Parts(parts.log_weight + density, after, parts.label)
+    return GaussianSum(parts.log_weight + density, after, parts.label)
 
 
-def arriving(x: Gaussian, link: Link, sender: slice, m: int) -> Gaussian:
+def arriving(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:
     """Return the law of z = G y + n of each Gaussian of (x, r, y)."""
 
     def receive_one(x: Gaussian) -> Gaussian:
@@ -99,7 +99,7 @@ def arriving(x: Gaussian, link: Link, sender: slice, m: int) -> Gaussian:
     return received
 
 
-def _transform_by_link(x: Gaussian, link: Link, m: int) -> tuple[jax.Array, jax.Array, Columns]:
+def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, Columns]:
     """Return E z, slopes and noise of z = G y + n, y the last m components."""
     centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
     second = Columns(rows, x.variances).covariance + outer(centre, centre)

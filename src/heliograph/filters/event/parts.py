@@ -18,7 +18,7 @@ FLOOR = 1e-6  # probability of what the rule forbids
 CERTAIN = 1e-24  # a variance below this share of its mean square and of the interval's is rounding
 
 
-class Parts(NamedTuple):
+class GaussianSum(NamedTuple):
     """Gaussians of a sum, with what is known of the sender in each.
 
     log_weight (K,), gaussian of N components with a leading axis K, label (K, senders, ...): probabilities of each
@@ -29,7 +29,7 @@ class Parts(NamedTuple):
     gaussian: Gaussian
     label: Float[jax.Array, "K senders ..."]
 
-    def labelled(self, s: int, label: jax.Array) -> "Parts":
+    def labelled(self, s: int, label: jax.Array) -> "GaussianSum":
         """Relabel sender s with (K, ...) whose sum is no longer 1: the sum goes into the weight."""
         shape = (-1, *[1] * (label.ndim - 1))
         total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
@@ -37,16 +37,16 @@ class Parts(NamedTuple):
         share = jnp.where((total > 0).reshape(shape), share, self.label[:, s])
         return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(share))
 
-    def times(self, log_factor: Array | float) -> "Parts":
+    def times(self, log_factor: Array | float) -> "GaussianSum":
         """Multiply the weights by a factor."""
         return self._replace(log_weight=self.log_weight + log_factor)
 
-    def some(self, first: int, stop: int | None = None) -> "Parts":
+    def some(self, first: int, stop: int | None = None) -> "GaussianSum":
         """Take some of the Gaussians."""
-        few: Parts = jax.tree.map(lambda leaf: leaf[first:stop], self)
+        few: GaussianSum = jax.tree.map(lambda leaf: leaf[first:stop], self)
         return few
 
-    def keep(self, places: np.ndarray) -> "Parts":
+    def keep(self, places: np.ndarray) -> "GaussianSum":
         """Keep some components of the Gaussians, in the order of `places`."""
         if np.array_equal(places, np.arange(len(places))):
             return self._replace(gaussian=leading(self.gaussian, len(places)))
@@ -69,14 +69,14 @@ def log_total(log_weight: jax.Array) -> jax.Array:
     return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
 
 
-def together(parts: Sequence[Parts]) -> Parts:
+def together(parts: Sequence[GaussianSum]) -> GaussianSum:
     """Put several sums together as one."""
-    every: Parts = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    every: GaussianSum = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return every
 
 
 @jax.jit
-def cut(parts: Parts, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> Parts:
+def cut(parts: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
     """Cut each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
     row, variance = _component(parts, direction)
     ends = [jnp.broadcast_to(end, variance.shape) for end in (lower, upper)]
@@ -84,7 +84,7 @@ def cut(parts: Parts, direction: jax.Array, lower: jax.Array, upper: jax.Array) 
 
 
 @jax.jit
-def cut_away(parts: Parts, direction: jax.Array, edge: jax.Array) -> Parts:
+def cut_away(parts: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
     """Cut each Gaussian to d'x >= edge, and after all these each to d'x <= -edge, (2 K,)."""
     row, variance = _component(parts, direction)
     centre, edges = parts.gaussian.mean @ direction, jnp.full(2 * len(variance), edge)
@@ -92,13 +92,15 @@ def cut_away(parts: Parts, direction: jax.Array, edge: jax.Array) -> Parts:
     return _cut(together([parts, parts]), centre, row, jnp.tile(variance, 2), [edges])
 
 
-def _component(parts: Parts, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _component(parts: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The row f (K, N) of d'x = d'm + f xi, and its variance (K,)."""
     row = direction @ parts.gaussian.root
     return row, jnp.sum(row**2 * parts.gaussian.variances, axis=1)
 
 
-def _cut(parts: Parts, centre: jax.Array, row: jax.Array, variance: jax.Array, ends: Sequence[jax.Array]) -> Parts:
+def _cut(
+    parts: GaussianSum, centre: jax.Array, row: jax.Array, variance: jax.Array, ends: Sequence[jax.Array]
+) -> GaussianSum:
     """Cut the Gaussians to where d'x = centre + row xi is above the first end, and below the second if there is one.
 
     With S the variance of d'x and mu, v the moments of a standard normal number that is cut: d'x moves by sqrt(S) mu
@@ -116,29 +118,29 @@ def _cut(parts: Parts, centre: jax.Array, row: jax.Array, variance: jax.Array, e
     shift = deviation * jnp.where(changes, moments.mean, 0.0)
     ratio = jnp.where(changes, moments.variance, 1.0)
     after = jax.vmap(revise)(parts.gaussian, jnp.where(changes[:, None], row, 0.0), shift, ratio)
-    return Parts(parts.log_weight + log_mass, after, parts.label)
+    return GaussianSum(parts.log_weight + log_mass, after, parts.label)
 
 
-def join(parts: Parts, groups: int = 1) -> Parts:
+def join(parts: GaussianSum, groups: int = 1) -> GaussianSum:
     """Join the sum into one Gaussian of its moments, (1, ...), or each of so many groups of as many Gaussians."""
-    few: Parts = _join(parts, groups)
+    few: GaussianSum = _join(parts, groups)
     return few
 
 
 @partial(jax.jit, static_argnames="groups")
-def _join(parts: Parts, groups: int) -> Parts:
-    def joined(parts: Parts) -> Parts:
+def _join(parts: GaussianSum, groups: int) -> GaussianSum:
+    def joined(parts: GaussianSum) -> GaussianSum:
         total = log_total(parts.log_weight)
         share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
-        return Parts(total, merge(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
+        return GaussianSum(total, merge(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
 
     size = len(parts.log_weight) // groups
-    few: Parts = jax.vmap(joined)(jax.tree.map(lambda leaf: leaf.reshape(groups, size, *leaf.shape[1:]), parts))
+    few: GaussianSum = jax.vmap(joined)(jax.tree.map(lambda leaf: leaf.reshape(groups, size, *leaf.shape[1:]), parts))
     return few
 
 
-def reduce_parts(parts: Parts, count: int, places: slice) -> Parts:
+def reduce_parts(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
     """Reduce to at most `count` Gaussians: pairs that are nearest in the components `places` are joined first.
 
     The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.
@@ -149,7 +151,7 @@ def reduce_parts(parts: Parts, count: int, places: slice) -> Parts:
 
 
 @partial(jax.jit, static_argnames="ends")
-def _one_fewer(parts: Parts, ends: tuple[int, int]) -> Parts:
+def _one_fewer(parts: GaussianSum, ends: tuple[int, int]) -> GaussianSum:
     """Join the pair of least cost; it takes the place of its first, the last Gaussian that of its second."""
     size, places = len(parts.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))
@@ -174,5 +176,5 @@ def _one_fewer(parts: Parts, ends: tuple[int, int]) -> Parts:
         moved = jnp.where(is_second.reshape(shape), values[-1:], values)
         return jnp.where(is_first.reshape(shape), new, moved)[:-1]
 
-    fewer: Parts = jax.tree.map(placed, parts, merged)
+    fewer: GaussianSum = jax.tree.map(placed, parts, merged)
     return fewer

@@ -11,7 +11,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, eliminate, join_columns
 from heliograph.factors.gaussian import Gaussian, given, observe, of_columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
+from heliograph.filters.event.parts import FLOOR, GaussianSum, join, safe_log, together
 from heliograph.filters.gaussian.belief import predict_gaussian, smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
@@ -111,7 +111,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         modes = len(state.law)
         sent = repeat(signal, modes)
         posteriors, weight, innovation = receive(sent, channel, jnp.arange(modes), state.law, values)
-        came = join(Parts(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
+        came = join(GaussianSum(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
         # Nothing: silence, or a link that is down.
         log_silent, quiet = self._condition_on_silence(prior, signal, state.reference, k)
         nothing = self._condition_on_nothing(prior, _sum_of_one(log_silent, quiet, state.law), state.law, channel, down)
@@ -141,8 +141,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         return following, Innovation(value, covariance, total)
 
     def _condition_on_nothing(
-        self, prior: Gaussian, silent: Parts, law: jax.Array, channel: SideInformation, down: jax.Array
-    ) -> Parts:
+        self, prior: Gaussian, silent: GaussianSum, law: jax.Array, channel: SideInformation, down: jax.Array
+    ) -> GaussianSum:
         """Condition on nothing that came: the sender was silent, or the link was down, and the prior stays."""
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
         parts = [silent.labelled(0, law[None] * (1 - lost))]
@@ -228,6 +228,6 @@ class StochasticEventFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self, step, first(self.plant))
 
 
-def _sum_of_one(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> Parts:
-    alone: Parts = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], Parts(log_weight, belief, law[None]))
+def _sum_of_one(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> GaussianSum:
+    alone: GaussianSum = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], GaussianSum(log_weight, belief, law[None]))
     return alone

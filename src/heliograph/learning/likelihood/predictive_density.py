@@ -156,10 +156,10 @@ def predictive(
     z = rows("measurements", measurements, None, filter.received, missing=True)
     u = rows("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False)
     y, spread, near = expect_signals(filter, z, u)
-    return score_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), Parts.of(received, nodes))
+    return score_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), StackDensities.of(received, nodes))
 
 
-class Part(NamedTuple):
+class StackDensity(NamedTuple):
     """Part of a stack as arrays over the combinations of its gains and noises.
 
     Shapes: log_weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
@@ -171,20 +171,20 @@ class Part(NamedTuple):
     noise: np.ndarray
 
 
-class Parts(tuple[Part, ...]):
+class StackDensities(tuple[StackDensity, ...]):
     """Parts of a channel, from the first output to the last."""
 
     @staticmethod
-    def of(channel: AbstractRandomAffine, nodes: int) -> "Parts":
+    def of(channel: AbstractRandomAffine, nodes: int) -> "StackDensities":
         """Combinations of each part of a stack, of everything else as a whole."""
         parts = channel.maps if isinstance(channel, Stack) else (channel,)
-        return Parts(_part(atoms_of(discretise_laws(affine, nodes))) for affine in parts)
+        return StackDensities(_part(atoms_of(discretise_laws(affine, nodes))) for affine in parts)
 
 
-def _part(components: list[Component]) -> Part:
+def _part(components: list[Component]) -> StackDensity:
     possible = [component for component in components if component.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
-    return Part(np.log(weight), gain, offset, noise)
+    return StackDensity(np.log(weight), gain, offset, noise)
 
 
 @compile_in_float64
@@ -206,7 +206,7 @@ def expect_signals(
     return signals[0], signals[1], signals[2]
 
 
-def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts) -> Predictive:
+def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: StackDensities) -> Predictive:
     """Densities and pits of z (steps, m), from the moments (steps, p) and (steps, p, p) of the signals before each."""
     y, spread, z = expected
     blocks = [
@@ -215,7 +215,7 @@ def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Pa
     return Predictive(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 
-def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tuple[np.ndarray, np.ndarray]:
+def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: StackDensities) -> tuple[np.ndarray, np.ndarray]:
     total, pits, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
@@ -234,7 +234,7 @@ def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tu
 
 
 def _weigh_combinations(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackDensity
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log-weights of the combinations before each component and after the last (t, a, m + 1), L^-1 (z - E z), and L."""
     there = ~np.isnan(z)[:, None]
@@ -253,7 +253,13 @@ def _weigh_combinations(
 
 
 def _correct_signal(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part, weight: np.ndarray, error: np.ndarray, root: np.ndarray
+    y: np.ndarray,
+    spread: np.ndarray,
+    z: np.ndarray,
+    law: StackDensity,
+    weight: np.ndarray,
+    error: np.ndarray,
+    root: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moments of the signal given these components too: those of the mixture over its combinations, weight (t, a)."""
     there = ~np.isnan(z)[:, None, :, None]

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.leap import Leap
-from heliograph.live.plant import Kept, Link, Plant
+from heliograph.live.plant import Kept, LinkCounts, PlantState
 from heliograph.live.rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
@@ -59,7 +59,7 @@ class PlantParts(NamedTuple):
         return PlantParts(head, *arrays)
 
 
-def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
+def plant_bytes(plant: PlantState, fleet: Fleet) -> bytes:
     """Serialise a plant that has no pending changes."""
     rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
     origin = None if plant.origin is None else plant.origin.isoformat()
@@ -107,7 +107,7 @@ def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarra
     return array, at + len(bits) + values.nbytes
 
 
-def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
+def plant_from(name: str, data: bytes, fleet: Fleet) -> PlantState:
     """Restore a plant from bytes, with its rows in slots of the fleet's table."""
     head, keys, events, table, times, values = PlantParts.of(data, fleet.pool.table.shape[1])
     # Rows, each in a new slot; then their events.
@@ -121,10 +121,10 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
     kept = None if before is None else Kept(rows.pop(0), before)
     held = fleet.rows(rows[0])
     held.hold(rows)
-    links = {node: Link(*numbers) for node, numbers in head["links"].items()}
+    links = {node: LinkCounts(*numbers) for node, numbers in head["links"].items()}
     origin = head["origin"] and datetime.fromisoformat(head["origin"])
     leap = None if head["leap"] is None else _leap(head["leap"])
-    return Plant(name, held, head["now"], origin, forced=head["forced"], links=links, leap=leap, kept=kept)
+    return PlantState(name, held, head["now"], origin, forced=head["forced"], links=links, leap=leap, kept=kept)
 
 
 def _leap_parts(leap: Leap) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import homogeneous
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import Linearised, LinearStep, is_linear_filter, linear_step
-from heliograph.fusion.all_reports import Knowledge, begin, estimate_state, propagate_errors, receive_reports
+from heliograph.fusion.all_reports import ReportsBelief, begin, estimate_state, propagate_errors, receive_reports
 from heliograph.fusion.cross_covariance import (
     Errors,
     ErrorStep,
@@ -27,7 +27,7 @@ from heliograph.fusion.cross_covariance import (
     propagate_state,
 )
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
-from heliograph.fusion.report_link import Links
+from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper, weakest
@@ -324,7 +324,7 @@ class CentreBelief(NamedTuple):
 
     nodes: PyTree
     errors: Errors
-    known: Knowledge
+    known: ReportsBelief
 
 
 class CentreFilter(AbstractSizedFilter):
@@ -336,7 +336,7 @@ class CentreFilter(AbstractSizedFilter):
     """
 
     filters: NodesFilters
-    links: Links | OverTime
+    links: ReportModel | OverTime
     rows: tuple[int, ...] = eqx.field(static=True)
     ages: int = eqx.field(static=True)
     widest: int = eqx.field(static=True)

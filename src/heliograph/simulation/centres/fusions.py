@@ -31,7 +31,7 @@ from heliograph.simulation.node import Node
 from heliograph.simulation.side_by_side import initial_state, map_all
 
 
-class Fused(Module):
+class StackedFusions(Module):
     """Fusions that differ in numbers alone, stacked: rules, and the quantizers on the estimates' way (fusion, node).
 
     `sources` of each fusion: kind and filter of the estimates that it fuses, one group after another; `order` of each
@@ -113,7 +113,7 @@ class Reporting(Module):
         return (flying, known), estimate, traffic, (sent, drawn.delay)
 
 
-def fusions_of(network: Network) -> tuple[Fused, ...]:
+def fusions_of(network: Network) -> tuple[StackedFusions, ...]:
     """Fusions of the network, those of one structure stacked."""
     alike: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
@@ -126,7 +126,7 @@ def fusions_of(network: Network) -> tuple[Fused, ...]:
 
 def _stack_fusions(
     network: Network, names: Sequence[str], places: Mapping[tuple[str, str], tuple[int, int, int]], claims: list[Claim]
-) -> Fused:
+) -> StackedFusions:
     """Stack fusions of one structure, with the places of the estimates that they fuse."""
     fusions = [fusion for fusion in (network.fused[name] for name in names) if isinstance(fusion, Fusion)]
     nodes = [network.nodes_with(fusion.filter) for fusion in fusions]
@@ -140,7 +140,7 @@ def _stack_fusions(
     quantizers = stack([fusion.uplinks(mine) for fusion, mine in zip(fusions, nodes, strict=True)])
     rules = stack([fusion.rule for fusion in fusions])
     angles = first(network.plant).angles
-    return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims), angles)
+    return StackedFusions(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims), angles)
 
 
 def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import Linearised, linearise_step
-from heliograph.fusion.all_reports import AllReports, Knowledge
+from heliograph.fusion.all_reports import AllReports, ReportsBelief
 from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, advance, initial_errors
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.model.estimate import Claim, Estimate
@@ -90,7 +90,7 @@ def _make_shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> Er
     return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)
 
 
-def _drift(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:
+def _drift(state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:
     """F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
     nodes, n, _ = keep.shape
     before = state.mean[n:].reshape(nodes, n)

@@ -63,7 +63,7 @@ class Data(NamedTuple):
     complete: Float[jax.Array, "node n n"]
 
 
-class Parts(NamedTuple):
+class MeshStep(NamedTuple):
     """One step of all nodes without the estimates, which enter none of it.
 
     exchanges: weights of every round but the last. Shapes: information (node, n, n) that each node has
@@ -192,7 +192,7 @@ class Mesh(Module):
         self, covariance: Float[Array, "node n n"], blocks: Float[Array, "node degree n degree n"] | None,
         moments: tuple[Array, Array], there: Bool[Array, "node m"], arrived: Arrived, u: Array, k: Array,
         ahead: Ahead = (), messages: Messages | None = None,
-    ) -> Parts:  # fmt: skip
+    ) -> MeshStep:  # fmt: skip
         """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
         covariance, there, arrived, u = (jnp.asarray(x) for x in (covariance, there, arrived, u))
         held = None if blocks is None else jnp.asarray(blocks)
@@ -212,7 +212,7 @@ class Mesh(Module):
         if messages is not None:
             covariance, senders, arrives = messages.covariance, messages.senders, messages.arrives[:, -1]
         gains = self.gains(covariance, held, arrives, motion, information, complete, ahead, senders)
-        return Parts(motion, after, tuple(exchanges), data, information, gains)
+        return MeshStep(motion, after, tuple(exchanges), data, information, gains)
 
     def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
         """Measurements of a group, filled with NaN up to the longest."""
@@ -306,7 +306,9 @@ class Mesh(Module):
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
 
-    def _propagate_joint(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
+    def _propagate_joint(
+        self, joint: jax.Array, parts: MeshStep, present: jax.Array
+    ) -> Float[jax.Array, "node n node n"]:
         """Joint covariance after a step."""
         gains, motion, size = parts.gains, parts.motion, joint.shape[0] * joint.shape[1]
         measured = used(gains.gain, present)

@@ -20,7 +20,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.centres.edges import Edges
-from heliograph.simulation.centres.mesh import Mesh, Parts, mesh_of
+from heliograph.simulation.centres.mesh import Mesh, MeshStep, mesh_of
 from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.network import Network
 
@@ -151,12 +151,12 @@ def errors_over_time(
 def _parts(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
-) -> Parts:  # fmt: skip
+) -> MeshStep:  # fmt: skip
     there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     return mesh.parts(covariance, blocks, moments, there, arrived, u, k)
 
 
-def propagate(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> np.ndarray:
+def propagate(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np.ndarray) -> np.ndarray:
     """Joint covariance (N, N) after a step."""
     gains, present, senders = parts.gains, mesh.edges.present, mesh.senders
     # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).
@@ -200,7 +200,7 @@ def best_possible(
     u = inputs_of(network, inputs, len(flags))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
-        steps: list[Parts] = []
+        steps: list[MeshStep] = []
         moments = start.plant
         for k, u_k in enumerate(u):
             steps.append(to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k))))
@@ -223,7 +223,7 @@ def best_possible(
 
 
 @quickly_compiled
-def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> Parts:
+def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> MeshStep:
     """Parts of a step at which everything arrives, for the models of plant and measurements in it."""
     lossless = mesh.edges.lossless()
     there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)

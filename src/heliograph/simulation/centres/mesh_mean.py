@@ -26,7 +26,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.edges import arrival_chance, edge_links
-from heliograph.simulation.centres.mesh import Mesh, Parts, Rows
+from heliograph.simulation.centres.mesh import Mesh, MeshStep, Rows
 from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.centres.mesh_errors import MeshErrors, mesh_named, models
 from heliograph.simulation.network import Network
@@ -102,7 +102,7 @@ def mean_mesh_errors(
 
 
 @quickly_compiled
-def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: Parts) -> Gains:
+def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: MeshStep) -> Gains:
     information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]
     held = jnp.asarray(blocks)[patterns.node]
@@ -111,7 +111,7 @@ def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Pat
 
 
 def _mean(
-    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: Gains, step: Parts
+    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: Gains, step: MeshStep
 ) -> np.ndarray:
     """Joint covariance (N, N) after a step."""
     count, degree = mesh.senders.shape

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.quantizer import AbstractQuantizer
-from heliograph.fusion.report_link import Links
+from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.over_time import OverTime, at, over_time, stack
@@ -63,7 +63,7 @@ class Uplinks(Module):
 
     groups: tuple[ChannelGroup, ...]
     quantizers: AbstractQuantizer | None
-    links: Links | OverTime
+    links: ReportModel | OverTime
     delay: np.ndarray
     every: np.ndarray
     received: tuple[int, ...] = eqx.field(static=True)  # numbers that arrive of each node's report
@@ -203,7 +203,7 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
 
 def _model_links(
     known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
-) -> Links | OverTime:
+) -> ReportModel | OverTime:
     """Model of the uplinks for a centre, at each step if any varies."""
     varying = [link.steps for link in known if isinstance(link, OverTime)]
     if not varying:
@@ -211,12 +211,12 @@ def _model_links(
     return over_time([_links([at(link, k) for link in known], received, error) for k in range(min(varying))])
 
 
-def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> Links:
+def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
     more = [(0, max(received) - size) for size in received]
     gain = np.stack([np.pad(link.mean_gain, (a, (0, 0))) for link, a in zip(known, more, strict=True)])
     offset = np.stack([np.pad(link.offset, a) for link, a in zip(known, more, strict=True)])
     spread = [np.pad(link.nominal.center, (a, a, (0, 0), (0, 0))) for link, a in zip(known, more, strict=True)]
-    return Links(gain, offset, np.stack(spread), error)
+    return ReportModel(gain, offset, np.stack(spread), error)
 
 
 @readable

@@ -29,24 +29,24 @@ NAMED = 3  # of many nodes that are alike, how many are named
 ARROW, DIRECT = " → ", "direct"
 
 
-class Part(NamedTuple):
+class DiagramLine(NamedTuple):
     """One line of a diagram: what it is of, and what it is."""
 
     name: str
     words: str
 
 
-def diagram(network: HasNodes) -> list[Part]:
+def diagram(network: HasNodes) -> list[DiagramLine]:
     """Return the parts of a network in the order in which data flow."""
     plant = first(network.plant)
     inputs = f"; inputs {', '.join(network.inputs)}" if network.inputs else ""
-    parts = [Part("plant", f"{type(plant).__name__} of {', '.join(network.states)}{inputs}")]
+    parts = [DiagramLine("plant", f"{type(plant).__name__} of {', '.join(network.states)}{inputs}")]
     claims = claims_in_words(network)
     # Nodes that are alike share a line.
     alike: dict[str, list[str]] = {}
     for name in network.names:
         alike.setdefault(_node(network, name, claims[name]), []).append(name)
-    parts += [Part(join_names(names), words) for words, names in alike.items()]
+    parts += [DiagramLine(join_names(names), words) for words, names in alike.items()]
     # Fused estimates, then what several nodes share.
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
@@ -55,10 +55,10 @@ def diagram(network: HasNodes) -> list[Part]:
             words = (
                 f"{type(fusion.rule).__name__} of {fusion.filter!r} of {join_names(network.nodes_with(fusion.filter))}"
             )
-        parts.append(Part(f"fused {name}", f"{words} ({claims[FUSED][name]})"))
-    parts += [Part("shared", words) for words in list_shared(network)]
-    parts += [Part("digits", words) for words in list_rounded(network)]
-    return [Part(visible(line.name), visible(line.words)) for line in parts]
+        parts.append(DiagramLine(f"fused {name}", f"{words} ({claims[FUSED][name]})"))
+    parts += [DiagramLine("shared", words) for words in list_shared(network)]
+    parts += [DiagramLine("digits", words) for words in list_rounded(network)]
+    return [DiagramLine(visible(line.name), visible(line.words)) for line in parts]
 
 
 def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:

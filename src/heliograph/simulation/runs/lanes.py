@@ -31,7 +31,7 @@ def one_processor() -> bool:
     return len(jax.devices()) == 1 and jax.default_backend() == "cpu"
 
 
-class Lanes:
+class RunLanes:
     """Carries of all lanes, and their advance over the blocks of a chunk.
 
     `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.

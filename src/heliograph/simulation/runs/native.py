@@ -24,7 +24,7 @@ from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Resul
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import BLOCK, LANES, Progress, batch_counts, in_chunks
 from heliograph.simulation.runs.memory import Needed, check_memory
-from heliograph.simulation.smoothed import Part, Recorded, Smoother, finish, reduce_run
+from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
@@ -198,7 +198,7 @@ def natively(
     runs: int,
     chunk: int,
     progress: Progress | None,
-    smoothing: Part | None = None,
+    smoothing: SmoothedPart | None = None,
 ) -> Result | None:
     """Simulate a network by native code and reduce its runs; a part of it is smoothed.
 
@@ -249,7 +249,7 @@ def _code(
     key: jax.Array,
     reducer: AbstractReducer[Any],
     runs: int,
-    smoothing: Part | None = None,
+    smoothing: SmoothedPart | None = None,
     parts: int = 1,
 ) -> Native:
     filters = AllFilters(network, smoothing and smoothing.kinds)
