@@ -49,7 +49,8 @@ def kalman(times, values):
     m, p, before = 20.0, 1.0, times[0]
     for t, y in zip(times, values, strict=True):
         p, before = p + 1e-4 * (t - before), t
-        gain = p / (p + 0.04)
+        gain = 0.0 if np.isnan(y) else p / (p + 0.04)
+        y = m if np.isnan(y) else y  # did not arrive
         m, p = m + gain * (y - m), p - gain * p
     return m, np.sqrt(p)
 
@@ -196,7 +197,7 @@ def test_counts_of_devices_are_absent_at_0_wrap_and_begin_again(folder, capsys, 
     agrees(table, [0, 60, 120, 180], [20.0, 20.1, 20.2, 20.3])
     assert "a, a: 4 used, 1 duplicate, 3 lost" in out and "expected a number" in err
     out, _, table = run(folder, capsys, "up.jsonl", "\n".join(UPLINKS), source, "--plant", "b")
-    assert "b, a: 3 used, 1 lost" in out and len(table["x"]) == 3
+    assert "b, a: 2 used, 1 without a value, 1 lost" in out and len(table["x"]) == 3
     finals = [p for p in served(folder, UPLINKS) if p["kind"] == "final"]
     assert [p["plant"] for p in finals].count("a") == 4 and [p["plant"] for p in finals].count("b") == 3
 
@@ -280,6 +281,18 @@ def test_a_zero_among_dates_was_not_set(folder, capsys):
     out, err, table = run(folder, capsys, "log.jsonl", text, '{"log.jsonl": field("v", node="a", time="at")}')
     agrees(table, [0, 60], [20.1, 20.2])
     assert "expected a time that was set" in err and "2 used" in out
+
+
+def test_a_message_without_a_value_is_not_counted_as_used(folder, capsys):
+    """Of our own form and of a table that is mapped: its moment is a row, and its value did not arrive."""
+    rows = ["a,0,0,20.1", "a,1,60,", "a,2,120,20.2"]
+    own = "node,sequence,time,y\n" + "\n".join(rows)
+    out, _, table = run(folder, capsys, "events.csv", own)
+    agrees(table, [0, 60, 120], [20.1, np.nan, 20.2])
+    assert "a: 2 used, 1 without a value\n" in out  # and none is lost
+    mapped = "n,t,v\n" + "\n".join(row.removeprefix("a,") for row in rows)
+    source = '{"log.csv": field("v", node="a", time="t", sequence="n")}'
+    assert "a: 2 used, 1 without a value\n" in run(folder, capsys, "log.csv", mapped, source)[0]
 
 
 def test_the_option_for_messages_that_come_late(folder, capsys):

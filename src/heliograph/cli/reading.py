@@ -152,10 +152,11 @@ def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -
     import numpy as np
 
     window, ahead = options.limits
-    counts, lost = events.judge(window, ahead)
+    (counts, lost), absent = events.judge(window, ahead), events.count_absent(window, ahead)
     lines = []
     for node, verdicts in counts.items():
-        said = [f"{count} {verdict}" for verdict, count in verdicts.items() if count]
+        numbers = verdicts | {"used": verdicts["used"] - absent[node], "without a value": absent[node]}
+        said = [f"{count} {verdict}" for verdict, count in numbers.items() if count]
         said += [f"{lost[node]} lost"] if lost.get(node) else []
         lines.append(f"{plant + ', ' if plant else ''}{node}: {', '.join(said)}")
     recording, rows = events.rows(window, ahead)

@@ -11,6 +11,8 @@ from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.plant import GAP
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Bool, Float, Int
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 
 SECOND = 10**9  # nanoseconds
 YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
@@ -197,3 +199,18 @@ def _base(events: Events, rank: Int[np.ndarray, " events"], window: float) -> In
     newest = np.full(count + 1, -1)
     np.maximum.at(newest, final, rank)
     return np.maximum.accumulate(newest[:count])
+
+
+def counts_losses(network: Network, name: str) -> bool:
+    """Return whether the last number that a node receives is how many transmissions were lost before its values."""
+    node = network.nodes[name]
+    if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
+        return False
+    return node.trigger.side_information(len(node.outputs)) == 1
+
+
+def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
+    """Fill what is missing with the value before it, 0 before the first."""
+    rows = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])
+    last = np.maximum.accumulate(rows, axis=0) if len(values) else rows
+    return np.asarray(np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0)))

@@ -11,6 +11,8 @@ from heliograph.files.event_columns import (
     Events,
     count_gaps,
     count_verdicts,
+    counts_losses,
+    fill_forward,
     judge,
     order_within,
 )
@@ -23,7 +25,6 @@ from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Node
 
 NONE = np.iinfo(np.int64).min  # of many readings: the one that has no time
 MOST_STEPS = 10_000_000  # rows of a network that counts steps
@@ -268,6 +269,20 @@ class EventTable:
                 gaps[name] = count_gaps(mine.time, mine.sequence, columns.period)
         return counts, gaps
 
+    def count_absent(self, window: float = np.inf, ahead: float = AHEAD) -> dict[str, int]:
+        """Count by node the events that a timeline uses and that have no value, only a time.
+
+        Args:
+            window: how late an event may be, in seconds or steps (default any).
+            ahead: how much later than its arrival the time of an event may be (default a tenth of a second).
+        """
+        events, verdicts = self._judge_events(window, ahead)
+        counts = {}
+        for node, (name, matrix) in enumerate(zip((*self.network.names, INPUTS), self._matrices(), strict=True)):
+            used = events.place[(events.node == (-1 if name == INPUTS else node)) & (verdicts == USED)]
+            counts[name] = int(np.sum(np.isnan(matrix[used]).all(axis=1)))
+        return counts
+
     def recording(self, window: float = np.inf, ahead: float = AHEAD) -> Recording:
         """Return the events that a timeline uses as rows in order of their times; a repeated event counts once.
 
@@ -318,7 +333,7 @@ class EventTable:
             tables.append(table)
         for n, name in enumerate(self.network.names):
             self._fill_losses(name, tables[n], row, events, n)
-        inputs = self._inputs(_fill_forward(tables.pop()), times)
+        inputs = self._inputs(fill_forward(tables.pop()), times)
         origin = self.origin
         time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
@@ -385,18 +400,3 @@ class EventTable:
         before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
         since = np.diff(times, prepend=times[:1]) / self._unit
         return np.insert(before, self.network.inputs.index(TIME_STEP), since, 1)
-
-
-def counts_losses(network: Network, name: str) -> bool:
-    """Return whether the last number that a node receives is how many transmissions were lost before its values."""
-    node = network.nodes[name]
-    if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
-        return False
-    return node.trigger.side_information(len(node.outputs)) == 1
-
-
-def _fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
-    """Fill what is missing with the value before it, 0 before the first."""
-    rows = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])
-    last = np.maximum.accumulate(rows, axis=0) if len(values) else rows
-    return np.asarray(np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0)))

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.files.event_table import EventTable, counts_losses
+from heliograph.files.event_columns import counts_losses
+from heliograph.files.event_table import EventTable
 from heliograph.files.fields import name_of
 from heliograph.files.message_files import FileMessage, parquet_names
 from heliograph.files.sources import Reading
