@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.plausibility import LIMIT, Reason, why_inputs, why_values
+from heliograph.filters.plausibility import LIMIT, Judgement, Reason
 from heliograph.model.over_time import OverTime
 
 PUSHED = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0, [[1.0]], inputs=["push"])
@@ -134,6 +134,7 @@ def test_in_single_precision_too():
 
 
 def test_a_filter_that_is_lost_does_not_refuse_for_the_others():
+    why_values, why_inputs = Judgement.why_values, Judgement.why_inputs
     fine, far, silent = [1.0, 1.0, 0.0, 0.0], [1e20, 1.0, Reason.FAR, 0.0], [np.nan, 1.0, 0.0, np.nan]
     assert why_values(np.array([fine, far])) is None and why_values(np.array([fine, silent])) is None
     assert why_values(np.array([far, silent])) == "more than 1e6 deviations from what was expected (1e+10 of them)"

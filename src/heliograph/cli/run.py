@@ -57,10 +57,9 @@ def run(
     """
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
-    from heliograph.smoothing.modes import parse_smoothing
 
     # Check the options before JAX is imported.
-    later, options = parse_smoothing(smooth), reading or ReadingOptions()
+    later, options = _parse_smoothing(smooth), reading or ReadingOptions()
     _check_options(measurements, out, report, lag, options)
     with progress(4) as advance:
         advance("starting")
@@ -91,6 +90,20 @@ def run(
         _write_report(network, loaded, {data.plant: (record, data.recording) for data, record, *_ in done}, report)
     for _, _, written, place, doubts, lines in done:
         _print_lines(list(dict.fromkeys(doubts)), [*_write_results(written, place, report), *lines])
+
+
+def _parse_smoothing(word: str) -> "AbstractSmoothing | None":
+    """Read the option: "all" for the fixed interval, a number for a lag, nothing for none."""
+    from heliograph.numerics.check import fail
+    from heliograph.smoothing import FixedInterval, FixedLag
+
+    if word == "":
+        return None
+    if word == "all":
+        return FixedInterval()
+    if not (word.isascii() and word.isdecimal()):
+        raise fail("--smooth", "all, or how many later rows", repr(word))
+    return FixedLag(int(word))
 
 
 def _place(out: Path, plant: str, several: bool) -> Path:

@@ -1,7 +1,9 @@
 """Quoting of a user's text for terminals, tables, figures and files, so that no name breaks them or acts in them."""
 
 import re
+from collections.abc import Sequence
 
+NAMED = 3  # of many names, how many are said
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a cell that begins so is computed by a spreadsheet
 
 
@@ -36,3 +38,10 @@ def unquote_file(text: str) -> str:
     """Undo `quote_for_file`."""
     code = r"\\(?:[\\nrt]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})"
     return re.sub(code, lambda match: match[0].encode().decode("unicode_escape"), text)
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Return names on a line; of many, the first few and their number."""
+    if len(names) <= 2 * NAMED:
+        return ", ".join(names)
+    return f"{', '.join(names[:NAMED])} … ({len(names)})"

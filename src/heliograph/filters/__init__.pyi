@@ -27,8 +27,13 @@ from .gaussian.gaussian import (
     gaussian_filter as gaussian_filter,
 )
 from .innovation import (
+    InnovationSummary as InnovationSummary,
+    Weighed as Weighed,
     gaussian_innovation as gaussian_innovation,
     mixed_innovation as mixed_innovation,
+)
+from .plausibility import (
+    Judgement as Judgement,
 )
 from .linear.linear import (
     as_current_filter as as_current_filter,

@@ -1,5 +1,6 @@
 """Innovations: value, covariance under the filter's model and log-likelihood of each, and a summary of many."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from heliograph.numerics.linalg import (
 )
 from heliograph.numerics.module import readable
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.shares import Share, wilson
+from heliograph.numerics.shares import Share, count_independent, wilson
 from heliograph.numerics.types import Array, Float
 
 LOG_TURN = float(np.log(2 * np.pi))
@@ -145,6 +146,21 @@ class Weighed(NamedTuple):
     variance: Array
     weight: Array
 
+    def summarise(self) -> "tuple[InnovationSummary, ...]":
+        """Summarise them over time, one output after the other.
+
+        Intervals count N values that are correlated over time as N (1 - a) / (1 + a), a the correlation of neighbours:
+        of the share Wilson's, with a of being down-weighted or not, since outliers come in runs behind a moving mean;
+        of the median the quantiles 1/2 -+ 1.96 / (2 sqrt N), with a of the innovations by ranks, which outliers do not
+        hide.
+        """
+        return tuple(_summary(*columns) for columns in zip(*(np.asarray(column).T for column in self), strict=True))
+
+    def square_used(self) -> Float[np.ndarray, "time m"]:
+        """Return the squares over their variances of those that count at least half, NaN for the others."""
+        value, variance, weight = (np.asarray(column) for column in self)
+        return np.where(weight >= HALF, value**2 / variance, np.nan)
+
 
 HALF = 0.5  # weight below which a component counts as down-weighted
 NORMAL = 1.96  # quantile of a 95 % interval
@@ -196,18 +212,30 @@ class InnovationSummary(NamedTuple):
             "be; it may be wrong itself, by its start or after an outage, and then it does not come back"
         ]
 
+    @staticmethod
+    def find_outlying(summaries: "Sequence[InnovationSummary]") -> list[int]:
+        """Outputs of which more values are down-weighted than of the others together, by an interval of the difference.
 
-def summarise_innovations(innovations: Weighed) -> tuple[InnovationSummary, ...]:
-    """Summarise innovations over time, one output after the other.
+        Shares p with intervals (l, u), of one output and of the others together: p_1 - p_2 is above 0 by more than
+        sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike some 3 of 100 are named.
 
-    Intervals count N values that are correlated over time as N (1 - a) / (1 + a), a the correlation of neighbours: of
-    the share Wilson's, with a of being down-weighted or not, since outliers come in runs behind a moving mean; of the
-    median the quantiles 1/2 -+ 1.96 / (2 sqrt N), with a of the innovations by ranks, which outliers do not hide.
+        Args:
+            summaries: one of each output.
 
-    Args:
-        innovations: value, variance and weight (time, m), NaN where nothing arrived.
-    """
-    return tuple(_summary(*columns) for columns in zip(*(np.asarray(column).T for column in innovations), strict=True))
+        Source: Newcombe, Interval estimation for the difference between independent proportions (1998), method 10.
+        """
+        outliers = []
+        for i, summary in enumerate(summaries):
+            others = [other for j, other in enumerate(summaries) if j != i and other.received]
+            if not summary.received or not others:
+                continue
+            pooled = sum(other.down_weighted for other in others) / sum(other.received for other in others)
+            independent = sum(other.independent for other in others)
+            rest = wilson(pooled * independent, independent)
+            share = summary.share
+            if share.estimate - pooled > np.hypot(share.estimate - share.low, rest.high - pooled):
+                outliers.append(i)
+        return outliers
 
 
 def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
@@ -217,44 +245,11 @@ def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np
     if not count:
         return InnovationSummary(len(value), 0, 0, wilson(0, 0), 0.0, *[float("nan")] * 5)
     # What counts as independent: neighbours that are alike say less.
-    independent = independent_count(np.argsort(np.argsort(e)).astype(float))
+    independent = count_independent(np.argsort(np.argsort(e)).astype(float))
     # The median's interval holds the quantiles between which it lies with 95 %.
     reach = NORMAL / (2 * np.sqrt(independent))
     low, middle, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
-    doubted = independent_count((w < HALF).astype(float))
+    doubted = count_independent((w < HALF).astype(float))
     share = wilson(down / count * doubted, doubted)
     numbers = (float(x) for x in (w.mean(), middle, low, high, d2.mean()))
     return InnovationSummary(len(value), count, down, share, doubted, *numbers)
-
-
-def independent_count(values: Float[np.ndarray, " time"]) -> float:
-    """Number of independent values that say as much, N (1 - a) / (1 + a), a the correlation of neighbours."""
-    apart = values - np.mean(values)
-    power = float(np.sum(apart**2))
-    a = np.clip(np.sum(apart[1:] * apart[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0
-    return max(float(len(values) * (1 - a) / (1 + a)), 1.0)
-
-
-def outlying(summaries: tuple[InnovationSummary, ...]) -> list[int]:
-    """Outputs of which more values are down-weighted than of the others together, by an interval of the difference.
-
-    Shares p with intervals (l, u), of one output and of the others together: p_1 - p_2 is above 0 by more than
-    sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike some 3 of 100 are named.
-
-    Args:
-        summaries: one of each output.
-
-    Source: Newcombe, Interval estimation for the difference between independent proportions (1998), method 10.
-    """
-    outliers = []
-    for i, summary in enumerate(summaries):
-        others = [other for j, other in enumerate(summaries) if j != i and other.received]
-        if not summary.received or not others:
-            continue
-        pooled = sum(other.down_weighted for other in others) / sum(other.received for other in others)
-        independent = sum(other.independent for other in others)
-        rest = wilson(pooled * independent, independent)
-        share = summary.share
-        if share.estimate - pooled > np.hypot(share.estimate - share.low, rest.high - pooled):
-            outliers.append(i)
-    return outliers

@@ -66,48 +66,53 @@ class Judgement(NamedTuple):
     rounding, NaN where no covariance is claimed. All are numbers, so that a judgement is a row of an array.
     """
 
-    distance: Float[Array, ""]
-    arrived: Float[Array, ""]
-    reason: Float[Array, ""]
-    input: Float[Array, ""]
+    distance: Array
+    arrived: Array
+    reason: Array
+    input: Array
 
     @property
     def implausible(self) -> Array:
         """True where the measurement must not be used."""
         return self.reason > 0
 
+    @staticmethod
+    def is_spoilt(reason: float) -> bool:
+        """Test whether a state or a prediction is no number: then some function of the model gave none."""
+        return reason in (Reason.UNSOUND, Reason.PREDICTION)
 
-def describe(reason: float, distance: float) -> str:
-    """Describe in words why something is implausible, with the bound of the precision that the distance has."""
-    if Reason(int(reason)) != Reason.FAR:
-        return WORDS[Reason(int(reason))]
-    most = np.sqrt(greatest_distance(np.asarray(distance).dtype))
-    bound = "1e6" if most == LIMIT else f"{most:,.0f}"
-    far = f"more than {bound} deviations from what was expected"
-    return far + (f" ({np.sqrt(distance):.3g} of them)" if np.isfinite(distance) else "")
+    @staticmethod
+    def describe(reason: float, distance: float) -> str:
+        """Describe in words why something is implausible, with the bound of the precision that the distance has."""
+        if Reason(int(reason)) != Reason.FAR:
+            return WORDS[Reason(int(reason))]
+        most = np.sqrt(greatest_distance(np.asarray(distance).dtype))
+        bound = "1e6" if most == LIMIT else f"{most:,.0f}"
+        far = f"more than {bound} deviations from what was expected"
+        return far + (f" ({np.sqrt(distance):.3g} of them)" if np.isfinite(distance) else "")
 
+    @staticmethod
+    def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
+        """Explain why a measurement is implausible: some filter judges it so, and no filter that can judge disagrees.
 
-def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
-    """Explain why a measurement is implausible: some filter judges it so, and no filter that can judge disagrees.
+        A single filter that has diverged, and judges all values implausible, does not exclude them for the others: it
+        alone skips them. A filter that claims no covariance judges nothing but its state.
+        """
+        distance, _, reason, _ = votes.T
+        bad = reason > 0
+        if not bad.any() or (~bad & ~np.isnan(distance)).any():
+            return None
+        worst = int(np.argmax(bad))
+        return Judgement.describe(reason[worst], distance[worst])
 
-    A single filter that has diverged, and judges all values implausible, does not exclude them for the others: it alone
-    skips them. A filter that claims no covariance judges nothing but its state.
-    """
-    distance, _, reason, _ = votes.T
-    bad = reason > 0
-    if not bad.any() or (~bad & ~np.isnan(distance)).any():
-        return None
-    worst = int(np.argmax(bad))
-    return describe(reason[worst], distance[worst])
-
-
-def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
-    """Explain why inputs are implausible, by the same rule."""
-    predicted = votes[:, 2] == Reason.PREDICTION
-    bad = (votes[:, 3] > 0) | predicted
-    if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
-        return None
-    return WORDS[Reason.PREDICTION] if predicted.any() else INPUT
+    @staticmethod
+    def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
+        """Explain why inputs are implausible, by the same rule."""
+        predicted = votes[:, 2] == Reason.PREDICTION
+        bad = (votes[:, 3] > 0) | predicted
+        if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
+            return None
+        return WORDS[Reason.PREDICTION] if predicted.any() else INPUT
 
 
 def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:

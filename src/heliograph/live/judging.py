@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plausibility import Judgement, Reason, why_inputs, why_values
+from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import Known
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
@@ -17,7 +17,7 @@ from heliograph.model.faults import function_fault
 from heliograph.numerics.types import Float
 from heliograph.simulation.centres.blame import find_blamed
 from heliograph.simulation.description.wide_angles import WideAngles
-from heliograph.simulation.network import FUSED
+from heliograph.simulation.network import Network
 from heliograph.simulation.rows.columns import FilterColumns
 
 TRIES = 10  # to find the function of a filter that returned no number
@@ -34,7 +34,7 @@ class Judges:
 
     def __init__(self, fleet: Fleet):
         self.fleet, places = fleet, fleet.lanes.places
-        central = _columns([output for output in places if output.node == FUSED])
+        central = _columns([output for output in places if output.node == Network.FUSED])
         self._columns, self._central = {}, set[int]()  # nodes without a filter of their own
         for index, name in enumerate(fleet.network.names):
             of_node = _columns([output for output in places if output.node == name and _listens(fleet, output)])
@@ -54,7 +54,7 @@ class Judges:
 
     def why_inputs(self, outputs: Float[np.ndarray, " outputs"]) -> str | None:
         """Explain why the inputs that led to these outputs are implausible; None if they are not."""
-        return why_inputs(outputs[self._every])
+        return Judgement.why_inputs(outputs[self._every])
 
     def implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
         """Return the indices of the implausible candidates, each with the reason.
@@ -74,7 +74,7 @@ class Judges:
         for i in np.flatnonzero(flagged).tolist():
             (_, plant, event, _), outputs = taken[i], pool.table[slots[i], pool.outputs]
             if event.node_index >= 0:
-                why = why_values(outputs[self._columns[event.node_index]]) if _size(event) >= 0 else None
+                why = Judgement.why_values(outputs[self._columns[event.node_index]]) if _size(event) >= 0 else None
             elif why := self.why_inputs(outputs):
                 first = spoilt.setdefault(plant.name, i)
                 spoilt[plant.name] = min(first, i, key=lambda j: taken[j][-1].key)
@@ -101,11 +101,11 @@ class Judges:
         known = pool.table[before.slot, pool.outputs]
         for place in self.fleet.lanes.places:
             filter = filter_of(self.fleet, place)
-            judged = place.judgement is not None and after[place.judgement.reason] in (
-                Reason.UNSOUND,
-                Reason.PREDICTION,
+            judged = place.judgement is not None and Judgement.is_spoilt(after[place.judgement.reason])
+            concerned = event.node_index < 0 or place.node in (
+                Network.FUSED,
+                self.fleet.network.names[event.node_index],
             )
-            concerned = event.node_index < 0 or place.node in (FUSED, self.fleet.network.names[event.node_index])
             if filter is None or not judged or not concerned:
                 continue
             tried, said = self._faults.get((place.node, place.filter), (0, ""))
@@ -147,7 +147,7 @@ class Judges:
         at = rows.places[event.node_index]
         there.numbers[at] = [nan] * (at.stop - at.start)
         self.fleet.step_row(rows.held[rows.index(row.key) - 1], there)
-        plausible = why_values(pool.table[there.slot, pool.outputs][self._columns[event.node_index]]) is None
+        plausible = Judgement.why_values(pool.table[there.slot, pool.outputs][self._columns[event.node_index]]) is None
         pool.give([there.slot])
         return plausible
 
@@ -190,7 +190,7 @@ class FleetAngles:
 
 def filter_of(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:
     """Return the filter of these columns; None of a fusion rule."""
-    if output.node == FUSED:
+    if output.node == Network.FUSED:
         central = fleet.network.fused[output.filter]
         return central if isinstance(central, AbstractFilter) else None
     return fleet.network.nodes[output.node].filters.get(output.filter)

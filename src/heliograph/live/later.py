@@ -20,7 +20,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import Network
 from heliograph.simulation.plausible_step import reasons
 from heliograph.simulation.rows.row_step import NetworkStep
 from heliograph.simulation.stepping import AllFilters
@@ -228,7 +228,7 @@ class Sweeper:
             fusion, claim = self.network.fused[name], outputs.claim
             if isinstance(fusion, Fusion):
                 claim = fusion.claim([claims[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)])
-            results.setdefault(FUSED, {})[name] = _estimate_of(outputs, claim, ())
+            results.setdefault(Network.FUSED, {})[name] = _estimate_of(outputs, claim, ())
         return {node: filters for node, filters in results.items() if filters}
 
 

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from heliograph.filters.base import AbstractFilter, check_input, check_measurement
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
-from heliograph.filters.plausibility import describe, why_inputs
+from heliograph.filters.plausibility import Judgement
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.live.stored.layout import describe_old_layout, fits, parts_of, relocate_parts
@@ -130,16 +130,16 @@ class Stream:
         check_measurement(self.filter, z)
         check_input(self.filter, u)
         stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
-        if len(u) and (why := why_inputs(stepper.judgement[None])):
+        if len(u) and (why := Judgement.why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
             state = stepper.state
             stepper.step(np.full(len(z), np.nan), np.zeros(len(u)), self.steps)
-            without = why_inputs(stepper.judgement[None])
+            without = Judgement.why_inputs(stepper.judgement[None])
             stepper.put(state)
             if not without:
                 raise fail(f"inputs of step {self.steps}", "plausible ones", f"{u.tolist()}: {why}{self._fault(u)}")
         if reason > 0:
-            why = describe(reason, distance) + self._fault(u)
+            why = Judgement.describe(reason, distance) + self._fault(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         stepper.step(z, u, self.steps)  # anew, if inputs were tried without
         stepper.accept()

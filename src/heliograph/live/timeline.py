@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.filters.plausibility import describe
+from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import FleetAngles, Judges
@@ -346,7 +346,7 @@ class Timeline:
             if judged is not None:
                 nis, received = float(outputs[judged.distance]), int(outputs[judged.arrived])
                 reason = 0.0 if place.judgement is None else float(outputs[place.judgement.reason])
-                refused = describe(reason, nis) if reason > 0 else ""
+                refused = Judgement.describe(reason, nis) if reason > 0 else ""
                 estimates[place.node][place.filter] = JudgedEstimate(
                     estimate.mean, estimate.covariance, estimate.claim, nis, received, refused
                 )

@@ -11,7 +11,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.types import Array, PyTree
+from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 
@@ -165,6 +165,17 @@ class Steps(Module):
     def owner(self) -> np.ndarray:
         """Index of the filter that receives each of the R numbers."""
         return np.repeat(np.arange(len(self.received)), self.received)
+
+    def predict_maps(self) -> tuple[Float[np.ndarray, "time R n"], Float[np.ndarray, "time R"]]:
+        """Return B and b of the prediction B s + b of each received number from the estimate s of its filter."""
+        relays = len(self.received) - 1
+        predicted = [self.sensing @ self.transition, *[self.sensing] * relays]
+        constant = np.einsum("kmn,kn->km", self.sensing, self.drift) + self.sensor_offset
+        m = self.sensing.shape[1]
+        return (
+            self.gain @ np.concatenate(predicted, axis=1),
+            np.einsum("krm,km->kr", self.gain[:, :, :m], constant) + self.offset,
+        )
 
 
 def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:

@@ -1,4 +1,4 @@
-"""Shares that were counted, with Wilson's interval."""
+"""Shares that were counted, and of values correlated in time their independent number and the error of their mean."""
 
 from typing import NamedTuple
 
@@ -6,6 +6,7 @@ import numpy as np
 import scipy
 
 from heliograph.numerics.module import readable
+from heliograph.numerics.types import Float
 
 
 @readable
@@ -35,3 +36,26 @@ def wilson(hits: float, of: float) -> Share:
     middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
     half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
     return Share(p, 0.0 if not hits else float(middle - half), 1.0 if hits == of else float(middle + half))
+
+
+def count_independent(values: Float[np.ndarray, " time"]) -> float:
+    """Number of independent values that say as much, N (1 - a) / (1 + a), a the correlation of neighbours."""
+    apart = values - np.mean(values)
+    power = float(np.sum(apart**2))
+    a = np.clip(np.sum(apart[1:] * apart[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0
+    return max(float(len(values) * (1 - a) / (1 + a)), 1.0)
+
+
+def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Mean of the values that are not NaN, and its standard error by Bartlett's weights, of values correlated in time.
+
+    The weights reach over the cube root of the length.
+    """
+    there = ~np.isnan(values)
+    count = max(int(there.sum()), 1)
+    mean = float(values[there].sum() / count)
+    apart = np.where(there, values - mean, 0.0)
+    # sum over t of (1 - |t| / width) sum_k e_k e_(k+t) is the mean over a window's width of squares of its moving sums.
+    width = int(np.ceil(len(values) ** (1 / 3))) + 1
+    sums = np.convolve(apart, np.ones(width))
+    return mean, float(np.sqrt(np.mean(sums**2) * (len(sums) / width)) / count)

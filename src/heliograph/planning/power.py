@@ -19,9 +19,9 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import compute_sent_powers, steady_powers
-from heliograph.relays.design import expected_maps, given_design
+from heliograph.relays.design import given_design
 from heliograph.simulation.draws import seed_key
-from heliograph.simulation.network import LOCAL, Network
+from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 BATCHES = 20  # of runs, from whose spread the standard errors come
@@ -167,12 +167,12 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
     """Powers of relays that filter: exact for schedules made as if a relay's estimate were everybody's."""
     relays = network.relays
     assert relays is not None
-    filters = {name: network.nodes[name].filters[LOCAL] for name in relays.relays}
+    filters = {name: network.nodes[name].filters[Network.LOCAL] for name in relays.relays}
     schedules = {name: filter.gains.values for name, filter in filters.items() if isinstance(filter, ScheduledFilter)}
     known = min(len(schedule.gain) for schedule in schedules.values())
     steps = known if horizon is None else check_horizon(horizon, known)
     moved = relays.steps(steps)
-    rows, n = expected_maps(moved)[0], len(relays.states)
+    rows, n = moved.predict_maps()[0], len(relays.states)
     ends = dict(zip(relays.filters, np.cumsum(relays.received), strict=True))
     gains = {RECEIVER: np.zeros((steps, n, relays.received[-1]))}
     # Each schedule has to be s+ = A s + K (z - B s - b) with the rows that the relay expects.

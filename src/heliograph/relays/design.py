@@ -140,7 +140,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     _check_start(network, design)
     steps = network.steps(len(design.moments) - 1)
-    rows, constants = expected_maps(steps)
+    rows, constants = steps.predict_maps()
     # Moments of (eta+ before correction, innovation): predicted and innovation covariances.
     n, before = len(network.states), np.asarray(_predict_covariances(steps, design.moments[:-1]))
     d = design.moments.shape[-1]
@@ -177,18 +177,6 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
 def _predict_covariances(steps: Steps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
     """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
     return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
-
-
-def expected_maps(steps: Steps) -> tuple[Float[np.ndarray, "time R n"], Float[np.ndarray, "time R"]]:
-    """Return B and b of the prediction B s + b of each received number from the estimate s of its filter."""
-    relays = len(steps.received) - 1
-    predicted = [steps.sensing @ steps.transition, *[steps.sensing] * relays]
-    constant = np.einsum("kmn,kn->km", steps.sensing, steps.drift) + steps.sensor_offset
-    m = steps.sensing.shape[1]
-    return (
-        steps.gain @ np.concatenate(predicted, axis=1),
-        np.einsum("krm,km->kr", steps.gain[:, :, :m], constant) + steps.offset,
-    )
 
 
 def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
@@ -256,7 +244,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     none = np.zeros((len(known), d + r, r))
     # Means: x+ has drift a, z the constant b.
     drift = np.zeros((len(known), d + r))
-    drift[:, :n], drift[:, d:] = steps.drift, expected_maps(steps)[1][:, -r:]
+    drift[:, :n], drift[:, d:] = steps.drift, steps.predict_maps()[1][:, -r:]
     # (x, e, z)+ = [known; received] (x, e) + white noise, measured as z exactly.
     system = SystemSteps(
         transition=np.concatenate([np.concatenate([known, received], axis=1), none], axis=2),

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import ndtri
 
-from heliograph.filters.innovation import independent_count
+from heliograph.numerics.shares import count_independent
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.report.pattern import Pattern, find_pattern
 
@@ -138,7 +138,7 @@ class Arrivals:
         if p is None or self.due_slots is None or not 0 < p < 1:
             return False
         came = self.due_slots.astype(float)
-        independent = len(came) if self.period is not None else independent_count(came)
+        independent = len(came) if self.period is not None else count_independent(came)
         deviation = np.sqrt(p * (1 - p) / independent)
         return bool(abs(self.share - p) > max(-ndtri(level / 2) * deviation, LEAST_SHARE))
 

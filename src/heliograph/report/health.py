@@ -15,7 +15,7 @@ from heliograph.random_affine.erasure import outcomes
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
 from heliograph.simulation.claims import beliefs
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
@@ -75,7 +75,9 @@ class Health:
             f"{health.judged.held}, where its noise makes no run as long; what else is said of filters that use it may "
             "be due to that"
             for health in self.outputs
-            if health.judged.held is not None and health.node != FUSED and (health.node, health.filter) in trusted
+            if health.judged.held is not None
+            and health.node != Network.FUSED
+            and (health.node, health.filter) in trusted
         }
 
     def doubted(self) -> list[FilterHealth]:
@@ -87,7 +89,7 @@ class Health:
         return [
             filter
             for filter in self.filters
-            if filter.trusted and not (filter.node in nodes or (nodes and filter.node == FUSED))
+            if filter.trusted and not (filter.node in nodes or (nodes and filter.node == Network.FUSED))
             if any(self._doubts(filter))
         ]
 

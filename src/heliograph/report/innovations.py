@@ -13,7 +13,7 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, 
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.outputs import rounded
 from heliograph.report.page import Choice, Picture, Section, Table, Text
-from heliograph.simulation.network import FUSED
+from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
@@ -61,7 +61,7 @@ def _components(health: Health) -> dict[str, list[str]]:
     names: dict[str, list[str]] = {}
     for link in health.links:
         names.setdefault(link.node, []).append(link.component)
-    return names | {FUSED: [f"{link.node}: {link.component}" for link in health.links]}
+    return names | {Network.FUSED: [f"{link.node}: {link.component}" for link in health.links]}
 
 
 def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Section:
@@ -81,7 +81,7 @@ def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Sectio
             if filter.white is not None and filter.node not in drawn]  # fmt: skip
     # Fusions of estimates, which are in no row.
     listed = {(filter.node, filter.filter) for filter in health.filters}
-    fusions = [name for name in health.record.estimates.get(FUSED, {}) if (FUSED, name) not in listed]
+    fusions = [name for name in health.record.estimates.get(Network.FUSED, {}) if (Network.FUSED, name) not in listed]
     if fusions:
         text += (
             f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
@@ -115,7 +115,7 @@ def _tests_table(health: Health) -> Table:
 
 
 def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
-    return sorted(filters, key=lambda judged: judged.node != FUSED)
+    return sorted(filters, key=lambda judged: judged.node != Network.FUSED)
 
 
 def _outputs_table(health: Health) -> list[Table]:

@@ -8,7 +8,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.outliers import Contaminated, StudentT
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 DRAWS = 20_000  # the median of this many is known to 1 % of a deviation
@@ -27,7 +27,7 @@ def law_medians(
         node: name of the node; of a filter of the centre, the nodes' numbers one after the other.
         variance: claimed variance of each innovation.
     """
-    if node == FUSED:
+    if node == Network.FUSED:
         sizes = np.cumsum([0, *(network.nodes[name].received for name in network.names)])
         return np.concatenate([law_medians(network, name, variance[a:b])
                                for name, a, b in zip(network.names, sizes[:-1], sizes[1:], strict=True)])  # fmt: skip

@@ -9,15 +9,15 @@ import numpy as np
 
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.innovation import HALF, InnovationSummary, Weighed, outlying, summarise_innovations
+from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
+from heliograph.numerics.shares import average_correlated
 from heliograph.report.held import HeldValue, held_value
 from heliograph.report.medians import law_medians
 from heliograph.report.results import Json
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.whiteness import average_correlated
 
 
 class Errors(NamedTuple):
@@ -43,7 +43,7 @@ def errors_of(record: Record) -> list[Errors]:
         return []
     known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)
     results = []
-    for node, estimates in sorted(record.estimates.items(), key=lambda pair: pair[0] != FUSED):
+    for node, estimates in sorted(record.estimates.items(), key=lambda pair: pair[0] != Network.FUSED):
         for name, estimate in estimates.items():
             values = record.nees(node, name)
             judged = ~np.isnan(values)
@@ -135,7 +135,7 @@ def listeners(network: Network, record: Record) -> Iterator[Listener]:
     every = [f"{node}: {name}" for node in received for name in network.nodes[node].received_names]
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
-            yield Listener(FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
+            yield Listener(Network.FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
 
 
 def _find_relied_on(network: Network) -> dict[str, set[str]]:
@@ -192,11 +192,10 @@ def judge_outputs(
     """
     summaries = [
         summary._replace(bias=summary.bias - m, bias_low=summary.bias_low - m, bias_high=summary.bias_high - m)
-        for summary, m in zip(summarise_innovations(innovations), medians, strict=True)
+        for summary, m in zip(innovations.summarise(), medians, strict=True)
     ]
-    outliers = outlying(tuple(summaries)) if blames else []
-    value, variance, weight = (np.asarray(column) for column in innovations)
-    used = np.where(weight >= HALF, value**2 / variance, np.nan)
+    outliers = InnovationSummary.find_outlying(summaries) if blames else []
+    used, variance = innovations.square_used(), np.asarray(innovations.variance)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
         size = average_correlated(used[:, i]) if np.any(~np.isnan(used[:, i])) else (np.nan, np.nan)

@@ -29,7 +29,7 @@ from heliograph.report.outputs import errors_of, output_numbers, rounded
 from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.position_map import coordinates_of, map_figure
 from heliograph.report.results import Json, Results, write_into
-from heliograph.simulation.network import FUSED
+from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
 PAGE = 2_100_000  # bytes of the figures that a page holds, so that it has at most 3 MB
@@ -108,7 +108,9 @@ def _nodes(record: Record) -> list[str]:
 
 
 def _sort_nodes(record: Record) -> list[str]:
-    return sorted((node for node, filters in record.estimates.items() if filters), key=lambda node: node != FUSED)
+    return sorted(
+        (node for node, filters in record.estimates.items() if filters), key=lambda node: node != Network.FUSED
+    )
 
 
 @matplotlib.rc_context(LOOK)

@@ -7,7 +7,7 @@ from math import isfinite
 import numpy as np
 from pydantic_core import to_json
 
-from heliograph.filters.plausibility import describe
+from heliograph.filters.plausibility import Judgement
 from heliograph.live.lanes import Lanes
 from heliograph.numerics.types import Float
 from heliograph.simulation.rows.columns import FilterColumns, WeighedAt
@@ -96,7 +96,7 @@ class EstimateWriter:
             parts = zip(WeighedAt._fields, columns.weighed, strict=True)
             results["outputs"] = {name: [outputs[i] for i in columns] for name, columns in parts}
         if outputs[judged.reason] > 0:
-            why = describe(outputs[judged.reason], outputs[judged.distance])
+            why = Judgement.describe(outputs[judged.reason], outputs[judged.distance])
             return results | {"nis": None, "received": 0, "implausible": why}
         return results | {"nis": outputs[judged.distance], "received": int(outputs[judged.arrived])}
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from prometheus_client import CollectorRegistry, Histogram
 from pydantic_core import from_json
 
+from heliograph.disk.quoting import join_names
 from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
 from heliograph.model.estimate import Claim
@@ -23,8 +24,7 @@ from heliograph.serving.output import Output
 from heliograph.serving.overview import Overview, Wrong
 from heliograph.serving.running_nis import MEMORY, RunningNis, used_nis
 from heliograph.serving.totals import LinkTotals, Totals
-from heliograph.simulation.description.diagram import join_names
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import Network
 
 T = TypeVar("T")
 PLANTS = 200  # plants with estimates in memory, those with the newest messages
@@ -286,8 +286,8 @@ class Watch:
             doubted = ["/".join(source) for source, test in known if test.doubt()]
             numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in known)}
             judged = {"doubt": bool(doubted), "by": doubted or ["/".join(source) for source, _ in known]}
-            if known and (FUSED, name) not in tests:  # else it has a test of itself
-                rows.append({"node": FUSED, "filter": name, "claim": claim, **numbers, **judged})
+            if known and (Network.FUSED, name) not in tests:  # else it has a test of itself
+                rows.append({"node": Network.FUSED, "filter": name, "claim": claim, **numbers, **judged})
         return rows
 
     def _warnings(
@@ -383,7 +383,7 @@ def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> W
     """Return the observer of services of a network, whose name is `title`; `uncounted` as of a `Watch`."""
     claims = network.claims()
     fused = {
-        name: (claims[FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
+        name: (claims[Network.FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
         for name, fusion in network.fused.items()
         if isinstance(fusion, Fusion)
     }
@@ -391,6 +391,6 @@ def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> W
         (node, name): receiver.received_names for node, receiver in network.nodes.items() for name in receiver.filters
     }
     all_names = [f"{node}: {name}" for node, receiver in network.nodes.items() for name in receiver.received_names]
-    names |= {(FUSED, name): all_names for name in network.fused}
+    names |= {(Network.FUSED, name): all_names for name in network.fused}
     unit = units_in(network.inputs).get(TIME_STEP, "s") if TIME_STEP in network.inputs else "steps"
     return Watch(network.states, title, unit, fused, names, uncounted)

@@ -22,6 +22,10 @@ from .boundedness import (
     Boundedness as Boundedness,
     certify_boundedness as certify_boundedness,
 )
+from .description.doubts import (
+    Doubt as Doubt,
+    doubts_before_data as doubts_before_data,
+)
 from .runs.compilation_cache import (
     keep_compilations as keep_compilations,
 )

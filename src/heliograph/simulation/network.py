@@ -1,10 +1,10 @@
 """Network: one plant, and nodes that receive measurements of it, with their filters."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from copy import copy
 from functools import cached_property
 from itertools import accumulate
-from typing import NamedTuple
+from typing import ClassVar
 from zlib import crc32
 
 import equinox as eqx
@@ -16,7 +16,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.linear.system import Schedule
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Claim
-from heliograph.model.over_time import first, steps_covered, structure
+from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
@@ -36,6 +36,7 @@ from heliograph.simulation.claims import (
     nominal_nodes,
 )
 from heliograph.simulation.description.diagram import short_text_of, table_of
+from heliograph.simulation.index import Kind, Place, group_by_structure, places_of
 from heliograph.simulation.node import FUSED as FUSED
 from heliograph.simulation.node import (
     Common,
@@ -53,21 +54,6 @@ Claims = dict[str, dict[str, Claim]]  # by node and filter
 
 LOCAL = "local"  # a relay's one filter
 SENSORLESS = ReceivingNode({}, 0, (), True)  # a node that estimates from its neighbours alone
-
-
-class Kind(NamedTuple):
-    """Filters that differ in numbers alone: `filters` of the nodes of one group."""
-
-    group: int
-    filters: tuple[str, ...]
-
-
-class Place(NamedTuple):
-    """Where an estimate stands: which kind of filters, and which filter and node along its axes."""
-
-    kind: int
-    filter: int
-    node: int
 
 
 class Network(Module):
@@ -91,6 +77,8 @@ class Network(Module):
             neighbours a node that cannot know the plant's state from those upstream.
     """
 
+    FUSED: ClassVar[str] = FUSED  # the name under which results of several nodes stand
+    LOCAL: ClassVar[str] = LOCAL  # of the one filter of a relay
     plant: AnyPlant
     nodes: dict[str, Node | ReceivingNode]
     fused: dict[str, Fusion | AbstractFilter]
@@ -138,18 +126,18 @@ class Network(Module):
         self.nodes = nodes_alike(nodes_standing(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
-        self.groups = _group_by_structure(
+        self.groups = group_by_structure(
             (name, without_output_names((_world(n), n.filters, meshes[name]))) for name, n in self.nodes.items()
         )
         self.kinds = tuple(
             Kind(g, alike)
             for g, names in enumerate(self.groups)
-            for alike in _group_by_structure(self.nodes[names[0]].filters.items())
+            for alike in group_by_structure(self.nodes[names[0]].filters.items())
         )
         self.mesh_kinds = tuple(
             Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
         )
-        self.places = FrozenMapping(_places_of(self.groups, self.kinds))
+        self.places = FrozenMapping(places_of(self.groups, self.kinds))
         self._check_links()
         self._check_fused()
         self.fused = judge_fused_standing(self)
@@ -391,20 +379,3 @@ def _world(node: Node | ReceivingNode) -> object:
     if isinstance(node, Node):
         return node.sensor, drop_names(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
-
-
-def _places_of(groups: Sequence[Sequence[str]], kinds: Sequence[Kind]) -> dict[tuple[str, str], Place]:
-    return {
-        (node, name): Place(k, f, i)
-        for k, kind in enumerate(kinds)
-        for f, name in enumerate(kind.filters)
-        for i, node in enumerate(groups[kind.group])
-    }
-
-
-def _group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
-    """Group names by the structure of their items, in order of first appearance."""
-    results: dict[object, list[str]] = {}
-    for name, described in items:
-        results.setdefault(structure(described), []).append(name)
-    return tuple(tuple(names) for names in results.values())

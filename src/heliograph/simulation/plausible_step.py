@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plausibility import INPUT, Judgement, describe, why_inputs, why_values
+from heliograph.filters.plausibility import INPUT, Judgement
 from heliograph.model.faults import function_fault
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
@@ -122,7 +122,7 @@ def find_refused_rows(
 
 
 def _reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
-    return {k: said for k in _find_flagged(votes, "reason") if (said := why_values(votes[k]))}
+    return {k: said for k in _find_flagged(votes, "reason") if (said := Judgement.why_values(votes[k]))}
 
 
 def doubts(
@@ -148,12 +148,12 @@ def doubts(
         reported = all_rows if node == FUSED else refused.get(node, {})
         rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in reported]
         if rows:
-            why = describe(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
+            why = Judgement.describe(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
             lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
         votes = Judges(network).of_all(outputs)
-        rows = [k for k in _find_flagged(votes, "input") if why_inputs(votes[k])]
+        rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
         lines += [f"inputs: {_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines
 

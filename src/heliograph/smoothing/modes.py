@@ -150,14 +150,3 @@ class FixedPoint(AbstractSmoothing):
         """Raise ValueError if the step is not one of the run's."""
         if self.step >= horizon:
             raise fail("step of a fixed point", f"one of the run's {horizon}, counted from 0", self.step)
-
-
-def parse_smoothing(name: str) -> AbstractSmoothing | None:
-    """Smoothing by a word of the command line: "all" for the fixed interval, a number for a lag, nothing for none."""
-    if name == "":
-        return None
-    if name == "all":
-        return FixedInterval()
-    if not (name.isascii() and name.isdecimal()):
-        raise fail("--smooth", "all, or how many later rows", repr(name))
-    return FixedLag(int(name))

@@ -19,7 +19,7 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.combine import Series, known
 from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, second_order
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
 from heliograph.simulation.simulate import monte_carlo
@@ -100,7 +100,7 @@ def _draw_units(network: Network, random: np.random.Generator, common: bool) -> 
         node = network.nodes[name]
         units[name] = Units(states, factors(len(node.outputs)), factors(node.received), inputs)
     outputs, received = (np.concatenate([units[name][i] for name in network.names]) for i in (1, 2))
-    return units | {FUSED: Units(states, outputs, received, inputs)}
+    return units | {Network.FUSED: Units(states, outputs, received, inputs)}
 
 
 def _compare_runs(
@@ -112,9 +112,9 @@ def _compare_runs(
     common: bool,
 ) -> float:
     nodes = {name: _node(name, node, units[name]) for name, node in _nodes(network).items()}
-    fused = {name: _rescale_fusion(name, fusion, units[FUSED]) for name, fusion in network.fused.items()}
-    scaled = Network(rescaled_plant(network.plant, units[FUSED]), nodes, fused)
-    shared = units[FUSED].inputs
+    fused = {name: _rescale_fusion(name, fusion, units[Network.FUSED]) for name, fusion in network.fused.items()}
+    scaled = Network(rescaled_plant(network.plant, units[Network.FUSED]), nodes, fused)
+    shared = units[Network.FUSED].inputs
     estimates = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
     worst = 0.0
     for node, filters in plain.items():
@@ -194,7 +194,7 @@ def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) ->
 
 def _searches(network: Network, node: str, name: str) -> bool:
     """Return whether a trace is minimised on the way to this estimate."""
-    if node != FUSED:
+    if node != Network.FUSED:
         return _minimises(network.nodes[node].filters[name])
     fusion = network.fused[name]
     if isinstance(fusion, AbstractFilter):

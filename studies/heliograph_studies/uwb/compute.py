@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.innovation import InnovationSummary, Weighed, outlying, summarise_innovations
+from heliograph.filters import InnovationSummary, Weighed
 from heliograph_studies import Stages, Unlisted
 from heliograph_studies.uwb.drives import Drive, drives
 from heliograph_studies.uwb.learning import followed, learn, padded, slots, true_places
@@ -197,11 +197,11 @@ def judged(rule: str, drive: Drive, numbers: Numbers) -> Rule:
     error = off(read.time - numbers.late, place)
     ahead = place + numbers.late * np.gradient(place, np.maximum.accumulate(read.time), axis=0)
     squared = hg.nees(error, np.zeros_like(error), covariance[used])
-    summaries = summarise_innovations(Weighed(innovation, variance, weight))
+    summaries = Weighed(innovation, variance, weight).summarise()
     return Rule(
         _rms(error), float(squared.mean() / 2), _rms(off(read.time, ahead)), numbers, read.time[used], place[used],
         np.sqrt(np.trace(covariance[used], axis1=1, axis2=2)), np.linalg.norm(error, axis=1), weight[used],
-        dict(zip(drive.names, summaries, strict=True)), [drive.names[i] for i in outlying(summaries)],
+        dict(zip(drive.names, summaries, strict=True)), [drive.names[i] for i in InnovationSummary.find_outlying(summaries)],
     )  # fmt: skip
 
 

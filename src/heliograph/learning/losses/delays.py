@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.filters.innovation import independent_count
 from heliograph.numerics.check import TINY, array, fail, scalar
 from heliograph.numerics.module import readable
-from heliograph.numerics.shares import Share, wilson
+from heliograph.numerics.shares import Share, count_independent, wilson
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.law import Discrete
 
@@ -71,6 +70,6 @@ def learn_delays(late: "Float[ArrayLike, ' measurements']", step: "Float[ArrayLi
     shares = {}
     for delay in np.unique(known):
         mine = (known == delay).astype(float)
-        count = independent_count(mine)
+        count = count_independent(mine)
         shares[int(delay)] = wilson(float(mine.mean()) * count, count)
     return Delays(size, len(known), len(steps) - len(known), shares)

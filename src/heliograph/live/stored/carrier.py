@@ -16,7 +16,7 @@ from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, plant_by
 from heliograph.live.stored.snapshot import Identity
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.network import FUSED
+from heliograph.simulation.network import Network
 
 DESCRIPTION = "description"  # key of an identity: its numbers and the layout of its rows, as JSON
 MOST = 64  # numbers of an array that are stored; of a longer one only a hash is
@@ -85,7 +85,7 @@ def _filter_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str
                 note(name, path, np.asarray(own))
     for name, state in sorted(central.items()):
         for path, leaf in columns(state).items():
-            note(f"{FUSED}/{name}", path, leaf)
+            note(f"{Network.FUSED}/{name}", path, leaf)
     # What centres and neighbours remember goes on only if the nodes are the same.
     for path, leaf in columns(rest).items():
         note(f"memory of the fusions of {', '.join(network.names)}", path, leaf)

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.engine.choice import chosen
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plausibility import Judgement, why_values
+from heliograph.filters.plausibility import Judgement
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.side_by_side import filter_step, map_all
@@ -55,7 +55,7 @@ def refuse_centrally(
         without[list(z).index(name)][i] = np.nan
     # Whether the filters find the row plausible then.
     votes = _judgements(filters, before, np.concatenate(without, axis=1), u, rows)
-    plausible = {removal: why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
+    plausible = {removal: Judgement.why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
     refused = dict[str, dict[int, str]]()
     for k, reason in why.items():
         if candidates := [removal for removal in removals if removal[0] == k]:

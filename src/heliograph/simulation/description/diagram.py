@@ -1,12 +1,12 @@
 """Diagram of a network in lines or as a table: plant, nodes from sensor to filters, channels in words, fusions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.disk.quoting import visible
+from heliograph.disk.quoting import join_names, visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
@@ -25,7 +25,6 @@ from heliograph.simulation.description.single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
 from heliograph.simulation.shared_fading import memory_places
 
-NAMED = 3  # of many nodes that are alike, how many are named
 ARROW, DIRECT = " → ", "direct"
 
 
@@ -108,13 +107,6 @@ def list_rounded(network: HasNodes) -> list[str]:
         f"rounded to single precision before they came in: {describe_rounded(rounded)} ({join_names(names)})"
         for rounded, names in find_rounded_parts(network).items()
     ]
-
-
-def join_names(names: Sequence[str]) -> str:
-    """Return names on a line; of many, the first few and their number."""
-    if len(names) <= 2 * NAMED:
-        return ", ".join(names)
-    return f"{', '.join(names[:NAMED])} … ({len(names)})"
 
 
 def text_of(network: HasNodes) -> str:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.disk.quoting import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
@@ -15,14 +16,14 @@ from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.check import InputError
+from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.traced import DOUBLE
 from heliograph.numerics.types import Float
 from heliograph.random_affine.modes import forgetful
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
-from heliograph.simulation.description.diagram import join_names, list_rounded, list_shared
+from heliograph.simulation.description.diagram import list_rounded, list_shared
 from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import wide_at_the_start
 from heliograph.simulation.network import Network
@@ -35,7 +36,12 @@ SEED = 0  # of the state at which a nonlinear plant is judged
 
 
 class Doubt(NamedTuple):
-    """A line about a network; `serious` where an estimate may not be what it is for, else something to know."""
+    """A line about a network; `serious` where an estimate may not be what it is for, else something to know.
+
+    Args:
+        serious: whether an estimate may not be what it is for.
+        words: the line.
+    """
 
     serious: bool
     words: str
@@ -46,7 +52,11 @@ def doubts_before_data(network: Network) -> list[Doubt]:
 
     Args:
         network: the network.
+
+    Raises:
+        ValueError: what is no network.
     """
+    instance("network", network, Network, "a Network")
     lines = [*_unobservable(network), *_doubt_boundedness(network), *_unheard(network)]
     lines += [*_forgotten(network), *_other_worlds(network)]
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]

@@ -10,7 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.disk.quoting import quote_for_figure
-from heliograph.filters.innovation import InnovationSummary, Weighed, summarise_innovations
+from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -190,7 +190,7 @@ class Record(Saved):
         if name not in self.weighed.get(node, {}):
             weighing = [f"{element}/{of}" for element, filters in self.weighed.items() for of in filters]
             raise fail("node and filter", f"one that weighs, of a recording: {weighing}", f"{node}/{name}")
-        return summarise_innovations(self.weighed[node][name])
+        return self.weighed[node][name].summarise()
 
     def to_xarray(self) -> "xr.Dataset":
         """Labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.

@@ -16,6 +16,7 @@ from heliograph.numerics.check import array, check_count, fail, instance, rank
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import whiten
 from heliograph.numerics.module import readable
+from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 
@@ -141,21 +142,6 @@ def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray
     """Mean over the components that are not NaN; NaN where none is."""
     there = np.sum(~np.isnan(parts), axis=1)
     return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
-
-
-def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Mean of the values that are not NaN, and its standard error by Bartlett's weights, of values correlated in time.
-
-    The weights reach over the cube root of the length.
-    """
-    there = ~np.isnan(values)
-    count = max(int(there.sum()), 1)
-    mean = float(values[there].sum() / count)
-    apart = np.where(there, values - mean, 0.0)
-    # sum over t of (1 - |t| / width) sum_k e_k e_(k+t) is the mean over a window's width of squares of its moving sums.
-    width = int(np.ceil(len(values) ** (1 / 3))) + 1
-    sums = np.convolve(apart, np.ones(width))
-    return mean, float(np.sqrt(np.mean(sums**2) * (len(sums) / width)) / count)
 
 
 def innovations_of(
