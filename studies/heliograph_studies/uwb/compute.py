@@ -201,7 +201,8 @@ def judged(rule: str, drive: Drive, numbers: Numbers) -> Rule:
     return Rule(
         _rms(error), float(squared.mean() / 2), _rms(off(read.time, ahead)), numbers, read.time[used], place[used],
         np.sqrt(np.trace(covariance[used], axis1=1, axis2=2)), np.linalg.norm(error, axis=1), weight[used],
-        dict(zip(drive.names, summaries, strict=True)), [drive.names[i] for i in InnovationSummary.find_outlying(summaries)],
+        dict(zip(drive.names, summaries, strict=True)),
+        [drive.names[i] for i in InnovationSummary.find_outlying(summaries)],
     )  # fmt: skip
 
 
