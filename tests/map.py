@@ -22,7 +22,17 @@ PARTS = {
 ROOMS = {
     "ground": ["numerics", "engine", "disk", "factors"],
     "description": ["random_affine", "model"],
-    "estimation": ["linear", "relays", "h_infinity", "filters", "smoothing", "fusion", "simulation", "testing"],
+    "estimation": [
+        "linear",
+        "relays",
+        "h_infinity",
+        "filters",
+        "smoothing",
+        "fusion",
+        "simulation",
+        "forecasting",
+        "testing",
+    ],
     "design": ["learning", "planning"],
     "application": ["live", "export", "files", "report", "campaign", "serving", "cli"],
 }

@@ -10,6 +10,7 @@ from . import (
     smoothing as smoothing,
     fusion as fusion,
     simulation as simulation,
+    forecasting as forecasting,
     learning as learning,
     planning as planning,
     files as files,
@@ -120,6 +121,9 @@ from .simulation.results.record import (
 )
 from .simulation.results.sums import (
     Statistics as Statistics,
+)
+from .forecasting.forecast import (
+    forecast as forecast,
 )
 from .learning.description import (
     free as free,

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from heliograph.engine.choice import compute_once
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
+from heliograph.model.origin import KeptOrigin, Origin, last_input
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.masked import fill_masked
@@ -65,6 +66,7 @@ class Filtered:
         claim: what the covariances are: "exact", "upper", "nominal" or "none".
         weights: of each component in its update (steps, received), from 0 (left out) to 1 (in full); None of a filter
             that weighs nothing.
+        origin: the state after the last row, from which `hg.forecast` predicts; None where it was not kept.
     """
 
     means: np.ndarray
@@ -74,6 +76,7 @@ class Filtered:
     log_likelihoods: np.ndarray
     claim: Claim
     weights: np.ndarray | None = None
+    origin: KeptOrigin = field(default=None, compare=False, repr=False)
 
     @property
     def log_likelihood(self) -> float:
@@ -88,6 +91,16 @@ def over_rows(
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> PyTree:
     """Step a filter over rows inside a compiled computation: output(state, innovation, k) of each, stacked."""
+    return scan_rows(filter, z, u, output)[1]
+
+
+def scan_rows(
+    filter: Steps,
+    z: Float[Array, "steps received"],
+    u: Float[Array, "steps inputs"],
+    output: Callable[[PyTree, Innovation, jax.Array], PyTree],
+) -> tuple[PyTree, PyTree]:
+    """Step a filter over rows like `over_rows`; return its last state too, before the outputs."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         k, z_k, u_k = row
@@ -95,19 +108,21 @@ def over_rows(
         return after, output(after, innovation, k)
 
     start = jax.tree.map(jnp.asarray, filter.init())
-    return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    last, outputs = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))
+    return last, outputs
 
 
 def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
     """Run a filter over rows of data, by native code where it supports the filter."""
-    mean, covariance, innovation = compute_once(_results, _by_xla, (filter, *data_of(filter, z, u)))
+    rows_z, rows_u = data_of(filter, z, u)
+    state, (mean, covariance, innovation) = compute_once(_results, _by_xla, (filter, rows_z, rows_u))
     lost = ~np.isfinite(mean).all(axis=1)
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
         warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)
     return Filtered(
         mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
-        innovation.weight,
+        innovation.weight, Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), float(len(rows_z) - 1)),
     )  # fmt: skip
 
 
@@ -116,7 +131,7 @@ def _results(filter: Steps, z: Array, u: Array) -> PyTree:
         estimate = filter.after_step(state, k)
         return estimate.mean, estimate.covariance, innovation
 
-    return over_rows(filter, z, u, outputs_of)
+    return scan_rows(filter, z, u, outputs_of)
 
 
 _by_xla = quickly_compiled(_results)

@@ -20,6 +20,7 @@ from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim
 from heliograph.model.faults import function_fault
 from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
+from heliograph.model.origin import Origin
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
@@ -61,6 +62,7 @@ class Stream:
         self.limits = limits_of(filter.received, limits, invalid)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
         self.steps, self._last, self._beyond = 0, -1, 0
+        self._inputs = np.full(len(filter.inputs), np.nan)
         self._placed, self._angles = _place(filter), WideAngles(filter)
         self._stepper = self._placed.stepper()
 
@@ -105,7 +107,7 @@ class Stream:
         # The step itself; a flagged one is examined.
         if not stepper.step(z, u, k):
             self._refuse(z, u)
-        self.steps = k + 1
+        self.steps, self._inputs = k + 1, u
         if placed.values and not np.isnan(z[: placed.values]).all():
             self._last = k
         if outside is not None:
@@ -118,6 +120,13 @@ class Stream:
                 warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
         estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
         return lower_unsound_claim(estimate) if nis != nis else estimate
+
+    @property
+    def origin(self) -> Origin:
+        """Return the state after the last step, from which `hg.forecast` predicts."""
+        state = self._placed.state.unflatten([np.array(leaf) for leaf in self._stepper.state])
+        time, spacing = float(self.steps - 1), float("nan") if "dt" in self.filter.inputs else 1.0
+        return Origin(self.filter, state, self.steps, np.array(self._inputs), time, spacing)
 
     def _judge(self, beyond: bool) -> None:
         """Count measurements in a row that were not expected, and warn once of many."""
@@ -170,6 +179,7 @@ class Stream:
             "dropped": self.dropped.tolist(),
             "last": self._last,
             "beyond": self._beyond,
+            "inputs": [None if value != value else value for value in self._inputs.tolist()],
             "of": self._placed.identity,
         }
         return pack(head, leaves)
@@ -201,6 +211,8 @@ class Stream:
         check_same("snapshot", mine, other, SAME, accept_changes)
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
         new._last, new._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
+        held = head.get("inputs", [None] * len(filter.inputs))
+        new._inputs = np.array([np.nan if value is None else value for value in held], dtype=float)
         # Parts by their paths, which a version before 0.3.0 did not write.
         layout = new._placed.layout
         paths = head.get("paths", list(describe_old_layout(layout)))

@@ -20,6 +20,7 @@ from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, descripti
 from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.live.stored.snapshot import check_same, pack, unpack
 from heliograph.model.estimate import Estimate, JudgedEstimate, lower_unsound_claim
+from heliograph.model.origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -200,13 +201,28 @@ class Timeline:
 
         Each says what its filter made of what arrived at `now`: `nis`, `received` and `refused` of `JudgedEstimate`.
         """
+        return self._arrange_judgements(self._outputs(self._slot_now()[0]))
+
+    @property
+    def origin(self) -> Origin:
+        """Return the filters' states at `now`, from which `hg.forecast` predicts; late events are taken as before."""
+        (slot, now), pool, steps = self._slot_now(), self._fleet.pool, self._lanes.step_rows
+        row = pool.table[slot].copy()
+        held, dt = row[pool.held], self._lanes.dt
+        inputs = held if dt is None else np.insert(held, dt, np.nan)
+        state, spacing = steps.state.tree(row[pool.state]), 1.0 if dt is None else float("nan")
+        estimates = self._arrange_outputs(row[pool.outputs])
+        return Origin(self.network, state, int(row[pool.at.start]) + 1, inputs, now, spacing, estimates)
+
+    def _slot_now(self) -> tuple[int, float]:
+        """Return the slot of the row at `now`, which is looked ahead to where there is none, and its time."""
         newest, now = self._plant.rows.held[-1], self.now
         if self._lanes.dt is None:
             now = np.floor(min(now, self._fleet.end_step))
         if newest.key[1] != BEFORE and now <= newest.key[0]:
-            return self._arrange_judgements(self._outputs(newest.slot))
+            return newest.slot, float(newest.key[0])
         self._fleet.look(newest, now, self._spare)
-        return self._arrange_judgements(self._outputs(self._spare))
+        return self._spare, float(now)
 
     def senders(self) -> dict[str, SenderStatus]:
         """Return the status of each node's sender that decides when to send: what its silence means by now.

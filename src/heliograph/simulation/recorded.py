@@ -10,6 +10,8 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
+from heliograph.model.estimate import Estimate
+from heliograph.model.origin import Origin, last_input, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_times, fail, instance, rank, table
 from heliograph.numerics.dates import unequal_steps
@@ -110,13 +112,27 @@ def run(
             filters, {} if reports is None else table("reports", reports, "reports by fusion"), steps
         )
         outputs = _filter_plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
+    state = outputs.pop("state")
     record = record_of(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
     for line in (*wide_in_rows(network, record), *_describe_left_out(network, record)):
         warnings.warn(line, stacklevel=2)
-    return record if true is None else add_truth(record, network.plant, true, smooth)
+    origin = _origin(network, record, state, u)
+    return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
+
+
+def _origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> Origin:
+    """Where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
+    last = {
+        node: {name: Estimate(np.asarray(e.mean)[-1], np.asarray(e.covariance)[-1], e.claim) for name, e in of.items()}
+        for node, of in record.estimates.items()
+    }
+    spacing = usual_spacing(record.time)
+    if TIME_STEP in network.inputs and len(u) > 1:
+        spacing = float(np.median(u[1:, network.inputs.index(TIME_STEP)]))
+    return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last)
 
 
 def _drop_beyond_limits(
@@ -242,10 +258,11 @@ def _scan_in_parts(
         now = np.minimum(np.arange(start, start + size), len(u) - 1)
         k, u_k, z_k, drawn = jax.tree.map(lambda leaf, now=now: np.asarray(leaf)[now], rows)
         drawn |= {name: (drawn[name], mesh.ahead(drawn[name])) for name, mesh in filters.meshes.items()}
-        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), without)
+        counts = np.arange(start, start + size) < len(u)
+        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), without, counts)
         parts.append(to_numpy(results))
     whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
-    return to_numpy(_results(later, z, whole))
+    return to_numpy(_results(later, z, states, whole))
 
 
 def _run_filters(
@@ -253,27 +270,31 @@ def _run_filters(
     without: bool,
 ) -> PyTree:  # fmt: skip
     """Filter all rows; `without` implausible data."""
-    return _results(later, z, _scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), without)[1])
+    return _results(later, z, *_scan(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), without))
 
 
 def _scan(
-    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], without: bool
+    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], without: bool, counts: np.ndarray | None = None
 ) -> tuple[PyTree, dict[str, PyTree]]:
-    def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        k, u_k, z_k, drawn = row
-        if without:
-            return plausible_step(filters, states, z_k, u_k, k, drawn)
-        return filters.step(states, z_k, u_k, k, drawn)
+    """Step over rows; the states stay as they are at those that do not count."""
 
-    states, results = jax.lax.scan(body, states, rows)
+    def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+        (k, u_k, z_k, drawn), row_counts = row
+        step = plausible_step if without else AllFilters.step
+        after, results = step(filters, states, z_k, u_k, k, drawn)
+        if row_counts is not None:
+            after = jax.tree.map(lambda new, old: jnp.where(row_counts, new, old), after, states)
+        return after, results
+
+    states, results = jax.lax.scan(body, states, (rows, counts))
     return states, results
 
 
-def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[str, PyTree]) -> PyTree:
-    """Return what the filters judged, and their results, smoothed if there is a smoother."""
+def _results(later: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]) -> PyTree:
+    """Return what the filters judged, their last state, and their results, smoothed if there is a smoother."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if later is None else later.both(results)) | judged
+    return (results if later is None else later.both(results)) | judged | {"state": state}
 
 
 _by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan)

@@ -13,6 +13,9 @@ from .rts import (
 from .backward_pass import (
     smoother_steps as smoother_steps,
 )
+from .simulation_smoother import (
+    simulation_smoother as simulation_smoother,
+)
 from .rts import (
     Smoothed as Smoothed,
 )

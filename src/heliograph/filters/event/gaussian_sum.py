@@ -58,19 +58,19 @@ class EventBelief(NamedTuple):
     moved: jax.Array
 
     @property
-    def gaussian(self) -> Gaussian:
-        """The Gaussians of (x, r)."""
-        return Gaussian(self.mean, self.lower, self.variances)
+    def components(self) -> tuple[jax.Array, Gaussian]:
+        """The mixture: weights (H,), and the Gaussians of (x, r)."""
+        return self.weight, Gaussian(self.mean, self.lower, self.variances)
 
     @property
     def covariance(self) -> Any:
         """Covariances of (x, r)."""
-        return self.gaussian.covariance
+        return self.components[1].covariance
 
     @property
     def parts(self) -> GaussianSum:
         """The sum, with the logarithms of its weights."""
-        return GaussianSum(safe_log(self.weight), self.gaussian, self.label)
+        return GaussianSum(safe_log(self.weight), self.components[1], self.label)
 
     @staticmethod
     def of(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
@@ -163,7 +163,7 @@ class EventFilter(AbstractSizedFilter):
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
         """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
         plant, u, start = at(self.plant, k), jnp.asarray(u), start_of(self.plant)
-        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.gaussian)
+        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.parts.gaussian)
         if self.trigger.reference == "prediction":
             expected, places = self.reference(self._whole(state).mean, u, k), len(self.states) + np.arange(self.outputs)
             both = jax.vmap(lambda x: pin(x, places, expected))(both)

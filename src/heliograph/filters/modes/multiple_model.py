@@ -123,6 +123,11 @@ class ModalBeliefs(NamedTuple):
         return Gaussian(*self[:3])
 
     @property
+    def components(self) -> tuple[jax.Array, Gaussian]:
+        """The mixture: probabilities (M,) of the components, and these."""
+        return jnp.sum(self.weight, axis=1), self.parts
+
+    @property
     def covariance(self) -> Any:
         """Covariance of each component."""
         return self.parts.covariance

@@ -56,6 +56,11 @@ class Particles(NamedTuple):
         return Gaussian(*self[:3])
 
     @property
+    def components(self) -> tuple[jax.Array, Gaussian]:
+        """The mixture: weights (N,), and the Gaussian of each particle."""
+        return self.weight, self.parts
+
+    @property
     def covariance(self) -> Any:
         """Covariance of each particle."""
         return self.parts.covariance

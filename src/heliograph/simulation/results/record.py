@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -12,6 +13,7 @@ from typing_extensions import TypeAliasType
 from heliograph.disk.quoting import quote_for_figure
 from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Claim, Estimate, is_sound
+from heliograph.model.origin import KeptOrigin, Origin
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import units_in
@@ -80,6 +82,7 @@ class Record(Saved):
             was sent, negative where it was lost, 0 where it was not sent.
         weighed: of a recording, by node and filter that weighs what arrives: `value` and `variance` of its innovations
             and their `weight` in the update, (time, received) each; `outputs` summarises them.
+        origin: of what `hg.run` returns, the filters' last states, from which `hg.forecast` predicts; not saved.
     """
 
     time: Array
@@ -93,11 +96,18 @@ class Record(Saved):
     reports: Reports = field(default_factory=dict)
     transmissions: ByNode = field(default_factory=dict)
     weighed: Weights = field(default_factory=dict)
+    origin: KeptOrigin = field(default=None, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Take the units of states whose names have one; units given apart come first."""
         if isinstance(self.states, tuple) and (units := units_in(self.states)):
             object.__setattr__(self, "units", units | self.units)
+
+    def with_origin(self, origin: Origin) -> "Record":
+        """Return the same record with the states in which its filters ended."""
+        changed = copy(self)
+        vars(changed)["origin"] = origin
+        return changed
 
     @property
     def runs(self) -> int | None:

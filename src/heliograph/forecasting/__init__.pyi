@@ -1,0 +1,14 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .paths import (
+    Paths as Paths,
+    draw_paths as draw_paths,
+)
+from .threshold import (
+    Crossing as Crossing,
+    crossing as crossing,
+)
+from .prediction import (
+    Forecast as Forecast,
+    Prediction as Prediction,
+)

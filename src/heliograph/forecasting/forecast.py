@@ -1,0 +1,191 @@
+"""Forecasts from any result or live object: its filters predicted from their last state, which stays as it is."""
+
+from dataclasses import replace
+from typing import NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+
+from heliograph.factors.gaussian import given
+from heliograph.filters.base import AbstractFilter, FilterAngles
+from heliograph.filters.gaussian.belief import open_loop_filter
+from heliograph.forecasting.horizons import Ahead, Horizons, Inputs, ahead_of, check_ahead
+from heliograph.forecasting.outlook import Outlook, look_ahead, outlook_of, output_claim, prediction_of
+from heliograph.forecasting.prediction import Forecast
+from heliograph.model.enlarged import joint_sensor
+from heliograph.model.estimate import Estimate, weakest
+from heliograph.model.origin import HasOrigin, Origin
+from heliograph.model.over_time import first
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node, received_names
+
+Forecasts: TypeAlias = dict[str, dict[str, Forecast]]  # by node and filter
+
+
+def forecast(source: HasOrigin, horizons: Horizons, inputs: Inputs = None) -> Forecast | Forecasts:
+    """Forecast states, what sensors would measure, and what would arrive, from what has arrived so far.
+
+    Each filter predicts from its last state as if nothing arrived any more; `source` stays as it is. Modes and
+    particles are predicted as mixtures. The claim is the filter's own: a filter that is exact is so ahead.
+
+    Args:
+        source: what `filter.run`, `hg.run`, a `Stream` or a `Timeline` is: anything with an `origin`.
+        horizons: a number of steps, for each up to it; or a list of how far ahead: in steps, as spans of time or as
+            dates. Where the plant has an input dt, numbers in a list are times, which may lie between steps.
+        inputs: what the plant will get, (steps up to the last horizon, inputs), where it has an input dt a row up to
+            each horizon and no column of dt; "held" for those of the last step. Needed where the plant has inputs.
+
+    Returns:
+        A `Forecast` of a single filter; of a network one for each estimate, by node and filter.
+
+    Raises:
+        ValueError: nothing to forecast from, horizons that are not after the data, inputs that are missing or of
+            another shape, more steps than the model covers.
+
+    Source: the prediction step of the filter, repeated.
+    """
+    origin = origin_of(source)
+    forecasts = forecasts_from(origin, horizons, inputs)
+    return forecasts if isinstance(origin.model, Network) else forecasts[""][""]
+
+
+def origin_of(source: object) -> Origin:
+    """Return where a forecast starts.
+
+    Raises:
+        ValueError: something without an origin, or a record whose filters' states were not kept.
+    """
+    origin = getattr(source, "origin", None)
+    if not isinstance(origin, Origin):
+        expected = "a result of filter.run or hg.run, a Stream or a Timeline"
+        got = type(source).__name__
+        raise fail(
+            "forecast",
+            expected,
+            f"a {got} without states, as files and simulations have" if hasattr(source, "origin") else got,
+        )
+    return origin
+
+
+def forecasts_from(origin: Origin, horizons: Horizons, inputs: Inputs) -> Forecasts:
+    """Forecast each estimate of an origin, by node and filter; a single filter is called ""."""
+    model = origin.model
+    assert isinstance(model, Network | AbstractFilter)  # nothing else makes one
+    ahead = ahead_of(origin, model.inputs, horizons, inputs)
+    forecasts: Forecasts = {}
+    for target in targets_of(origin):
+        check_covered(target.outlook.filter, origin.step, len(ahead.u))
+        forecasts.setdefault(target.node, {})[target.filter] = _one(target, origin.step, ahead)
+    return forecasts
+
+
+class Target(NamedTuple):
+    """An estimate that is forecast: its node and filter, how it is read ahead, its state, the names of what arrives."""
+
+    node: str
+    filter: str
+    outlook: Outlook
+    state: PyTree
+    received: tuple[str, ...]
+
+
+def target_of(origin: Origin, node: str | None, filter: str | None) -> Target:
+    """Return the estimate of this node and filter, or the only one where they are None.
+
+    Raises:
+        ValueError: none, or several of them.
+    """
+    every = targets_of(origin)
+    found = [t for t in every if node in (None, t.node) and filter in (None, t.filter)]
+    if len(found) != 1:
+        known = ", ".join(f"{t.node}/{t.filter}" for t in every)
+        raise fail("node and filter", f"one of {known}", "none" if node is filter is None else f"{node}/{filter}")
+    return found[0]
+
+
+def targets_of(origin: Origin) -> list[Target]:
+    """List the estimates that an origin has."""
+    model = origin.model
+    if isinstance(model, AbstractFilter):
+        outlook = outlook_of(model)
+        outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
+        return [Target("", "", outlook, origin.state, received_names(outputs, model.received))]
+    assert isinstance(model, Network)
+    kinds, central, *_ = origin.state
+    found = []
+    for node, filters in origin.estimates.items():
+        for name, estimate in filters.items():
+            if (node, name) in model.places:
+                kind, f, i = model.places[node, name]
+                place = f * len(model.groups[model.kinds[kind].group]) + i
+                filter, state = model.nodes[node].filters[name], _entry(kinds[kind], place)
+            elif name in central:
+                known = model.fused[name]
+                assert isinstance(known, AbstractFilter)
+                filter, state = known, central[name]
+            else:
+                filter, state = _moved_alone(model, estimate)
+            outlook = outlook_of(filter, _sensor_of(model, node), model.plant)
+            found.append(Target(node, name, outlook, state, _received(model, node)))
+    return found
+
+
+def _entry(stacked: PyTree, place: int) -> PyTree:
+    """One of the states of filters that are stacked."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[place], stacked)
+
+
+def _moved_alone(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
+    """A fused estimate as the state of a filter that only predicts: exact and upper covariances stay so if linear."""
+    plant = first(network.plant)
+    linear = isinstance(plant, LinearPlant) and not plant.circular
+    claim = estimate.claim if linear or estimate.claim == "none" else weakest([estimate.claim, "nominal"])
+    filter = open_loop_filter(network.plant)
+    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    lowered = replace(filter, claim=claim)
+    object.__setattr__(lowered, "kept", filter.kept)
+    return lowered, given(mean, covariance if claim != "none" else np.zeros_like(covariance))
+
+
+def _sensor_of(network: Network, node: str) -> AnySensor | None:
+    """The sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary."""
+    if node != FUSED:
+        single = network.nodes[node]
+        return single.sensor if isinstance(single, Node) else None
+    whole = {name: single.sensor for name, single in network.nodes.items() if isinstance(single, Node)}
+    sensors = {name: sensor for name, sensor in whole.items() if isinstance(sensor, AbstractSensor)}
+    return None if len(sensors) < len(network.nodes) else joint_sensor(sensors)
+
+
+def _received(network: Network, node: str) -> tuple[str, ...]:
+    if node != FUSED:
+        return network.nodes[node].received_names
+    return tuple(f"{name}_{part}" for name in network.names for part in network.nodes[name].received_names)
+
+
+def check_covered(filter: AbstractFilter, step: int, count: int) -> None:
+    """Raise ValueError where what varies over time ends before these steps ahead."""
+    if filter.horizon is not None and step + count > filter.horizon:
+        left = max(filter.horizon - step, 0)
+        raise fail("horizons", f"at most {left} steps, which the model covers behind the data", count)
+
+
+def _one(target: Target, step: int, ahead: Ahead) -> Forecast:
+    """Forecast of one filter."""
+    outlook, filter = target.outlook, target.outlook.filter
+    check_ahead(filter.inputs, ahead, filter, step)
+    states, outputs, received = (
+        None if part is None else type(part)(*(np.asarray(leaf)[ahead.rows] for leaf in part))
+        for part in look_ahead(outlook, target.state, ahead.u, step)
+    )
+    assert states is not None
+    angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
+    claim = filter.claim
+    measured = outputs and prediction_of(outputs, tuple(sensor.outputs), output_claim(filter, outlook), sensor.angles)
+    arriving = received and prediction_of(received, target.received, claim, angles.received)
+    whole = prediction_of(states, filter.states, claim, angles.states)
+    return Forecast(ahead.steps, ahead.time, whole, measured, arriving, ahead.inputs)

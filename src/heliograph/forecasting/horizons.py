@@ -1,0 +1,165 @@
+"""How far ahead, and with which inputs: horizons in steps, time or dates as rows of inputs to predict with."""
+
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
+
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.forecasting.prediction import InputsAhead
+from heliograph.model.inputs import check_inputs
+from heliograph.model.origin import Origin
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import array, check_count, fail, is_whole, rank, shown
+from heliograph.numerics.types import ArrayLike, Float, units_in
+
+Horizon = int | float | timedelta | datetime | np.timedelta64 | np.datetime64
+Horizons = TypeAliasType("Horizons", Horizon | Sequence[Horizon] | np.ndarray)
+Inputs = TypeAliasType("Inputs", ArrayLike | Literal["held"] | None)  # rows ahead
+SECOND = 1e9  # nanoseconds
+OFF = 0.25  # of a step: months and years differ by less from the usual one
+LONGEST = 1_000_000  # steps ahead
+
+
+@runtime_checkable
+class HasInputs(Protocol):
+    """A filter or a network, with the names of its inputs."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+
+
+class Ahead(NamedTuple):
+    """Rows to predict over: u (rows, inputs), the number of the row that ends at each horizon, and their times."""
+
+    u: Float[np.ndarray, "rows inputs"]
+    rows: np.ndarray
+    steps: np.ndarray
+    time: np.ndarray
+    inputs: InputsAhead
+
+
+def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: Inputs) -> Ahead:
+    """Return the rows of inputs from an origin to each horizon.
+
+    Where time counts steps there is a row a step; where the plant has an input dt, a row from each horizon to the next.
+
+    Raises:
+        ValueError: a horizon that is not behind the one before, or behind the data; inputs that are not those of the
+            rows, none of a plant that has some, or none to hold.
+    """
+    continuous = TIME_STEP in names
+    distances = _in_time(origin, horizons) if continuous else _in_steps(origin, horizons)
+    if np.any(np.diff(distances, prepend=0.0) <= 0):
+        raise fail("horizons", "times after the data, each later than the one before", shown(horizons))
+    count = len(distances) if continuous else int(distances[-1])
+    others = [name for name in names if name != TIME_STEP]
+    given, said = _inputs_of(origin, names, others, inputs, count)
+    u = given
+    if continuous:
+        u = np.insert(given, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=1)
+    rows = np.arange(count) if continuous else distances.astype(int) - 1
+    return Ahead(
+        u, rows, distances if continuous else distances.astype(int), _clock(origin, distances, continuous), said
+    )
+
+
+def _in_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
+    """Horizons as numbers of steps."""
+    if is_whole(horizons):
+        return np.arange(1.0, _count(horizons) + 1)
+    steps = []
+    for one in _listed(horizons):
+        if (seconds := _seconds(origin, one)) is None:
+            steps.append(float(_count(one)))
+            continue
+        if not origin.spacing > 0:
+            raise fail("horizons", "numbers of steps, where the time between them is not known", shown(one))
+        count = seconds / origin.spacing
+        if abs(count - round(count)) > OFF:
+            raise fail("horizons", f"whole steps of {origin.spacing:g} s", f"{shown(one)}, {count:.4g} steps ahead")
+        steps.append(float(round(count)))
+    return np.array(steps)
+
+
+def _in_time(origin: Origin, horizons: Horizons) -> np.ndarray:
+    """Horizons as times ahead in the unit of dt, of dates in seconds; a whole number counts steps of the usual size."""
+    if is_whole(horizons):
+        if not origin.spacing > 0:
+            raise fail("horizons", "times ahead, such as [1.0, 5.0], where no step is usual", horizons)
+        return origin.spacing * np.arange(1, _count(horizons) + 1)
+    listed = [(one, _seconds(origin, one)) for one in _listed(horizons)]
+    return np.array(
+        [float(array("horizon", cast(ArrayLike, one), ())) if seconds is None else seconds for one, seconds in listed]
+    )
+
+
+def _count(value: object) -> int:
+    count = check_count("horizons", value)
+    if count > LONGEST:
+        raise fail("horizons", f"at most {LONGEST:,} steps", count)
+    return count
+
+
+def _listed(horizons: object) -> list[object]:
+    single = isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64)
+    listed: list[object] = [horizons] if single else list(horizons) if rank("horizons", horizons) == 1 else []  # type: ignore[call-overload]
+    if not listed:
+        raise fail("horizons", "a number of steps, or a list of how far ahead", shown(horizons))
+    return listed
+
+
+def _seconds(origin: Origin, one: object) -> float | None:
+    """Seconds ahead of a span of time or a date; None of a number."""
+    if isinstance(one, timedelta | np.timedelta64):
+        unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
+        if unit != "s":
+            raise fail("horizons", f"numbers of {unit}, the unit of dt", shown(one))
+        return float(np.timedelta64(one, "ns").astype(np.int64)) / SECOND
+    if not isinstance(one, datetime | np.datetime64):
+        return None
+    if not isinstance(origin.time, np.datetime64):
+        raise fail("horizons", "how far ahead, as the data have no dates", shown(one))
+    ahead = np.datetime64(one).astype("datetime64[ns]") - origin.time.astype("datetime64[ns]")
+    if ahead <= np.timedelta64(0, "ns"):
+        raise fail("horizons", f"dates after the data, which end at {origin.time}", shown(one))
+    return float(ahead.astype(np.int64)) / SECOND
+
+
+def _inputs_of(
+    origin: Origin, names: Sequence[str], others: Sequence[str], inputs: Inputs, count: int
+) -> tuple[np.ndarray, InputsAhead]:
+    """Rows of inputs other than dt, and whether they were given or held."""
+    if isinstance(inputs, str) and inputs != "held":
+        raise fail("inputs ahead", 'an array, or "held"', repr(inputs))
+    if not others:
+        if inputs is not None and not isinstance(inputs, str) and np.size(inputs):
+            raise fail("inputs ahead", "none, as the plant has none but dt", f"shape {np.shape(inputs)}")
+        return np.zeros((count, 0)), "none"
+    if inputs is None:
+        raise fail("inputs ahead", f'rows of {list(others)} for {count} steps, or "held"', "none")
+    if not isinstance(inputs, str):
+        single = len(others) == 1 and rank("inputs ahead", inputs) == 1
+        return array("inputs ahead", np.reshape(inputs, (-1, 1)) if single else inputs, (count, len(others))), "given"
+    held = origin.inputs[[list(names).index(name) for name in others]]
+    if np.isnan(held).any():
+        raise fail("inputs ahead", "rows, as there is no last step whose inputs could be held", '"held"')
+    return np.tile(held, (count, 1)), "held"
+
+
+def check_ahead(names: Sequence[str], ahead: Ahead, models: object, step: int) -> None:
+    """Refuse inputs for which a function of the plant returns what it must not."""
+    check_inputs(names, ahead.u, models, step)
+
+
+def _clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
+    """Time of each horizon on the clock of the data."""
+    spacing = 1.0 if continuous else origin.spacing
+    if not isinstance(origin.time, np.datetime64):
+        return np.asarray(origin.time + (1.0 if np.isnan(spacing) else spacing) * distances)
+    if np.isnan(spacing):
+        return np.full(len(distances), np.datetime64("NaT", "ns"))
+    ahead = np.round(SECOND * spacing * distances).astype(np.int64).astype("timedelta64[ns]")
+    return np.asarray(origin.time.astype("datetime64[ns]") + ahead)

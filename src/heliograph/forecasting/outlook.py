@@ -1,0 +1,155 @@
+"""A filter stepped without data: its states ahead, what its sensor would measure, and what would arrive."""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compiled, computed
+from heliograph.factors.gaussian import Gaussian, given, leading
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.signal import signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.modes.mode_observed import ModeObservedFilter
+from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.forecasting.prediction import Prediction
+from heliograph.model.estimate import Claim, weakest
+from heliograph.model.over_time import at, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+
+
+@runtime_checkable
+class HasComponents(Protocol):
+    """A filter's state that is a mixture: weights (K,), and Gaussians (K, ...) whose first numbers are the states."""
+
+    @property
+    def components(self) -> tuple[jax.Array, Gaussian]:
+        """Weights and Gaussians."""
+
+
+class Moments(NamedTuple):
+    """Weights (K,), means (K, m) and covariances (K, m, m) of a mixture."""
+
+    weights: jax.Array
+    means: jax.Array
+    covariances: jax.Array
+
+
+class Outlook(Module):
+    """How a filter's states are read ahead: by its plant and sensor (None: outputs are not), and its own correction."""
+
+    filter: AbstractFilter
+    plant: AnyPlant | None
+    sensor: AnySensor | None
+    transform: AbstractTransform
+    receives: bool = eqx.field(static=True)
+
+    def mixture(self, state: PyTree) -> Moments:
+        """Moments of the states, one part of a filter that has no more; the means alone where nothing is claimed."""
+        if isinstance(state, HasComponents):
+            weights, parts = state.components
+            parts = leading(parts, len(self.filter.states))
+            return Moments(weights, parts.mean, jnp.asarray(jax.vmap(lambda x: x.covariance)(parts)))
+        estimate = self.filter.estimate(state)
+        covariance = jnp.asarray(estimate.covariance)
+        known = covariance if self.filter.claim != "none" else jnp.zeros_like(covariance)
+        return Moments(jnp.ones(1), jnp.asarray(estimate.mean)[None], known[None])
+
+    def moments(self, state: PyTree) -> Moments:
+        """Moments of the states as they are now, as NumPy arrays."""
+        return _now(self, state)
+
+    def measured(self, states: Moments, k: jax.Array) -> Moments | None:
+        """Moments of what the sensor would measure, part by part."""
+        if self.sensor is None or self.plant is None:
+            return None
+        plant, sensor, start = at(self.plant, k), at(self.sensor, k), start_of(self.plant)
+
+        def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+            signal = signal_of(plant, sensor, self.transform, given(mean, covariance), start)
+            return signal.mean, signal.covariance
+
+        means, covariances = jax.vmap(of_part)(states.means, states.covariances)
+        return Moments(states.weights, means, covariances)
+
+    def received(self, prior: PyTree, k: jax.Array) -> Moments | None:
+        """Moments of what would arrive: of z = 0 the innovation is minus what is expected, with that covariance."""
+        if not self.receives:
+            return None
+        _, innovation = self.filter.correct(prior, jnp.zeros(self.filter.received), k)
+        return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], jnp.asarray(innovation.covariance)[None])
+
+    def step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
+        """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
+        prior = self.filter.predict(state, u, k)
+        states = self.mixture(prior)
+        return prior, (states, self.measured(states, k), self.received(prior, k))
+
+
+def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
+    """Outlook of a filter, by the plant and sensor that it believes in, or by these where it does not say."""
+    premise = filter.premise
+    plant = plant if premise is None else premise.plant
+    believed = sensor if premise is None or premise.sensor is None else premise.sensor
+    flagged = isinstance(filter, ModeObservedFilter) or (isinstance(filter, SideInformationFilter) and filter.flagged)
+    transform = getattr(filter, "transform", None)
+    return Outlook(
+        filter=filter,
+        plant=plant,
+        sensor=believed if plant is not None else None,
+        transform=transform if isinstance(transform, AbstractTransform) else Cubature(),
+        receives=bool(filter.received) and not filter.silence_tells and not flagged,
+    )
+
+
+@compiled
+def _now(outlook: Outlook, state: PyTree) -> Moments:
+    return outlook.mixture(state)
+
+
+def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int) -> tuple[Moments | None, ...]:
+    """Moments at each row ahead (rows, K, ...), by native code where it supports the filter."""
+    arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
+    moments: tuple[Moments | None, ...] = computed(_look_ahead, _by_xla, arguments)
+    return moments
+
+
+def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
+    def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        return outlook.step(state, *row)
+
+    rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
+    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)[1]
+
+
+_by_xla = quickly_compiled(_look_ahead)
+
+
+def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles) -> Prediction:
+    """Prediction of these moments (horizons, K, ...), its angles between -pi and pi."""
+    weights, means, covariances = map(np.asarray, moments)
+    variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
+    means = nearest(means, means[:, :1], angles)
+    # First two moments of the mixture: within its parts, and between their means.
+    mean = np.einsum("hk,hkm->hm", weights, means)
+    apart = means - mean[:, None]
+    covariance = np.einsum("hk,hkij->hij", weights, covariances) + np.einsum("hk,hki,hkj->hij", weights, apart, apart)
+    if claim == "none":
+        covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
+    near = wrapped(mean, angles)
+    return Prediction(names, near, covariance, claim, weights, means + (near - mean)[:, None], variances)
+
+
+def output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
+    """Claim of outputs: that of the states, by a linear sensor without angles; nominal by any other."""
+    sensor = first(outlook.sensor)
+    plain = isinstance(sensor, LinearSensor) and not sensor.circular
+    return filter.claim if plain or filter.claim == "none" else weakest([filter.claim, "nominal"])

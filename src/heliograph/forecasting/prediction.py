@@ -1,0 +1,139 @@
+"""What a forecast says of several numbers at several horizons: mean, covariance, quantiles, probabilities."""
+
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+from typing_extensions import TypeAliasType
+
+from heliograph.model.estimate import Claim
+from heliograph.numerics.check import array, fail, scalar
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float
+
+HALVINGS = 80  # of a bracket of a quantile: from some deviations to the last digit
+Array = TypeAliasType("Array", np.ndarray)
+InputsAhead: TypeAlias = Literal["none", "given", "held"]
+
+
+@readable
+@dataclass(frozen=True)
+class Prediction:
+    """The law of some numbers at each horizon: a Gaussian, or a mixture of K of them, of which each part is Gaussian.
+
+    Quantiles and probabilities are of the mixture; mean and covariance are its first two moments. The quantiles of an
+    angle go on from its mean, so that a band about pi stays a band.
+
+    Args:
+        names: of the numbers, m of them.
+        mean: (horizons, m), angles between -pi and pi.
+        covariance: of the error (horizons, m, m); NaN where nothing is claimed.
+        claim: what the covariance is: "exact", "upper", "nominal" or "none".
+        weights: of the parts (horizons, K).
+        part_means: (horizons, K, m), angles within half a turn of the mean's.
+        part_variances: (horizons, K, m).
+    """
+
+    names: tuple[str, ...]
+    mean: Array
+    covariance: Array
+    claim: Claim
+    weights: Array = field(repr=False)
+    part_means: Array = field(repr=False)
+    part_variances: Array = field(repr=False)
+
+    @property
+    def deviation(self) -> Float[np.ndarray, "horizons m"]:
+        """Claimed standard deviations (horizons, m)."""
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return np.sqrt(np.where(variances >= 0, variances, np.nan))
+
+    def quantile(self, level: float) -> Float[np.ndarray, "horizons m"]:
+        """Return the number below which each lies with probability `level`, (horizons, m).
+
+        Raises:
+            ValueError: a level that is no probability between 0 and 1.
+        """
+        p = float(scalar("level of a quantile", level, 0, 1))
+        if not 0 < p < 1:
+            raise fail("level of a quantile", "a probability between 0 and 1", level)
+        means, deviations = self.part_means, np.sqrt(self.part_variances)
+        each = means + ndtri(p) * deviations
+        # The mixture's lies between the least and the greatest of its parts': halve that interval.
+        low, high = each.min(axis=1), each.max(axis=1)
+        for _ in range(HALVINGS if means.shape[1] > 1 else 0):
+            middle = (low + high) / 2
+            below = self._below(middle) < p
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return np.where(np.isnan(self.deviation), np.nan, (low + high) / 2)
+
+    def interval(self, coverage: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+        """Return both ends (horizons, m) of the interval that holds each number with this probability, half outside
+        on each side.
+
+        Args:
+            coverage: probability inside, between 0 and 1.
+
+        Raises:
+            ValueError: a coverage that is no probability between 0 and 1.
+        """
+        inside = float(scalar("coverage", coverage, 0, 1))
+        return self.quantile((1 - inside) / 2), self.quantile((1 + inside) / 2)
+
+    def below(self, values: ArrayLike) -> Float[np.ndarray, "horizons m"]:
+        """Return the probability that each number lies below a value: one for all, (m,), or (horizons, m).
+
+        Raises:
+            ValueError: values of another shape.
+        """
+        numbers = np.asarray(values, dtype=float)
+        if numbers.shape not in ((), self.mean.shape[1:], self.mean.shape):
+            raise fail("values", f"one, or shape {self.mean.shape[1:]} or {self.mean.shape}", f"shape {numbers.shape}")
+        limits = np.broadcast_to(array("values", numbers, numbers.shape), self.mean.shape)
+        return np.where(np.isnan(self.deviation), np.nan, self._below(limits))
+
+    def _below(self, limits: np.ndarray) -> np.ndarray:
+        """Sum of weight_k P(part k < limit), a part without variance being its mean."""
+        away = limits[:, None] - self.part_means
+        spread = np.sqrt(self.part_variances)
+        certain = np.where(away > 0, np.inf, np.where(away < 0, -np.inf, 0.0))
+        units = np.where(spread > 0, away / np.where(spread > 0, spread, 1.0), certain)
+        total: np.ndarray = np.einsum("hk,hkm->hm", self.weights, ndtr(units))
+        return total
+
+
+@readable
+@dataclass(frozen=True)
+class Forecast:
+    """What one filter says of the future, given what has arrived so far.
+
+    Args:
+        steps: how far each horizon is: in steps, or in the unit of time where the plant has an input dt.
+        time: of each horizon (horizons,), on the clock of the data: numbers or dates.
+        states: the states.
+        outputs: what the sensor would measure; None of a filter that does not say which sensor it is for.
+        received: what would arrive of it through the channel, if anything arrives; None of a filter that uses no
+            measurements, or for which not to receive one is a measurement.
+        inputs: whether inputs were "given" or "held" at those of the last step; "none" of a plant without.
+    """
+
+    steps: np.ndarray
+    time: np.ndarray
+    states: Prediction
+    outputs: Prediction | None
+    received: Prediction | None
+    inputs: InputsAhead
+
+    def named(self, name: str) -> tuple[Prediction, int]:
+        """Return the prediction that has a number of this name, states first, and its place there.
+
+        Raises:
+            ValueError: no state, output or received number of this name.
+        """
+        predictions = [part for part in (self.states, self.outputs, self.received) if part is not None]
+        for prediction in predictions:
+            if name in prediction.names:
+                return prediction, prediction.names.index(name)
+        known = dict.fromkeys(known for prediction in predictions for known in prediction.names)
+        raise fail("name", f"one of {', '.join(known)}", repr(name))

@@ -1,0 +1,58 @@
+"""Where a forecast starts: the state of a filter, or of a network's filters, after what arrived last."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.dates import seconds_between
+from heliograph.numerics.types import PyTree
+
+Moment: TypeAlias = "float | np.datetime64"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Origin:
+    """The last state of a filter or network, from which forecasts predict; nothing of it is changed by them.
+
+    Args:
+        model: the filter, or the network.
+        state: its state after the last step: of a network that of all its filters.
+        step: number of the first step ahead, from 0.
+        inputs: inputs of the last step (inputs,), which a forecast may hold; NaN where there was none.
+        time: of the last step, a number or a date.
+        spacing: usual time between steps, of dates in seconds; NaN where it is not known.
+        estimates: of a network, the last ones by node and filter.
+    """
+
+    model: object
+    state: PyTree
+    step: int
+    inputs: np.ndarray
+    time: Moment
+    spacing: float = float("nan")
+    estimates: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
+
+
+KeptOrigin = TypeAliasType("KeptOrigin", Origin | None)  # None where no state was kept
+
+
+class HasOrigin(Protocol):
+    """A result or a live object from which one can forecast."""
+
+    @property
+    def origin(self) -> Origin | None:
+        """Where a forecast starts; None where no state was kept."""
+
+
+def last_input(u: np.ndarray) -> np.ndarray:
+    """Return the inputs of the last of some rows (steps, inputs); NaN without rows."""
+    return np.asarray(u[-1] if len(u) else np.full(u.shape[1], np.nan), dtype=float)
+
+
+def usual_spacing(time: np.ndarray) -> float:
+    """Return the median time between rows, of dates in seconds; NaN of fewer than two."""
+    return float(np.median(seconds_between(np.asarray(time))[1:])) if len(time) > 1 else float("nan")

@@ -1,0 +1,87 @@
+"""Paths of the past, drawn given all data: a filter ahead, and draws on the way back."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import square_root
+from heliograph.factors.gaussian import Gaussian
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.rows import data_of
+from heliograph.filters.smoother_step import SmootherStep
+from heliograph.numerics.angle import wrapped
+from heliograph.numerics.check import check_count, check_seed, fail, instance
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.smoothing.backward_pass import row, rows_of, stepped
+
+
+def simulation_smoother(
+    filter: AbstractFilter,
+    z: Float[ArrayLike, "steps received"],
+    u: Float[ArrayLike, "steps inputs"] | None = None,
+    draws: int = 1000,
+    seed: int = 0,
+) -> Float[np.ndarray, "draws steps n"]:
+    """Draw paths of the states given all rows: of what smoothed means and covariances are the moments.
+
+    The last state is drawn from its filtered law, each one before from its law given the state drawn after it:
+    x_k = m + K (x_{k+1} - m-) + e. So whole paths are right, not each state alone: how long a level was passed, the
+    greatest value, the sum. Of a linear Gaussian model they are exact draws.
+
+    Args:
+        filter: a filter that can be smoothed; any that keeps a covariance.
+        z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
+        u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+        draws: number of paths; 1000 by default.
+        seed: of the random numbers; 0 by default.
+
+    Returns:
+        States (draws, steps, n), angles between -pi and pi.
+
+    Raises:
+        ValueError: data of another size than the filter's, no rows, a filter that cannot be smoothed.
+
+    Source: Fruehwirth-Schnatter, Data augmentation and dynamic linear models (1994); Carter and Kohn (1994).
+    """
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    rows, inputs = data_of(filter, z, u)
+    if not len(rows):
+        raise fail("measurements", "at least one row", "none")
+    keys = jax.random.split(jax.random.key(check_seed("seed", seed)), check_count("draws", draws))
+    return np.asarray(_drawn(filter, rows, inputs, keys))
+
+
+@compiled
+def _drawn(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
+    _, steps = stepped(filter, z, u, filter.init(), np.asarray(0))
+    drawn: jax.Array = jax.vmap(lambda key: _path(steps, key))(keys)
+    return drawn
+
+
+def _path(steps: SmootherStep, key: jax.Array) -> jax.Array:
+    """Draw one path back from the last step."""
+
+    def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        previous, step, key = pair
+        left = step.before.left
+        x = _draw(left._replace(mean=step.before.mean_given(later)), key)
+        return x, _plant_state(previous, x)
+
+    last, keys = row(steps, -1), jax.random.split(key, len(steps.mean))
+    end = _draw(last.after, keys[-1])
+    pairs = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None)), keys[:-1]
+    _, earlier = jax.lax.scan(body, end, pairs, reverse=True)
+    return jnp.concatenate([earlier, _plant_state(last, end)[None]])
+
+
+def _draw(law: Gaussian, key: jax.Array) -> jax.Array:
+    """Draw m + L diag(d)^1/2 e with e standard normal."""
+    normal = jax.random.normal(key, law.variances.shape, dtype=float)
+    return jnp.asarray(law.mean + law.root @ (square_root(law.variances) * normal))
+
+
+def _plant_state(step: SmootherStep, x: jax.Array) -> jax.Array:
+    """Return the plant's state of the filter's."""
+    x = x if step.projection is None else step.projection @ x
+    return wrapped(x if step.shift is None else x + step.shift, step.angles)
