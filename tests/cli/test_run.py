@@ -166,3 +166,25 @@ def test_nothing_is_left_when_the_disk_fills(folder, capsys, monkeypatch):
     (folder / "out.csv").write_text("before")
     monkeypatch.setattr(os, "replace", full)
     refused(folder, capsys, run_arguments(), "out.csv: No space left on device")
+
+
+@pytest.mark.slow
+def test_forecasts_are_rows_behind_the_data_and_a_part_of_the_page(tmp_path, capsys):
+    """`--forecast 3`: three marked rows, a line on the inputs, a section of the report; MCAP is refused."""
+    (tmp_path / "level.py").write_text(
+        "import heliograph as hg\n"
+        "plant = hg.LinearPlant([[1.0]], 1.0, [0.0], 4.0, [[1.0]], states=['level'], inputs=['flow'])\n"
+        "sensor = hg.LinearSensor([[1.0]], 0.5, outputs=['height'])\n"
+        "node = hg.Node(sensor, hg.perfect(1), {'f': hg.kalman_filter(plant, sensor)})\n"
+        "network = hg.Network(plant, {'a': node})\n"
+    )
+    rows = "".join(f"{k},0.5,{k}\n" for k in range(30))
+    (tmp_path / "data.csv").write_text(f"time,flow,height\n{rows}")
+    call = ["run", str(tmp_path / "level.py"), "--measurements", str(tmp_path / "data.csv"), "--forecast", "3"]
+    assert cli.main([*call, "--out", str(tmp_path / "out.csv"), "--report", str(tmp_path / "report")]) == 0
+    assert "forecast: 3 rows behind the data, to 32.0, inputs held at those of the last row" in capsys.readouterr().out
+    written = (tmp_path / "out.csv").read_text().splitlines()
+    assert [line.split(",")[1] for line in written[-4:]] == ["0", "1", "1", "1"]
+    assert "Inputs are held at those of the last row." in (tmp_path / "report" / "report.html").read_text()
+    assert cli.main([*call, "--out", str(tmp_path / "out.mcap")]) == 2
+    assert "--forecast: expected a table of estimates" in capsys.readouterr().err

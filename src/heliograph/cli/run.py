@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from heliograph.files.event_table import EventTable
+    from heliograph.files.forecasts import ByFilter
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.report.progress import Advance
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from heliograph.smoothing.modes import AbstractSmoothing
 
     Write = Callable[[Record, Path], None]
+    Horizons = int | list[float | np.timedelta64 | np.datetime64]
 
 
 def run(
@@ -39,6 +41,7 @@ def run(
     report: Annotated[Path | None, path_option("Folder of figures, and a page on estimates and links.")] = None,
     smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
     lag: Annotated[float | None, Parameter(help="Of messages: also estimates given what came so much later.")] = None,
+    forecast: Annotated[str, Parameter(help="How far ahead: 12 rows, or 5s,1min, or dates; marked as such.")] = "",
     reading: ReadingOptions | None = None,
 ) -> None:
     """Run the filters of your own network over measured data.
@@ -56,11 +59,15 @@ def run(
         holds several. The name may be that of a function that returns one.
     """
     from heliograph.numerics.check import fail
+    from heliograph.numerics.dates import horizons_in
     from heliograph.report.progress import progress
 
     # Check the options before JAX is imported.
     later, options = _parse_smoothing(smooth), reading or ReadingOptions()
     _check_options(measurements, out, report, lag, options)
+    ahead = horizons_in(forecast) if forecast else None
+    if ahead is not None and out is not None and out.suffix.lower() == ".mcap":
+        raise fail("--forecast", "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
     with progress(4) as advance:
         advance("starting")
         from heliograph.files.network_file import load_module
@@ -79,16 +86,18 @@ def run(
             place = out and _place(out, data.plant, len(measured) > 1)
             written = _select_rows(record, data.rows)
             lines = [*_describe_doubted(loaded, record), *data.summary]
+            future = _forecast(record, ahead, lines)
             if place is not None:
                 advance(f"writing {place}")
                 write = _writer(data.events, module)
-                write(written, place)
+                _write_rows(write, written, future, place)
                 lines += _write_lagged(loaded, data, lag, options, place, write)
-            done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines))
+            done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines, future))
     # Report, then warnings and a summary.
     if report is not None:
-        _write_report(network, loaded, {data.plant: (record, data.recording) for data, record, *_ in done}, report)
-    for _, _, written, place, doubts, lines in done:
+        plants = {data.plant: (record, data.recording, future) for data, record, *_, future in done}
+        _write_report(network, loaded, plants, report)
+    for _, _, written, place, doubts, lines, _ in done:
         _print_lines(list(dict.fromkeys(doubts)), [*_write_results(written, place, report), *lines])
 
 
@@ -142,6 +151,28 @@ def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
         uplinks={},
         weighed={},
     )
+
+
+def _forecast(record: "Record", ahead: "Horizons | None", lines: list[str]) -> "ByFilter":
+    """Forecast each estimate from the last row, and add a line on how far and with which inputs; {} unless asked."""
+    if ahead is None:
+        return {}
+    forecasts = heliograph.forecast(record, ahead, inputs="held")
+    assert isinstance(forecasts, dict)  # of a network
+    some = next(forecast for filters in forecasts.values() for forecast in filters.values())
+    held = "" if some.inputs == "none" else ", inputs held at those of the last row"
+    lines.append(f"forecast: {len(some.steps)} rows behind the data, to {some.time[-1]}{held}")
+    return forecasts
+
+
+def _write_rows(write: "Write", record: "Record", forecasts: "ByFilter", place: Path) -> None:
+    """Write estimates, with rows of forecasts below them where there are any."""
+    if not forecasts:
+        write(record, place)
+        return
+    from heliograph.files.forecasts import write_forecast
+
+    write_forecast(record, forecasts, place)
 
 
 def _write_lagged(
@@ -274,14 +305,17 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
 
 
 def _write_report(
-    name: str, network: "Network", plants: "Mapping[str, tuple[Record, Recording]]", report: Path
+    name: str, network: "Network", plants: "Mapping[str, tuple[Record, Recording, ByFilter]]", report: Path
 ) -> None:
+    from dataclasses import replace
+
     from heliograph.report.health import Health, examine
     from heliograph.report.results import Results, write_results
 
     def examined(advance: "Advance") -> dict[str, Health]:
         return {
-            plant: examine(network, record, recording.inputs, advance) for plant, (record, recording) in plants.items()
+            plant: replace(examine(network, record, recording.inputs, advance), forecasts=future)
+            for plant, (record, recording, future) in plants.items()
         }
 
     def results_of(health: dict[str, Health]) -> Results:

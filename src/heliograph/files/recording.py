@@ -187,7 +187,7 @@ def write_estimates(record: Record, path: str | Path) -> None:
     write_table(estimate_columns(record), path)
 
 
-def _make_header(name: str, unit: str | None) -> str:
+def make_header(name: str, unit: str | None) -> str:
     """Return the name of a column, with its unit where there is one."""
     return f"{name} ({unit})" if unit else str(name)
 
@@ -198,18 +198,18 @@ def _claims(states: Sequence[str], units: Mapping[str, str], estimate: Estimate)
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     columns = []
     for i, state in enumerate(states):
-        columns.append((_make_header(state, units.get(state)), mean[:, i]))
+        columns.append((make_header(state, units.get(state)), mean[:, i]))
         if estimate.claim != "none":
             variance = bound[:, i, i]
             columns.append(
-                (_make_header(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
+                (make_header(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
             )
     # Covariances of two states have the product of their units.
     if estimate.claim != "none":
         for i, a in enumerate(states):
             for j in range(i + 1, len(states)):
                 of = " ".join(units[name] for name in (a, states[j]) if name in units)
-                columns.append((_make_header(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
+                columns.append((make_header(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
     return [*columns, ("valid", is_sound(estimate))]
 
 

@@ -11,7 +11,7 @@ from heliograph.forecasting.prediction import InputsAhead
 from heliograph.model.inputs import check_inputs
 from heliograph.model.origin import Origin
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import array, check_count, fail, is_whole, rank, shown
+from heliograph.numerics.check import array, check_count, fail, is_whole, rank, show_value
 from heliograph.numerics.types import ArrayLike, Float, units_in
 
 Horizon = int | float | timedelta | datetime | np.timedelta64 | np.datetime64
@@ -53,7 +53,7 @@ def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: I
     continuous = TIME_STEP in names
     distances = _in_time(origin, horizons) if continuous else _in_steps(origin, horizons)
     if np.any(np.diff(distances, prepend=0.0) <= 0):
-        raise fail("horizons", "times after the data, each later than the one before", shown(horizons))
+        raise fail("horizons", "times after the data, each later than the one before", show_value(horizons))
     count = len(distances) if continuous else int(distances[-1])
     others = [name for name in names if name != TIME_STEP]
     given, said = _inputs_of(origin, names, others, inputs, count)
@@ -76,10 +76,12 @@ def _in_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
             steps.append(float(_count(one)))
             continue
         if not origin.spacing > 0:
-            raise fail("horizons", "numbers of steps, where the time between them is not known", shown(one))
+            raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(one))
         count = seconds / origin.spacing
         if abs(count - round(count)) > OFF:
-            raise fail("horizons", f"whole steps of {origin.spacing:g} s", f"{shown(one)}, {count:.4g} steps ahead")
+            raise fail(
+                "horizons", f"whole steps of {origin.spacing:g} s", f"{show_value(one)}, {count:.4g} steps ahead"
+            )
         steps.append(float(round(count)))
     return np.array(steps)
 
@@ -107,7 +109,7 @@ def _listed(horizons: object) -> list[object]:
     single = isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64)
     listed: list[object] = [horizons] if single else list(horizons) if rank("horizons", horizons) == 1 else []  # type: ignore[call-overload]
     if not listed:
-        raise fail("horizons", "a number of steps, or a list of how far ahead", shown(horizons))
+        raise fail("horizons", "a number of steps, or a list of how far ahead", show_value(horizons))
     return listed
 
 
@@ -116,15 +118,15 @@ def _seconds(origin: Origin, one: object) -> float | None:
     if isinstance(one, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
         if unit != "s":
-            raise fail("horizons", f"numbers of {unit}, the unit of dt", shown(one))
+            raise fail("horizons", f"numbers of {unit}, the unit of dt", show_value(one))
         return float(np.timedelta64(one, "ns").astype(np.int64)) / SECOND
     if not isinstance(one, datetime | np.datetime64):
         return None
     if not isinstance(origin.time, np.datetime64):
-        raise fail("horizons", "how far ahead, as the data have no dates", shown(one))
+        raise fail("horizons", "how far ahead, as the data have no dates", show_value(one))
     ahead = np.datetime64(one).astype("datetime64[ns]") - origin.time.astype("datetime64[ns]")
     if ahead <= np.timedelta64(0, "ns"):
-        raise fail("horizons", f"dates after the data, which end at {origin.time}", shown(one))
+        raise fail("horizons", f"dates after the data, which end at {origin.time}", show_value(one))
     return float(ahead.astype(np.int64)) / SECOND
 
 

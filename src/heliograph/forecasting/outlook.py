@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compiled, computed
+from heliograph.engine.choice import compile_on_call, compute_once
 from heliograph.factors.gaussian import Gaussian, given, leading
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import start_of
@@ -20,7 +20,7 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
@@ -110,7 +110,7 @@ def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: A
     )
 
 
-@compiled
+@compile_on_call
 def _now(outlook: Outlook, state: PyTree) -> Moments:
     return outlook.mixture(state)
 
@@ -118,7 +118,7 @@ def _now(outlook: Outlook, state: PyTree) -> Moments:
 def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int) -> tuple[Moments | None, ...]:
     """Moments at each row ahead (rows, K, ...), by native code where it supports the filter."""
     arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
-    moments: tuple[Moments | None, ...] = computed(_look_ahead, _by_xla, arguments)
+    moments: tuple[Moments | None, ...] = compute_once(_look_ahead, _by_xla, arguments)
     return moments
 
 
@@ -144,7 +144,7 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
     covariance = np.einsum("hk,hkij->hij", weights, covariances) + np.einsum("hk,hki,hkj->hij", weights, apart, apart)
     if claim == "none":
         covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
-    near = wrapped(mean, angles)
+    near = wrap_angles(mean, angles)
     return Prediction(names, near, covariance, claim, weights, means + (near - mean)[:, None], variances)
 
 

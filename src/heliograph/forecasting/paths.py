@@ -12,9 +12,9 @@ from heliograph.model.origin import HasOrigin
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array
 
@@ -97,7 +97,7 @@ def _starts(target: Target, draws: int, generator: np.random.Generator) -> np.nd
     return drawn
 
 
-@compiled
+@compile_in_float64
 def _drawn(
     plant: AnyPlant, sensor: AnySensor | None, start: Array, u: Array, keys: jax.Array, step: Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -108,11 +108,11 @@ def _drawn(
             u_k, k = row
             moving, measuring = jax.random.split(jax.random.fold_in(key, k))
             now = at(plant, k)
-            x = wrapped(now.transition(x, u_k) + now.sample_noise(moving, u_k), now.angles)
+            x = wrap_angles(now.transition(x, u_k) + now.sample_noise(moving, u_k), now.angles)
             if sensor is None:
                 return x, (x, jnp.zeros(0))
             eye = at(sensor, k)
-            return x, (x, wrapped(eye.measure(x) + eye.noise.sample(measuring), eye.angles))
+            return x, (x, wrap_angles(eye.measure(x) + eye.noise.sample(measuring), eye.angles))
 
         path: tuple[jax.Array, jax.Array] = jax.lax.scan(
             move, x, (jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u)))

@@ -122,3 +122,40 @@ def format_dates(time: np.ndarray) -> np.ndarray:
     there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
     unit = next(unit for unit, size in UNITS.items() if not np.any(there % size))
     return np.asarray(np.where(np.isnat(time), "", np.datetime_as_string(time, unit=unit, timezone="UTC")))
+
+
+SPAN = re.compile(r"(?P<count>\d+(?:[.]\d+)?(?:e[+-]?\d+)?)\s*(?P<unit>ns|us|ms|s|min|h|d|w)")
+NANOSECONDS = {
+    "s": 10**9,
+    "ms": 10**6,
+    "us": 10**3,
+    "ns": 1,
+    "min": 60 * 10**9,
+    "h": 3600 * 10**9,
+    "d": 86400 * 10**9,
+    "w": 7 * 86400 * 10**9,
+}
+
+
+def horizons_in(text: str) -> int | list[float | np.timedelta64 | np.datetime64]:
+    """Read how far ahead: "12" is a number of steps, "5s, 1min, 2026-12-01" is a list of spans, dates and numbers.
+
+    Raises:
+        ValueError: something that is none of these, by its words.
+    """
+    if re.fullmatch(r"\s*\d+\s*", text):
+        return int(text)
+    return [_horizon(part.strip()) for part in text.split(",")]
+
+
+def _horizon(text: str) -> float | np.timedelta64 | np.datetime64:
+    if span := SPAN.fullmatch(text):
+        return np.timedelta64(round(float(span["count"]) * NANOSECONDS[span["unit"]]), "ns")
+    if looks_like_date(text):
+        return np.datetime64(moment_of(text, "horizon")[0], "ns")
+    if re.fullmatch(r"\d+", text):
+        return int(text)
+    try:
+        return float(text)
+    except ValueError:
+        raise fail("horizon", "a number of steps, or spans and dates as 5s,1min,2026-12-01", show_value(text)) from None

@@ -1,7 +1,7 @@
 """Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
 from heliograph.random_affine.erasure import outcomes
 from heliograph.report.arrivals import Arrivals, rows_are_messages
+from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
 from heliograph.simulation.claims import beliefs
 from heliograph.simulation.network import Network
@@ -51,6 +52,7 @@ class Health:
     outputs: list[OutputHealth]  # by filter that claims a covariance
     shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
     beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
+    forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""

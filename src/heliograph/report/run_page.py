@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above, stacked_panels
+from heliograph.report.forecasts import draw_forecasts, forecast_tables
 from heliograph.report.health import Health
 from heliograph.report.innovations import (
     BAND,
@@ -116,7 +117,10 @@ def _sort_nodes(record: Record) -> list[str]:
 @matplotlib.rc_context(LOOK)
 def _estimates(health: Health, record: Record, node: str) -> Figure:
     figure, grid = stacked_panels(len(record.states), 1.7, 0.8)
-    record.plot(node, list(record.estimates[node])[: len(COLOURS)], axes=grid, sigmas=BAND)
+    names = list(record.estimates[node])[: len(COLOURS)]
+    record.plot(node, names, axes=grid, sigmas=BAND)
+    if record is health.record:
+        draw_forecasts(grid, record, node, health.forecasts.get(node, {}), names, BAND)
     legend_above(figure, grid[0])
     time_axis(health.record, grid[-1])
     return figure
@@ -165,6 +169,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
                 [KeyFigures(keys), *_show_doubts(doubts), *_show_compared(health), *_show_premises(health)],
             ),
             Section("Estimates", [*errors_table(record), *_pictures(health, drawings)]),
+            *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
             innovations_section(health, drawings),
             Section("Links", _health(health, drawings)),
         ],

@@ -9,11 +9,11 @@ from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
 from heliograph.filters.smoother_step import SmootherStep
-from heliograph.numerics.angle import wrapped
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import row, rows_of, stepped
+from heliograph.smoothing.backward_pass import row, rows_of, step_rows
 
 
 def simulation_smoother(
@@ -52,9 +52,9 @@ def simulation_smoother(
     return np.asarray(_drawn(filter, rows, inputs, keys))
 
 
-@compiled
+@compile_in_float64
 def _drawn(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
-    _, steps = stepped(filter, z, u, filter.init(), np.asarray(0))
+    _, steps = step_rows(filter, z, u, filter.init(), np.asarray(0))
     drawn: jax.Array = jax.vmap(lambda key: _path(steps, key))(keys)
     return drawn
 
@@ -84,4 +84,4 @@ def _draw(law: Gaussian, key: jax.Array) -> jax.Array:
 def _plant_state(step: SmootherStep, x: jax.Array) -> jax.Array:
     """Return the plant's state of the filter's."""
     x = x if step.projection is None else step.projection @ x
-    return wrapped(x if step.shift is None else x + step.shift, step.angles)
+    return wrap_angles(x if step.shift is None else x + step.shift, step.angles)

@@ -1,0 +1,79 @@
+"""Forecasts in tables: rows behind those of a recording, marked as such, with what the sensors would measure."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heliograph.files.recording import estimate_columns, make_header
+from heliograph.files.table import write_table
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.types import unit_of
+from heliograph.simulation.results.record import Record
+
+if TYPE_CHECKING:
+    import heliograph
+
+FORECAST = "forecast"  # the column that marks rows, and what stands before the names of outputs
+ByFilter = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by node and filter
+
+
+def forecast_columns(record: Record, forecasts: ByFilter) -> dict[str, np.ndarray]:
+    """Return the columns of the estimates with rows of forecasts below them, in which `forecast` is true.
+
+    What each sensor would measure stands in the columns forecast.OUTPUT and forecast.OUTPUT.sd, named after node and
+    filter as the states are; NaN in rows of data.
+    """
+    one = next(forecast for filters in forecasts.values() for forecast in filters.values())
+    estimates = {
+        node: {name: Estimate(f.states.mean, f.states.covariance, f.states.claim) for name, f in filters.items()}
+        for node, filters in forecasts.items()
+    }
+    above = estimate_columns(record)
+    below = estimate_columns(replace(record, time=one.time, truth=None, estimates=estimates, smoothed=None))
+    columns = {name: _joined(values, below.get(name), len(one.time)) for name, values in above.items()}
+    ahead = np.arange(len(record.time) + len(one.time)) >= len(record.time)
+    columns = {"time": columns.pop("time"), FORECAST: ahead, **columns}
+    several = len(forecasts) > 1, any(len(filters) > 1 for filters in forecasts.values())
+    for node, filters in forecasts.items():
+        for name, forecast in filters.items():
+            prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
+            columns |= _outputs(f"{prefix}{FORECAST}.", forecast, len(record.time))
+    return columns
+
+
+def write_forecast(record: Record, forecasts: ByFilter, path: str | Path) -> None:
+    """Write `forecast_columns` to a CSV or Parquet file, as a whole or not at all.
+
+    Args:
+        record: the result of `run`.
+        forecasts: what `forecast` returned for it.
+        path: the file, ending in .csv or .parquet.
+
+    Raises:
+        ValueError: another format, or a folder that cannot be written.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    write_table(forecast_columns(record, forecasts), path)
+
+
+def _joined(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:
+    """Put rows below a column; of one that has none they are NaN, or false."""
+    if below is None:
+        below = np.full(rows, np.nan if above.dtype.kind == "f" else False)
+    return np.concatenate([above, below.astype(above.dtype)])
+
+
+def _outputs(prefix: str, forecast: "heliograph.forecasting.Forecast", rows: int) -> dict[str, np.ndarray]:
+    """Columns of what the sensor would measure, and of its deviations where there is a claim."""
+    if forecast.outputs is None:
+        return {}
+    columns = {}
+    for i, output in enumerate(forecast.outputs.names):
+        parts = {output: forecast.outputs.mean[:, i], f"{output}.sd": forecast.outputs.deviation[:, i]}
+        for name, values in parts.items():
+            if not np.isnan(values).all():
+                columns[prefix + make_header(name, unit_of(output))] = np.concatenate([np.full(rows, np.nan), values])
+    return columns

@@ -1,0 +1,88 @@
+"""Forecasts on the page of a run: their bands behind the line where the data end, and a table of what is ahead."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from heliograph.disk.quoting import visible
+from heliograph.report.figures import MUTED
+from heliograph.report.outputs import rounded
+from heliograph.report.page import Table, Text
+from heliograph.simulation.results.plots import colour_of
+from heliograph.simulation.results.record import Record
+
+if TYPE_CHECKING:
+    import heliograph
+
+MOST = 12  # horizons of a table
+BOTH_SIDES = 0.95  # probability of the intervals in a table
+Forecasts = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by node and filter
+
+
+def draw_forecasts(
+    panels: Sequence[Axes],
+    record: Record,
+    node: str,
+    forecasts: "Mapping[str, heliograph.forecasting.Forecast]",
+    names: Sequence[str],
+    sigmas: float,
+) -> None:
+    """Draw forecasts of these filters with bands behind their estimates, one panel a state, and a line between."""
+    for number, name in enumerate(names):
+        if name not in forecasts:
+            continue
+        forecast, last, colour = forecasts[name], record.estimates[node][name], colour_of(number)
+        time = np.concatenate([record.time[-1:], forecast.time])
+        for i, panel in enumerate(panels):
+            # From the last estimate on.
+            now = np.asarray(last.mean)[-1, i], np.sqrt(np.asarray(last.covariance)[-1, i, i])
+            mean, deviation = forecast.states.mean[:, i], forecast.states.deviation[:, i]
+            mean, band = np.append(now[0], mean), sigmas * np.append(now[1], deviation)
+            panel.plot(time, mean, color=colour, linestyle=(0, (4, 1.5)))
+            panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+    for panel in panels if forecasts else ():
+        panel.axvline(record.time[-1], color=MUTED, linewidth=1.0)
+
+
+def forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
+    """Return a table for each filter: mean and interval of each state and output at horizons spread over all."""
+    some = next(forecast for filters in forecasts.values() for forecast in filters.values())
+    held = "Inputs are held at those of the last row."
+    inputs = {"held": held, "given": "Inputs ahead are those that were given.", "none": ""}[some.inputs]
+    said = f"From what had arrived by the last row, as if nothing arrived any more. {inputs}".strip()
+    parts: list[Table | Text] = [Text([said])]
+    for node, filters in forecasts.items():
+        parts += [_table(record, f"{node}/{name}", forecast) for name, forecast in filters.items()]
+    return parts
+
+
+def _table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
+    count = len(forecast.time)
+    rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
+    predictions = [("", forecast.states)] + ([] if forecast.outputs is None else [("measured ", forecast.outputs)])
+    headers, columns = ["time"], [[_moment(forecast.time[row]) for row in rows]]
+    for kind, prediction in predictions:
+        claims = prediction.claim != "none"
+        low, high = prediction.interval(BOTH_SIDES) if claims else (prediction.mean, prediction.mean)
+        for i, number in enumerate(prediction.names):
+            headers.append(visible(f"{kind}{number}"))
+            columns.append(
+                [
+                    _words(prediction.mean[row, i], low[row, i], high[row, i], prediction.deviation[row, i])
+                    for row in rows
+                ]
+            )
+    caption = f"**{visible(name)}**: mean, and the interval that holds 95 % of what it predicts."
+    return Table(headers, [list(cells) for cells in zip(*columns, strict=True)], caption)
+
+
+def _words(mean: float, low: float, high: float, deviation: float) -> str:
+    if np.isnan(deviation):
+        return f"{mean:.4g}"
+    return f"{rounded(mean, deviation)} ({rounded(low, deviation)} to {rounded(high, deviation)})"
+
+
+def _moment(time: np.generic) -> str:
+    return str(time)[:19] if isinstance(time, np.datetime64) else f"{time:g}"
