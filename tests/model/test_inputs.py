@@ -158,3 +158,34 @@ def test_the_test_in_a_step_agrees_with_that_of_all_rows():
                 with jax.enable_x64(True):
                     spoilt = inputs_spoil(plant, ("s",), jnp.zeros(1), 0)
                 assert bool(spoilt) == covariances_wrong(matrix[None])[0]
+
+
+STATE, START = np.zeros((3, 1)), ([0.0, 0.0], np.eye(2))
+COMPLEX = {
+    "transition": lambda: hg.Plant(lambda x, u: x + 1j, 0.1, *START),
+    "process noise": lambda: hg.Plant(lambda x, u: x, lambda u: jnp.eye(2) * 1j, *START, inputs=["u"]),
+    "matrix": lambda: hg.LinearPlant(lambda u: jnp.eye(2) * 1j, 0.1, *START, inputs=["u"]),
+    "sensor": lambda: hg.cubature_filter(
+        hg.LinearPlant(np.eye(2), 0.1, *START), hg.Sensor(lambda x: x[:1] + 1j, 0.1 * np.eye(1))
+    ),
+}
+
+
+@pytest.mark.parametrize("what", COMPLEX)
+def test_a_function_with_complex_numbers_is_refused(what):
+    with pytest.raises(ValueError, match="complex numbers, where real ones are expected") as raised:
+        COMPLEX[what]()
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("make", [hg.cubature_filter, hg.extended_filter, hg.unscented_filter])
+def test_flags_and_whole_numbers_of_a_function_are_numbers(make):
+    """As if the function had returned them as floats."""
+    found = []
+    for kind in (lambda x: x, lambda x: x.astype(float)):
+        plant = hg.Plant(lambda x, u, kind=kind: kind(x > 0.5), 0.1, *START)
+        sensor = hg.Sensor(lambda x, kind=kind: kind(jnp.round(x[:1]).astype(int)), 0.1 * np.eye(1))
+        found.append(make(plant, sensor).run(STATE + 0.3))
+    np.testing.assert_array_equal(found[0].means, found[1].means)
+    np.testing.assert_array_equal(found[0].covariances, found[1].covariances)
+    assert np.all(np.isfinite(found[0].means))

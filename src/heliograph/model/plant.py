@@ -16,7 +16,7 @@ from heliograph.numerics.check import array, covariance, fail, function, instanc
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, trace_shape
+from heliograph.numerics.traced import as_real, is_traced, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
     AbstractNoise,
@@ -46,7 +46,7 @@ class OfInputs(Module):
 
     def __call__(self, u: jax.Array) -> jax.Array:
         """M(u)."""
-        return jnp.asarray(self.function(u))
+        return as_real(self.function(u))
 
     def _refuse(self, *_: object, **__: object) -> NoReturn:
         """Raise ValueError: here the matrix must be a constant."""
@@ -107,7 +107,7 @@ class AbstractPlant(Module):
         """Covariance of w, (n, n); it may depend on the input (a time step, a distance travelled)."""
         if isinstance(self.noise, AbstractNoise):
             return jnp.asarray(self.noise.covariance)
-        return jnp.asarray(self.noise(u))
+        return as_real(self.noise(u))
 
     def noise_mean(self) -> jax.Array:
         """Mean of w, (n,)."""
@@ -210,7 +210,7 @@ class Plant(AbstractPlant):
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """f(x, u)."""
-        return jnp.asarray(self.function(x, u))
+        return as_real(self.function(x, u))
 
 
 class LinearPlant(AbstractPlant):

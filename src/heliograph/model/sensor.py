@@ -16,7 +16,7 @@ from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, function, instance, name_list, names, show_error
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import trace_shape
+from heliograph.numerics.traced import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
@@ -101,7 +101,7 @@ class Sensor(AbstractSensor):
 
     def measure(self, x: jax.Array) -> jax.Array:
         """h(x)."""
-        return jnp.asarray(self.function(x))
+        return as_real(self.function(x))
 
 
 class LinearSensor(AbstractSensor):

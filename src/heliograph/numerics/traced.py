@@ -73,7 +73,7 @@ def _say(text: str) -> None:
 def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[Any], tuple[int, ...]]:
     """Trace a function in double precision; return the arrays that it holds, and the shape of its result."""
     with jax.enable_x64(True):
-        made = jax.make_jaxpr(lambda *values: jnp.asarray(function(*values)))(*arguments)
+        made = jax.make_jaxpr(lambda *values: as_real(function(*values)))(*arguments)
     shape: tuple[int, ...] = made.out_avals[0].shape
     return list(made.consts), shape
 
@@ -85,6 +85,18 @@ def trace_shape(name: str, function: Callable[..., Any], *arguments: object) -> 
         if isinstance(constant, jax.Array):
             warn_of_single(name, constant)
     return shape
+
+
+def as_real(value: object) -> jax.Array:
+    """Return what a user's function returned as an array of real numbers: whole numbers and flags as floats.
+
+    Raises:
+        TypeError: complex numbers.
+    """
+    numbers = jnp.asarray(value)
+    if jnp.issubdtype(numbers.dtype, jnp.complexfloating):
+        raise TypeError("complex numbers, where real ones are expected")
+    return numbers if jnp.issubdtype(numbers.dtype, jnp.floating) else numbers.astype(float)
 
 
 def library(*values: object) -> Any:
