@@ -295,6 +295,43 @@ def test_a_message_without_a_value_is_not_counted_as_used(folder, capsys):
     assert "a: 2 used, 1 without a value\n" in run(folder, capsys, "log.csv", mapped, source)[0]
 
 
+def rows(*fields):
+    """Eight messages of two senders that differ in the last field."""
+    stamps = [f"2026-09-27T10:0{k}:00Z" for k in range(8)]
+    return [[stamp, 20 + k / 10, *(f[k % 2] for f in fields)] for k, stamp in enumerate(stamps)]
+
+
+@pytest.mark.parametrize("name", ["entity_id", "_field", "devEui", "id"])
+def test_several_senders_that_are_read_as_one_sensor_are_said(folder, capsys, name):
+    """A field that names a sender and has several values, of a table and of a topic's payloads."""
+    senders = (7, 12) if name == "id" else ("attic", "cellar")
+    table = "\n".join([f"t,v,{name},note", *(",".join(map(str, row)) for row in rows(senders, ("ok", "low")))])
+    said = f"field {name!r} of log.csv has 2 values ({senders[0]}, {senders[1]}) in what is read as one sensor"
+    assert said in run(folder, capsys, "log.csv", table, '{"log.csv": field("v", node="a", time="t")}')[0]
+    lines = [
+        json.dumps({"topic": "rtl_433/events", "payload": json.dumps({"t": t, "v": v, name: sender})})
+        for t, v, sender in rows(senders)
+    ]
+    source = '{"rtl_433/events": field("v", node="a", time="t")}'
+    assert (
+        f"field {name!r} of rtl_433/events has 2 values"
+        in run(folder, capsys, "log.jsonl", "\n".join(lines), source)[0]
+    )
+
+
+@pytest.mark.parametrize("how", ['where={"id": 7}', 'where={"id": [7, 12]}', 'plant="id"'])
+def test_senders_that_are_told_apart_are_not(folder, capsys, how):
+    table = "\n".join(["t,v,id", *(",".join(map(str, row)) for row in rows((7, 12)))])
+    source = f'{{"log.csv": field("v", node="a", time="t", {how})}}'
+    options = ("--plant", "7") if "plant" in how else ()
+    assert "one sensor" not in run(folder, capsys, "log.csv", table, source, *options)[0]
+
+
+def test_a_field_that_names_each_message_names_no_senders(folder, capsys):
+    table = "\n".join(["t,v,id", *(f"{t},{v},{k}" for k, (t, v) in enumerate(rows()))])
+    assert "one sensor" not in run(folder, capsys, "log.csv", table, '{"log.csv": field("v", node="a", time="t")}')[0]
+
+
 def test_the_option_for_messages_that_come_late(folder, capsys):
     """The third event came half a minute after it was measured, and after one that had been final for long."""
     rows = [("10:00:00", "10:00:00", 20.0), ("10:00:20", "10:00:20", 20.2), ("10:00:01", "10:00:31", 20.1)]

@@ -133,6 +133,7 @@ def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable
                 sources.stored += 1
                 continue
             events.add(sources.original(reading, came), arrival)
+            sources.senders.note(topic, reading.plant, reading.node, content, sources.asked(topic))
     except InputError as error:
         events.refuse(error, strict)
 
@@ -148,7 +149,7 @@ def _conclude(path: Path, sources: Sources, events: EventTable) -> None:
     if sources.unknown.total():
         counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
         events.notes.append(f"{path}: not among the sources: {counts}")
-    events.notes += [f"{path}: {note}" for note in sources.notes]
+    events.notes += [f"{path}: {note}" for note in (*sources.notes, *sources.senders.lines())]
     if sources.stored:
         events.notes.append(f"{path}: {sources.stored} stored messages were left out: without time= they have no date")
     if sources.steps is False and not len(events) and not events.reasons and not events.broken:

@@ -9,7 +9,8 @@ import numpy as np
 
 from heliograph.files.availability import LastWords
 from heliograph.files.fields import MissingFieldError, at, count, matches, nanoseconds, number
-from heliograph.files.json_field import Source, Yaw
+from heliograph.files.json_field import Field, Source, Yaw
+from heliograph.files.senders import SeveralSenders
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import fail, show_value
@@ -64,6 +65,7 @@ class Sources:
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
         self.others = others
+        self.senders = SeveralSenders()
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
@@ -82,6 +84,7 @@ class Sources:
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", show_value(table))
         self._table = {topic: self._check_sources(topic, items) for topic, items in table.items()}
         self._known: dict[str, list[Mapped]] = {}
+        self._asked: dict[str, set[str]] = {}
         mapped = [single for several in self._table.values() for single in several]
         self.words = LastWords(condition for single in mapped for condition in single.source.available)
         steps = {single.source.step for single in mapped}
@@ -128,6 +131,16 @@ class Sources:
         mapped = [(source, places) for items in self._table.values() for source, _, places in items]
         counted = {node for source, places in mapped for node in places if source.sequence is not None}
         return {node for _, places in mapped for node in places} - counted
+
+    def asked(self, topic: str) -> set[str]:
+        """Return the fields of a topic's messages of which a source says what they mean, by the first of their path."""
+        if topic not in self._asked:
+            asked = self._asked.setdefault(topic, set())
+            for source, *_ in self.of(topic):
+                names = [name.path for name in (source.plant, source.node) if isinstance(name, Field)]
+                paths = [path.path if isinstance(path, Yaw) else path for path in source.paths]
+                asked |= {path.split(".")[0] for path in (*names, *paths, *source.where)}
+        return self._asked[topic]
 
     def of(self, topic: str) -> list[Mapped]:
         """Return the sources of a topic, each with the places of its values in the node's measurement."""

@@ -1,0 +1,52 @@
+"""Fields that tell several senders apart, such as `entity_id`, in messages that are read as those of one."""
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping
+
+MANY = 50  # values above which a field names messages, not senders
+LISTED = 4  # of them in a line
+WORDS = re.compile(
+    r"(addr|address|anchor|channel|device|entity|eui|field|host|id|location|mac|measurement|model|name|node|room|sensor"
+    r"|serial|source|src|station|tag)",
+    re.IGNORECASE,
+)
+
+
+class SeveralSenders:
+    """Counts the values of fields that name a sender, by their own names, in what is read as one node of one plant."""
+
+    def __init__(self) -> None:
+        self._counts: dict[tuple[str, str, str, str], Counter[object]] = defaultdict(Counter)
+        self._names: dict[str, bool] = {}
+
+    def note(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
+        """Note a message that was read as one of a node of a plant; fields that are `asked` for say what they mean."""
+        for name, value in message.items() if isinstance(message, Mapping) else ():
+            if isinstance(value, str | int) and name not in asked and self._is_name(name):
+                counts = self._counts[topic, plant, node, name]
+                if len(counts) <= MANY:
+                    counts[value] += 1
+
+    def lines(self) -> list[str]:
+        """Say which fields have several values that come again, a line for each field of a topic."""
+        found: dict[tuple[str, str], list[object]] = {}
+        for (topic, _, _, name), counts in self._counts.items():
+            if 2 <= len(counts) <= MANY and counts.total() >= 2 * len(counts):
+                found.setdefault((topic, name), list(counts))
+        lines = []
+        for (topic, name), values in found.items():
+            more = "" if len(values) <= LISTED else ", ..."
+            listed = ", ".join(map(str, values[:LISTED])) + more
+            lines.append(
+                f"field {name!r} of {topic} has {len(values)} values ({listed}) in what is read as one sensor: "
+                f"plant={name!r}, node= or where= tells them apart"
+            )
+        return lines
+
+    def _is_name(self, field: str) -> bool:
+        """Return whether a word of a field's name, as of `entity_id` or `devEui`, says that it names a sender."""
+        if field not in self._names:
+            words = re.split(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])", field)
+            self._names[field] = any(map(WORDS.fullmatch, words))
+        return self._names[field]
