@@ -221,6 +221,15 @@ jax.tree_util.register_pytree_node(_Held, lambda held: ((), held.value), lambda 
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float, complex)
 
 
+HALVED = {np.dtype(x): np.dtype(y) for x, y in (("f8", "f4"), ("i8", "i4"), ("u8", "u4"))}
+
+
+def _halved(example: Any) -> Any:
+    """Return an example of the type that JAX has for it without enable_x64; a number of Python as it is."""
+    kind = getattr(example, "dtype", None)
+    return like(example.shape, HALVED[kind]) if kind in HALVED else example
+
+
 def traced(function: Callable[..., PyTree], *examples: PyTree, single: bool = False) -> tuple[ClosedJaxpr, Any]:
     """Trace a function of one run, in double precision or in single; return its program and its result's structure.
 
@@ -236,5 +245,5 @@ def traced(function: Callable[..., PyTree], *examples: PyTree, single: bool = Fa
 
     with jax.enable_x64(not single):
         flat, tree = jax.tree.flatten(examples)
-        program = jax.make_jaxpr(call)(*flat)
+        program = jax.make_jaxpr(call)(*(map(_halved, flat) if single else flat))
     return program, structure[0]

@@ -104,9 +104,9 @@ def monte_carlo(
     network = network.in_single_precision() if single else network
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
-    if not single and one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
+    if one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
         with out_of_memory(runs, horizon):
-            by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing)
+            by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing, single)
         if by_native_code is not None:
             return _warn_of_nan(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
@@ -270,7 +270,9 @@ def by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
 
 
 def _single(leaf: PyTree) -> PyTree:
-    return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
+    """Convert an array to the type that JAX has for it without enable_x64."""
+    halved = {"float64": "float32", "int64": "int32", "uint64": "uint32"}
+    return leaf.astype(halved.get(str(leaf.dtype), leaf.dtype)) if eqx.is_array(leaf) else leaf
 
 
 def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from straightline.folding import DTYPES
-from straightline.llvm.lanes import WIDTH, gather, lane_numbers, types
+from straightline.llvm.lanes import WIDTH, flushing, gather, lane_numbers, types
 from straightline.llvm.operations import BITS
 from straightline.llvm.text import Slots, Writer, loops_of, turns_of
 from straightline.llvm.transposed import mover, mover_name
@@ -178,6 +178,7 @@ def written(
     pointers = [*program.inputs, *tables, *outputs]
     blocks = Writer(alone, mine, products, spread, slots)
     blocks.turning = turning
+    blocks.flushes = flushes = _is_single(items)
     text, movers = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, width, summed)
     # The other function fills these slots, once for all runs.
     roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
@@ -185,7 +186,7 @@ def written(
     once = None
     if roots:
         writer = Writer(True, needed(roots), products, set(), slots)
-        writer.turning = turning
+        writer.turning, writer.flushes = turning, flushes
         once = _source(_once(writer, program, pointers, in_shared), writer, [])
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
@@ -199,6 +200,12 @@ def widest(items: Iterable[Any]) -> int:
     """Return the most runs of a vector: twice as many where most real numbers are of single precision."""
     counts = Counter([x.type for x in items if isinstance(x, Node)])
     return 2 * WIDEST if counts["f32"] > counts["f64"] else WIDEST
+
+
+def _is_single(items: Iterable[Any]) -> bool:
+    """Return whether real numbers are all of single precision."""
+    types_ = {x.type for x in items if isinstance(x, Node)}
+    return "f32" in types_ and "f64" not in types_
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
@@ -220,6 +227,8 @@ def _source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -
     turns = {block: turns_of(block) for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
     helpers: list[Callable[[int], str]] = [*movers, *(partial(gather, *kind) for kind in sorted(writer.gathered))]
+    if writer.flushes:
+        helpers.append(flushing)
     called = writer.called - {"threefry"}
     if called:
         helpers.append(partial(functions, called))
@@ -299,7 +308,7 @@ def _blocks(
     writer.start("exit")
     body = "\n".join(writer.lines)
     helpers += [partial(mover, *kind) for kind in sorted(movers)]
-    return f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n", helpers
+    return _run(body, writer), helpers
 
 
 def _add(
@@ -327,7 +336,15 @@ def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: d
     _pointers(writer, pointers, in_shared)
     writer.block(program.graph.top)
     body = "\n".join(writer.lines)
-    return f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n"
+    return _run(body, writer)
+
+
+def _run(body: str, writer: Writer) -> str:
+    """Write the function around its body; in single precision alone, subnormal numbers are zeros in it."""
+    before = after = ""
+    if writer.flushes:
+        before, after = "  %control = call i32 @hg_flush()\n", "  call void @hg_restore(i32 %control)\n"
+    return f"define void @run{HEAD} {{\nentry:\n{before}{body}\n{after}  ret void\n}}\n"
 
 
 def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:

@@ -83,6 +83,7 @@ class Writer:
         self.turning: Collection[Buffer] = ()  # shared buffers within loops that have a place for each turn
         self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
         self.counted = ""  # the lanes that count
+        self.flushes = False  # whether subnormal numbers are zeros
 
     def add(self, text: str) -> str:
         """Append an operation; return the new name of its result."""

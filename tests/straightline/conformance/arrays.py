@@ -160,13 +160,15 @@ def _scatters(method: str) -> list[Case]:
             label=mode,
         )
         cases += _indexed(
-            lambda x, k, m=mode: getattr(x.at[jnp.stack([k, k, k * 0])], method)(jnp.array([2.0, 5.0, 3.0]), mode=m),
+            lambda x, k, m=mode: getattr(x.at[jnp.stack([k, k, k * 0])], method)(
+                jnp.asarray([2.0, 5.0, 3.0], x.dtype), mode=m
+            ),
             array(np.float64, 4),
             kinds=WHOLE[:2],
             label=mode + " twice",
         )
         cases += _indexed(
-            lambda x, k, m=mode: getattr(x.at[jnp.array([1, 1, 9, -1])], method)(2.0 + k, mode=m),
+            lambda x, k, m=mode: getattr(x.at[jnp.array([1, 1, 9, -1])], method)((2.0 + k).astype(x.dtype), mode=m),
             array(np.float64, 4),
             kinds=WHOLE[:1],
             label=mode + " known",

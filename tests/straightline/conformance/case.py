@@ -72,7 +72,7 @@ def is_taken(function: Callable[..., Any], arguments: Sequence[np.ndarray]) -> b
     with jax.enable_x64(True):
         try:
             jax.eval_shape(function, *arguments)
-        except TypeError:
+        except (TypeError, ValueError):
             return False
     return True
 

@@ -42,6 +42,11 @@ class Native(NamedTuple):
     tree: Any
 
 
+def to_double(array: np.ndarray) -> np.ndarray:
+    """Return results in double precision, whatever they were computed in; whole numbers and flags as they are."""
+    return array.astype(float) if array.dtype == np.float32 else array
+
+
 def native(
     world: World,
     inputs: np.ndarray,
@@ -50,11 +55,13 @@ def native(
     runs: int,
     later: Smoother | None = None,
     parts: int = 1,
+    single: bool = False,
 ) -> Native:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
     `runs`: how many will follow. With `later`, the results are a pair: of filtered and of smoothed estimates; and sums
-    of the NIS. `parts`: of a network, of which this is one, whose results are held together.
+    of the NIS. `parts`: of a network, of which this is one, whose results are held together. `single`: whether runs are
+    computed in single precision.
 
     Raises:
         Unsupported: a program that native code does not support.
@@ -69,7 +76,9 @@ def native(
     arrays = [np.asarray(leaf) for leaf, h in zip(leaves, held, strict=True) if not h]
     # One program for networks of one structure.
     try:
-        made = _find_program(tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value))
+        made = _find_program(
+            tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value), single
+        )
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
@@ -79,6 +88,7 @@ def native(
     program, form = made
     lanes = min(LANES, -(-runs // BLOCK))
     collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
+    collected *= 2 if single else 1  # results are handed back in double precision
     check_memory(Needed(parts * collected, sums, variables), runs, len(inputs))
     return Native(program.begin([key, *arrays], runs), form)
 
@@ -123,19 +133,21 @@ def _is_given(array: np.ndarray) -> bool:
 
 @lru_cache(PROGRAMS)
 def _find_program(
-    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool
+    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool, single: bool
 ) -> tuple[Any, Any] | Unsupported:
     """Cached `_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
     try:
-        return _program(tree, held, fixed, known)
+        return _program(tree, held, fixed, known, single)
     except Unsupported as error:
         return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
-def _program(tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...]) -> tuple[Any, Any]:
+def _program(
+    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], single: bool
+) -> tuple[Any, Any]:
     """Compile the code of networks of one structure; also return the structure of what is collected of a run.
 
-    `held` and `fixed`: the leaves that are no arrays, such as a user's functions.
+    `held` and `fixed`: the leaves that are no arrays, such as a user's functions. `single`: in single precision.
     """
     form: list[Any] = []
 
@@ -156,7 +168,7 @@ def _program(tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: t
     # Sums over runs by batch; the rest is collected.
     key = jax.eval_shape(lambda: jax.random.key(0))
     masks = {n: k.mask for n, k in enumerate(known, start=1) if k.mask.any()}
-    program = accumulate(run, key, *(k.example for k in known), batches=BATCHES, known=masks)
+    program = accumulate(run, key, *(k.example for k in known), batches=BATCHES, known=masks, single=single)
     return program, form[0]
 
 
@@ -199,8 +211,9 @@ def natively(
     chunk: int,
     progress: Progress | None,
     smoothing: SmoothedPart | None = None,
+    single: bool = False,
 ) -> Result | None:
-    """Simulate a network by native code and reduce its runs; a part of it is smoothed.
+    """Simulate a network by native code and reduce its runs; a part of it is smoothed; in single precision if `single`.
 
     Returns None where native code does not support the network or the reducer. Draws depend on names alone, and so do
     nodes that share nothing but the plant: they are simulated a few at a time.
@@ -208,7 +221,7 @@ def natively(
     # Smoothing, few nodes, or nodes that share something: one program.
     whole = smoothing is not None or len(network.names) <= NODES or not _is_apart(network)
     if whole or type(reducer).joined is AbstractReducer.joined:
-        code = try_native(lambda: _code(network, inputs, key, reducer, runs, smoothing))
+        code = try_native(lambda: _code(network, inputs, key, reducer, runs, smoothing, single=single))
         return (
             None
             if code is None
@@ -217,7 +230,7 @@ def natively(
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
     for number, some in enumerate(parts):
-        code = try_native(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts)))  # noqa: B023
+        code = try_native(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts), single=single))  # noqa: B023
         if code is None:
             return None
 
@@ -251,10 +264,11 @@ def _code(
     runs: int,
     smoothing: SmoothedPart | None = None,
     parts: int = 1,
+    single: bool = False,
 ) -> Native:
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), filters)
-    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts)
+    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, single)
 
 
 def _run_chunks(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
@@ -284,7 +298,10 @@ class NativeLanes:
 
         collected = list(threads().map(go, used))
         order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
-        return [None if blocks[0] is None else np.concatenate(blocks)[order] for blocks in zip(*collected, strict=True)]
+        together = (
+            None if blocks[0] is None else np.concatenate(blocks)[order] for blocks in zip(*collected, strict=True)
+        )
+        return [None if one is None else to_double(one) for one in together]
 
     def _runs(self, blocks: np.ndarray) -> np.ndarray:
         runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
@@ -298,7 +315,7 @@ class NativeLanes:
         # Results that all runs share stand as of one run.
         for fixed, is_summed in zip(code.shared, code.summed, strict=True):
             value = next(totals) if is_summed else None
-            leaves.append(value if fixed is None else fixed)
+            leaves.append(value if fixed is None else to_double(fixed))
             common.append(fixed is not None)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
         return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
@@ -308,7 +325,7 @@ class NativeLanes:
         leaves: list[Any] = []
         for fixed, *single in zip(self.code.begun.shared, *parts, strict=True):
             if fixed is not None:
-                leaves.append(np.broadcast_to(fixed, (self.stop - self.first_run, *fixed.shape)))
+                leaves.append(np.broadcast_to(to_double(fixed), (self.stop - self.first_run, *fixed.shape)))
             else:
                 leaves.append(None if single[0] is None else np.concatenate(single) if len(single) > 1 else single[0])
         return jax.tree.unflatten(self.code.tree, leaves).collected
