@@ -17,9 +17,8 @@ from heliograph.campaign.plan import BITWISE, Campaign, Setting, canonical
 from heliograph.campaign.store import parameter_values
 from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
 from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.report.figures import INK, STYLE, WIDTH, svg
+from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, svg
 from heliograph.report.page import Block, Code, Page, Picture, Points, Section, Table, Text
-from heliograph.simulation.results.plots import COLOURS
 
 REPORT = "report.html"
 ROWS = 200  # of the table on the page

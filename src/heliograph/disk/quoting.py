@@ -1,7 +1,7 @@
 """Quoting of a user's text for terminals, tables, figures and files, so that no name breaks them or acts in them."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 NAMED = 3  # of many names, how many are said
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a cell that begins so is computed by a spreadsheet
@@ -45,3 +45,8 @@ def join_names(names: Sequence[str]) -> str:
     if len(names) <= 2 * NAMED:
         return ", ".join(names)
     return f"{', '.join(names[:NAMED])} … ({len(names)})"
+
+
+def label_with_unit(name: str, units: Mapping[str, str]) -> str:
+    """Label of a state or of time, with its unit if it has one."""
+    return quote_for_figure(f"{name} ({units[name]})" if name in units else name)

@@ -8,6 +8,9 @@ from .polynomial import (
     GainOverLinear as GainOverLinear,
     gain_over_linear as gain_over_linear,
 )
+from .jump_system import (
+    JumpSystem as JumpSystem,
+)
 from .lift import (
     lifted_system as lifted_system,
 )

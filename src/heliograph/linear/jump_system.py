@@ -35,17 +35,32 @@ def propagate(maps: Float[Array, "..."], moments: Float[Array, "..."], added: Ar
 
 
 class JumpSystem(NamedTuple):
-    """Steps of a jump system: chain T into each step, maps F and noises S by mode."""
+    """Steps of a jump system, X_j+ = F_j (sum_i T_ij X_i) F_j' + S_j with X_j = E[zeta zeta' 1{mode j}].
 
-    chain: Float[Array, "time M M"]
-    maps: Float[Array, "time M n n"]
-    added: Float[Array, "time M n n"]
+    Arrays are NumPy's or JAX's. X is (..., M, n, n), or its sum over the modes (..., 1, n, n), before a step whose
+    chain forgets the mode before: all rows of T are alike.
+
+    Args:
+        chain: T_ij, the probability of j in this step given i in the one before (time, M, M).
+        maps: F_j of each mode (time, M, n, n).
+        added: S_j, P(j) times the covariance of the noise, and all that random coefficients add (time, M, n, n).
+
+    Source: Costa, Fragoso and Marques, Discrete-time Markov jump linear systems (2005), chapter 3.
+    """
+
+    chain: Array
+    maps: Array
+    added: Array
+
+    def step(self, moments: Float[Array, "*axes _ n n"]) -> Any:
+        """Propagate X over one step, without an axis of time; or over each step from an X before it of its own."""
+        return propagate(self.maps, mix_modes(self.chain, moments), self.added)
 
     def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
         """Propagate X from before the first step: X after each step."""
         steps = []
-        for chain, maps, added in zip(*self, strict=True):
-            moments = propagate(maps, mix_modes(chain, moments), added)
+        for one in zip(*self, strict=True):
+            moments = JumpSystem(*one).step(moments)
             steps.append(moments)
         return steps
 
@@ -63,11 +78,11 @@ class JumpSystem(NamedTuple):
         """Return the spectral radius of the operator: below 1, X stays bounded over steps that repeat for ever."""
         return spectral_radius(self.operator())
 
-    def steady(self) -> Float[np.ndarray, "time M n n"]:
-        """Solve for X after each of steps that repeat for ever, of a radius below 1."""
+    def steady(self) -> Any:
+        """Solve for X (time, M, n, n) after each of steps that repeat for ever, of a radius below 1."""
         start = solve_fixed_point(self._replace(added=0.0 * self.added)._around, self._around(np.zeros(self.shape)))
-        after = np.array(self.after(start))
-        return np.asarray(after + after.swapaxes(-1, -2)) / 2
+        after = library(start).stack(self.after(start))
+        return (after + after.swapaxes(-1, -2)) / 2
 
     def adjoint(self, weights: Float[np.ndarray, "time n n"], forever: bool) -> Float[np.ndarray, "time M n n"]:
         """Derivative L of sum_k <W_k, sum_j X_k,j> by each X_k,j, through all later steps.
@@ -89,10 +104,10 @@ class JumpSystem(NamedTuple):
         ahead = np.array([np.broadcast_to(value, self.maps.shape[1:]) for value in back(behind, weights)[1]])
         return np.asarray(ahead + ahead.swapaxes(-1, -2)) / 2
 
-    def _around(self, moments: np.ndarray) -> np.ndarray:
+    def _around(self, moments: Array) -> Any:
         """Propagate X from before the first step to after the last, summed over modes that are forgotten there."""
         last = self.after(moments)[-1]
-        return np.asarray(last if moments.shape[-3] == last.shape[-3] else last.sum(axis=-3, keepdims=True))
+        return last if moments.shape[-3] == last.shape[-3] else last.sum(axis=-3, keepdims=True)
 
 
 def make_entry_matrix(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import propagate, solve_fixed_point
+from heliograph.linear.jump_system import JumpSystem
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, refuse_angles
@@ -45,7 +45,8 @@ def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n 
     """
     a = transition
     if is_traced(a, process):
-        return jnp.asarray(solve_fixed_point(lambda x: propagate(a, x, 0.0), process))
+        one_mode = JumpSystem(np.ones((1, 1, 1)), jnp.asarray(a)[None, None], jnp.asarray(process)[None, None])
+        return jnp.asarray(one_mode.steady()[0, 0])
     check_stable(np.asarray(a))
     # sum_k A^k Q A'^k, with twice as many terms after each doubling.
     total, power = np.asarray(process), np.asarray(a)

@@ -7,10 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from heliograph.disk.quoting import visible
-from heliograph.report.figures import MUTED
+from heliograph.report.figures import COLOURS, MUTED
 from heliograph.report.outputs import rounded
 from heliograph.report.page import Table, Text
-from heliograph.simulation.results.plots import colour_of
 from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ def draw_forecasts(
     for number, name in enumerate(names):
         if name not in forecasts:
             continue
-        forecast, last, colour = forecasts[name], record.estimates[node][name], colour_of(number)
+        forecast, last, colour = forecasts[name], record.estimates[node][name], COLOURS[number % len(COLOURS)]
         time = np.concatenate([record.time[-1:], forecast.time])
         for i, panel in enumerate(panels):
             # From the last estimate on.

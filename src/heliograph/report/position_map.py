@@ -7,9 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from heliograph.disk.quoting import quote_for_figure
-from heliograph.report.figures import INK, STYLE, WIDTH, legend_above
-from heliograph.simulation.results.plots import colour_of, label_with_unit
+from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, legend_above
 from heliograph.simulation.results.record import Record
 
 # Names that two coordinates of a plane have, without what stands before them: "x" and "y", "position_x" and ...
@@ -37,7 +36,7 @@ def map_figure(record: Record, node: str, names: Sequence[str]) -> Figure:
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
     axes = figure.subplots()
     for number, name in enumerate(names):
-        estimate, colour = record.estimates[node][name], colour_of(number)
+        estimate, colour = record.estimates[node][name], COLOURS[number % len(COLOURS)]
         mean = np.asarray(estimate.mean)
         axes.plot(mean[:, i], mean[:, j], color=colour, linewidth=1.2, label=quote_for_figure(name))
         if estimate.claim != "none":

@@ -10,7 +10,7 @@ from pydantic_core import to_json
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.lanes import Lanes
 from heliograph.numerics.types import Float
-from heliograph.simulation.rows.columns import FilterColumns, WeighedAt
+from heliograph.simulation.rows.columns import FilterColumns
 
 HEAD = b'{"kind":"%b","plant":%b,"time":%b,"estimates":'
 FIRST = 2**52  # the number of column 0 where a row holds column numbers: no name contains it
@@ -93,7 +93,7 @@ class EstimateWriter:
         if judged is None:
             return results
         if columns.weighed is not None:
-            parts = zip(WeighedAt._fields, columns.weighed, strict=True)
+            parts = columns.weighed._asdict().items()
             results["outputs"] = {name: [outputs[i] for i in columns] for name, columns in parts}
         if outputs[judged.reason] > 0:
             why = Judgement.describe(outputs[judged.reason], outputs[judged.distance])

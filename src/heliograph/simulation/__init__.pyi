@@ -26,6 +26,12 @@ from .description.doubts import (
     Doubt as Doubt,
     doubts_before_data as doubts_before_data,
 )
+from .rows.columns import (
+    FilterColumns as FilterColumns,
+)
+from .rows.row_step import (
+    RowStep as RowStep,
+)
 from .runs.compilation_cache import (
     keep_compilations as keep_compilations,
 )

@@ -52,11 +52,15 @@ class GaussianFilter(AbstractBeliefFilter):
         """Return the angles of its plant, and those that its channel delivers."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
+    def predict_signal(self, state: Gaussian, k: Step) -> Signal:
+        """Moments of the sensor's signal y at step k, from the state before its measurement."""
+        plant, sensor = at(self.plant, k), at(self.sensor, k)
+        return signal_of(plant, sensor, self.transform, state, start_of(self.plant, self))
+
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
-        sensor, channel = at(self.sensor, k), at(self.channel, k)
-        signal = signal_of(at(self.plant, k), sensor, self.transform, state, start_of(self.plant, self))
+        channel, signal = at(self.channel, k), self.predict_signal(state, k)
         unknown = signal.about_mean() if self.linear else signal
         return correct_signal(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
 

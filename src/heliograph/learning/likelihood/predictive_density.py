@@ -9,9 +9,7 @@ import numpy as np
 import scipy
 from scipy.special import logsumexp, ndtr
 
-from heliograph.filters.gaussian.belief import start_of
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
-from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.modes.mixture import Component, atoms_of
 from heliograph.filters.rows import rows
 from heliograph.model.over_time import at
@@ -196,8 +194,7 @@ def expect_signals(
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, ...]]:
         k, z_k, u_k = row
         prior = filter.predict(state, u_k, k)
-        plant, sensor, channel = at((filter.plant, filter.sensor, filter.channel), k)
-        y = signal_of(plant, sensor, filter.transform, prior, start_of(filter.plant, filter))
+        channel, y = at(filter.channel, k), filter.predict_signal(prior, k)
         near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, filter.observed_angles)
         return filter.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 

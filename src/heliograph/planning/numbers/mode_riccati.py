@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import JumpSystem, mix_modes, propagate
+from heliograph.linear.jump_system import JumpSystem
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Criterion
@@ -104,7 +104,7 @@ def _step_through(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Par
 def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
     """Best gains of a step, and X after it."""
     law = m.law[k][:, None, None]
-    prior = propagate(m.transition[k], mix_modes(m.chain[k], parts), law * m.process[k])
+    prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)
     cross = m.output[k] @ prior
     # A mode that never occurs has the gain zero.
     noise = np.where(law > 0, law * m.noise[k], np.eye(m.noise.shape[-1]))
@@ -116,7 +116,7 @@ def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[n
 def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
     """Recursion of X under given gains: F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K']."""
     close = np.eye(gains.shape[2]) - gains @ m.output
-    added = propagate(close, m.process[:, None], propagate(gains, m.noise, 0.0))
+    added = close @ m.process[:, None] @ close.swapaxes(-1, -2) + gains @ m.noise @ gains.swapaxes(-1, -2)
     return JumpSystem(m.chain, close @ m.transition[:, None], m.law[:, :, None, None] * added)
 
 
@@ -127,4 +127,4 @@ def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
     if m.start is not None:  # the first step's chain forgets the mode before: any will do
         earlier = jnp.zeros_like(parts).at[0, 0].set(m.start).at[1:].set(parts[:-1])
     jumps = _close_loop(m, gains)
-    return jnp.sum(ahead * propagate(jumps.maps, mix_modes(m.chain, earlier), jumps.added))
+    return jnp.sum(ahead * jumps.step(earlier))

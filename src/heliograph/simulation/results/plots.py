@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.disk.quoting import quote_for_figure
+from heliograph.disk.quoting import label_with_unit
 from heliograph.numerics.check import fail
 
 # Okabe and Ito's palette, which people with colour blindness can tell apart; then grey.
@@ -66,8 +66,3 @@ def legend_outside(axes: "Axes", title: str | None = None) -> None:
 def colour_of(number: int) -> str:
     """Colour of the pages for a filter, by its number."""
     return COLOURS[number % len(COLOURS)]
-
-
-def label_with_unit(name: str, units: Mapping[str, str]) -> str:
-    """Label of a state or of time, with its unit if it has one."""
-    return quote_for_figure(f"{name} ({units[name]})" if name in units else name)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.quoting import quote_for_figure
+from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.model.origin import KeptOrigin, Origin
@@ -39,7 +39,6 @@ from heliograph.simulation.results.labelled import (
 from heliograph.simulation.results.plots import (
     chosen_filters,
     colour_of,
-    label_with_unit,
     legend_outside,
     panels,
     state_places,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from heliograph.disk.quoting import quote_for_figure
+from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
@@ -30,7 +30,6 @@ from heliograph.simulation.results.plots import (
     FAR,
     chosen_filters,
     colour_of,
-    label_with_unit,
     legend_outside,
     panels,
     state_places,

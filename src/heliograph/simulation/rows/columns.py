@@ -40,8 +40,16 @@ class TestedAt(NamedTuple):
 class FilterColumns(NamedTuple):
     """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
 
-    `judgement` is None for a fusion rule, which receives no measurement; `tested` has its squared innovation by what
-    its nodes receive, and is None for all others. `weighed` is None of a filter that weighs nothing.
+    Args:
+        node: name of the node; `Network.FUSED` of what is fused.
+        filter: name of the filter or fusion.
+        claim: of its estimate.
+        mean: first column of the mean; the others follow it.
+        covariance: first column of the covariance, row by row.
+        judgement: columns of the filter's `Judgement`; None for a fusion rule, which receives no measurement.
+        weighed: columns of its `Weighed`; None of a filter that weighs nothing.
+        tested: columns of a fusion's squared innovation by what its nodes receive, and of how many numbers these were;
+            None for all others.
     """
 
     node: str

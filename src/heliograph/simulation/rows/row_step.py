@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import chosen
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.trees.flat import Flat, flat_like, row_of
@@ -84,11 +84,12 @@ class RowStep:
         network: the network; `received` are the measurements of its nodes in their order, NaN where nothing arrived.
 
     Raises:
-        ValueError: a fusion whose reports get lost by chance on their way to the centre.
+        ValueError: what is no network; a fusion whose reports get lost by chance on their way to the centre.
     """
 
     @in_float64
     def __init__(self, network: Network):
+        instance("network", network, Network, "a Network")
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
         # All filters, their states before the first step, and the layouts of both.
         filters = AllFilters(network, judges=True, tests=True)
