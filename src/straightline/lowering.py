@@ -31,9 +31,6 @@ NAMES: dict[Any, str] = {}  # of types of numbers, which NumPy takes long to spe
 IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in memory as they are
 
 
-NAMED: set[str] = set()  # operations of users, which state by a function how they are computed
-
-
 class Lowering:
     """Lowering of operations one after another into a graph."""
 

@@ -7,7 +7,6 @@ import pytest
 
 import heliograph as hg
 from heliograph.engine.choice import engine_of
-from heliograph.numerics.over_runs import runs_last
 from straightline import machine
 from straightline.compiled import Alone, Compiled, compile
 from straightline.jax_function import function_of
@@ -288,15 +287,6 @@ def test_a_user_can_ask_for_the_engine_and_force_one(monkeypatch):
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "gpu")
     with pytest.raises(ValueError, match="HELIOGRAPH_ENGINE: expected native or xla, got gpu"):
         engine_of(svd, x)
-
-
-@pytest.mark.parametrize("length", [5, 300])
-def test_a_kernel_over_many_takes_what_they_share_from_memory_whole(length):
-    """Forty runs within each run: their own number, and a row that all of them share, of which none takes a part."""
-    kernel = runs_last(lambda a, b: a * jnp.sum(b, axis=0) if b.ndim > a.ndim else a * b)
-    x, row = RANDOM.normal(size=(2, 40)), RANDOM.normal(size=(2, length))
-    result = hg.simulation.over_runs(jax.vmap(kernel, in_axes=(0, None)), x, row)
-    np.testing.assert_allclose(result, x * row.sum(axis=1, keepdims=True), rtol=1e-12)
 
 
 @pytest.mark.parametrize("length", [2, 300])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliograph.numerics.linalg import UNROLL_LIMIT, cholesky, psd_solve
+from heliograph.numerics.linalg import WRITTEN, cholesky, psd_solve
 
 FACTOR = jax.jit(cholesky)
 
@@ -15,7 +15,7 @@ def psd(seed, n, rank=None):
     return a @ a.T
 
 
-@pytest.mark.parametrize("n", [1, 3, UNROLL_LIMIT, UNROLL_LIMIT + 3])
+@pytest.mark.parametrize("n", [1, 3, WRITTEN, WRITTEN + 3])
 def test_factor_is_the_librarys(n):
     a = psd(n, n)
     with jax.enable_x64(True):
@@ -38,7 +38,7 @@ def test_zero_has_the_zero_factor_and_indefinite_has_none():
         assert np.any(np.isnan(cholesky(jnp.asarray([[1.0, 2.0], [2.0, 1.0]]))))
 
 
-@pytest.mark.parametrize("n", [1, 4, UNROLL_LIMIT + 2])
+@pytest.mark.parametrize("n", [1, 4, WRITTEN + 2])
 def test_solve(n):
     a, b = psd(n, n) + np.eye(n), np.random.default_rng(0).normal(size=(n, 3))
     with jax.enable_x64(True):

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.extend.core import Primitive
 
 import straightline as sl
 
@@ -148,33 +147,51 @@ def test_what_c_does_not_have_is_refused(function, name, error, message):
         sl.to_c(function, np.zeros(2), name=name, single=True)
 
 
-def in_closed_form(a, power):
-    """Singular values of ((a, b), (c, d)): |hypot(a + d, b - c) +- hypot(a - d, b + c)| / 2, to a power."""
+def in_closed_form(a):
+    """Singular values of ((a, b), (c, d)): |hypot(a + d, b - c) +- hypot(a - d, b + c)| / 2."""
     half = jnp.hypot(a[0, 0] + a[1, 1], a[0, 1] - a[1, 0]) / 2, jnp.hypot(a[0, 0] - a[1, 1], a[0, 1] + a[1, 0]) / 2
-    return [jnp.stack([half[0] + half[1], jnp.abs(half[0] - half[1])]) ** power]
+    return jnp.stack([half[0] + half[1], jnp.abs(half[0] - half[1])])
 
 
-def test_an_operation_of_one_s_own_is_computed_by_its_function():
-    values = Primitive("singular_values")
-    values.multiple_results = True
-    values.def_abstract_eval(lambda a, power: [jax.core.ShapedArray(a.shape[:-1], a.dtype)])
-    with pytest.raises(sl.Unsupported, match="singular_values at"):
-        sl.compile(lambda a: values.bind(a, power=2), np.eye(2))
-    sl.operation(values, in_closed_form)
+@sl.operation(in_closed_form)
+def singular_values(a):
+    """Singular values by the library."""
+    return jnp.linalg.svd(a)[1]
+
+
+def test_an_operation_of_one_s_own_is_computed_by_its_native_function():
+    """Which C takes too; what it is decorated on is refused."""
     a = RANDOM.normal(size=(9, 2, 2))
-    [result] = sl.compile(lambda a: values.bind(a, power=2), a[0])(a)
-    np.testing.assert_allclose(result, np.linalg.svd(a)[1] ** 2, rtol=1e-13)
-    with pytest.raises(ValueError, match="operation: expected a primitive with a name of its own, got 'add'"):
-        sl.operation(Primitive("add"), in_closed_form)
+    np.testing.assert_allclose(sl.compile(singular_values, a[0])(a), np.linalg.svd(a)[1], rtol=1e-13)
+    assert sl.explain(lambda a: jnp.linalg.svd(a)[1], a[0]).startswith("refused: svd")
+    assert "sqrt" in sl.to_c(singular_values, a[0], name="values").source
 
 
-@pytest.mark.parametrize("count", [3, 40])
-def test_axes_that_vmap_added_to_an_operation_come_last(count):
-    """A few are written out, many are a loop; what does not differ has an axis of one."""
-    scaled = Primitive("scaled")
-    scaled.multiple_results = True
-    scaled.def_abstract_eval(lambda a, x, sizes: [jax.core.ShapedArray((2, *sizes), a.dtype)])
-    sl.operation(scaled, lambda a, x: [a @ x], mapped="sizes")
+def test_to_jax_an_operation_is_the_plain_function():
+    """By XLA, under vmap, and with derivatives forward and back: a singular value moves by u' dA v."""
+    a = RANDOM.normal(size=(9, 2, 2))
+    with jax.enable_x64(True):
+        alone, mapped = singular_values(a[0]), jax.jit(jax.vmap(singular_values))(a)
+        slopes = [jac(singular_values)(jnp.asarray(a[0])) for jac in (jax.jacfwd, jax.jacrev)]
+    np.testing.assert_allclose(alone, np.linalg.svd(a[0])[1], rtol=1e-13)
+    np.testing.assert_allclose(mapped, np.linalg.svd(a)[1], rtol=1e-13)
+    u, _, v = np.linalg.svd(a[0])
+    for slope in slopes:
+        np.testing.assert_allclose(slope, np.einsum("ik,kj->kij", u, v), rtol=1e-12)
+
+
+@sl.operation(lambda a, x: {"image": a @ x, "size": jnp.sum(x)})
+def image(a, x):
+    return {"image": jnp.einsum("ij,j->i", a, x), "size": x.sum()}
+
+
+@pytest.mark.parametrize("count", [3, 200])
+def test_vmap_within_a_run_maps_the_native_function(count):
+    """A few are written out, many are a loop; what is shared stays whole, and the last axis may be the mapped one."""
     a, x = RANDOM.normal(size=(5, 2, 2)), RANDOM.normal(size=(5, 2, count))
-    code = sl.compile(lambda a, x: scaled.bind(a[..., None], x, sizes=(count,))[0], a[0], x[0])
+    code = sl.compile(lambda a, x: jax.vmap(lambda y: image(a, y)["image"], 1, 1)(x), a[0], x[0])
     np.testing.assert_allclose(code(a, x), a @ x, rtol=1e-13)
+    twice = sl.compile(lambda a, x: jax.vmap(jax.vmap(image, (0, None)), (None, 1))(a, x), np.stack([a[0]] * 3), x[0])
+    result = twice(np.stack([a] * 3, axis=1), x)
+    np.testing.assert_allclose(result["image"], np.stack([np.swapaxes(a @ x, 1, 2)] * 3, axis=2), rtol=1e-13)
+    np.testing.assert_allclose(result["size"], np.stack([x.sum(axis=1)] * 3, axis=2), atol=1e-13)

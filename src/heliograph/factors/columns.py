@@ -18,12 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.numerics.linalg import symmetric
+from heliograph.numerics.linalg import WRITTEN, outer, symmetric
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array
 
 UNITS = 4  # of rounding of a number, which are noise of it
-WRITTEN = 16  # rows that are written out one after another; more are a loop
 LARGEST = 1e30  # variance by rounding: beyond it numbers are absurd, and their squares none in single precision
 RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
 
@@ -244,11 +243,6 @@ def unit_of(numbers: Array) -> float:
     return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(_precision.get()).eps))
 
 
-def outer(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return a b' as a matrix product."""
-    return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
-
-
 def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
     """Return the larger of both; not by a maximum, which halves the derivative where both are zero."""
     return jnp.where(pivot >= floor, pivot, floor)
@@ -278,7 +272,7 @@ def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
         weighted = weights * rows[j]
         d = rows[j] @ weighted
         share = jnp.where(np.arange(n) > j, rows @ weighted * inverse(d), 0.0)
-        return rows - jnp.outer(share, rows[j]), lower.at[:, j].add(share), variances.at[j].set(d)
+        return rows - jnp.outer(share, rows[j]), *_with_column(j, lower, share, variances, d)
 
     start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
@@ -293,8 +287,16 @@ def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
         rest, lower, variances = carry
         d = _bound_below(rest[j, j], least * whole[j])
         share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal(d), 0.0)
-        return rest - jnp.outer(share, rest[j]), lower.at[:, j].add(share), variances.at[j].set(d)
+        return rest - jnp.outer(share, rest[j]), *_with_column(j, lower, share, variances, d)
 
     start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
     return Columns(lower, variances)
+
+
+def _with_column(
+    j: jax.Array, lower: jax.Array, share: jax.Array, variances: jax.Array, d: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Put a column into L, below its diagonal, and an entry into d, both zero before, at a place that a loop counts."""
+    here = np.arange(len(variances)) == j
+    return jnp.where(here, lower + share[:, None], lower), jnp.where(here, d, variances)

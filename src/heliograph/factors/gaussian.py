@@ -15,7 +15,6 @@ from jax import lax
 
 from heliograph.factors.columns import (
     UNITS,
-    WRITTEN,
     Columns,
     below_diagonal,
     decorrelate,
@@ -28,7 +27,7 @@ from heliograph.factors.columns import (
     unit_lower,
     unit_of,
 )
-from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
+from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, WRITTEN, rounding, symmetric
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 
@@ -327,7 +326,7 @@ def _measure_parts(
 
         def body(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
             root, d, gain = measure_part(i, *carry[:2])
-            return root, d, carry[2].at[:, i].add(gain)
+            return root, d, jnp.where(np.arange(n) == i, gain[:, None], carry[2])
 
         start = root, d, jnp.zeros((len(root), n), root.dtype)
         looped: tuple[jax.Array, jax.Array, jax.Array] = lax.fori_loop(0, n, body, start)

@@ -1,8 +1,7 @@
 """Innovations: value, covariance under the filter's model and log-likelihood of each, and a summary of many."""
 
 from collections.abc import Sequence
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +12,11 @@ from heliograph.numerics.linalg import (
     OFF_SUPPORT,
     OFF_VALUE,
     PIVOT_TOLERANCE,
-    UNROLL_LIMIT,
+    WRITTEN,
     negative_tolerance,
     rounding,
 )
 from heliograph.numerics.module import readable
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.shares import Share, count_independent, wilson
 from heliograph.numerics.types import Array, Float
 
@@ -84,22 +82,26 @@ def posterior_weights(
     return jax.nn.softmax(jnp.where(excluded, prior, weighed)), jax.nn.logsumexp(weighed), excluded
 
 
-def _shape_of_runs(value: jax.Array, covariance: jax.Array, size: jax.Array) -> tuple[int, ...]:
-    return jnp.broadcast_shapes(value.shape[1:], covariance.shape[2:], size.shape[1:])
+@jax.jit
+def log_density(
+    value: "Float[jax.Array, ' m']", covariance: "Float[jax.Array, 'm m']", size: "Float[jax.Array, ' m']"
+) -> "Float[jax.Array, '']":
+    """log N(value; 0, covariance) of the components that are not NaN, 0 if all are.
 
-
-def _log_density(value: jax.Array, covariance: jax.Array, size: jax.Array, looped: bool) -> jax.Array:
-    m = value.shape[0]
+    Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
+    covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf
+    where it does not: the density is that of the free components. `size` (m,) is the size of the terms whose difference
+    is `value`, for its rounding. An indefinite covariance gives NaN.
+    """
     # Absent components: value and covariance zero, so that they are determined and agree.
     present = ~jnp.isnan(value)
     rest = jnp.where(present, value, 0.0)
-    left = jnp.where(present[:, None] & present[None], covariance, 0.0)
-    rest = jnp.broadcast_to(rest, left.shape[1:])
+    left = jnp.where(present[:, None] & present, covariance, 0.0)
     # Deviation within which a determined component agrees with those before it.
-    variance = jnp.stack([left[j, j] for j in range(m)]) if m else rest
+    variance = jnp.diagonal(left)
     reach = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
-    def condition(j: int | jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def condition(j: Any, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rest, left, total, growth = carry
         pivot = left[j, j]
         # Determined: the pivot is zero, to rounding.
@@ -113,30 +115,18 @@ def _log_density(value: jax.Array, covariance: jax.Array, size: jax.Array, loope
         agrees = jnp.where(jnp.abs(rest[j]) <= reach[j], 0.0, -jnp.inf)
         # Condition the remaining components on component j.
         column = jnp.where(determined, 0.0, left[:, j] * scale)
-        after = rest - column * rest[j], left - column[:, None] * left[j][None]
+        after = rest - column * rest[j], left - jnp.outer(column, left[j])
         growth = jnp.maximum(growth, jnp.where(determined, 0.0, variance[j] * scale))
         return *after, total + jnp.where(determined, agrees, density), growth
 
-    none = jnp.zeros_like(jnp.sum(left, axis=(0, 1)))
+    none = jnp.zeros((), value.dtype)
     carry: tuple[jax.Array, ...] = (rest, left, none, none)
-    if looped:
-        carry = jax.lax.fori_loop(0, m, condition, carry)
+    if len(value) > WRITTEN:
+        carry = jax.lax.fori_loop(0, len(value), condition, carry)
         return carry[2]
-    for j in range(m):
+    for j in range(len(value)):
         carry = condition(j, carry)
     return carry[2]
-
-
-@partial(runs_last, shapes=_shape_of_runs, written=partial(_log_density, looped=False))
-def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax.Array:
-    """log N(value; 0, covariance) of the components that are not NaN, 0 if all are.
-
-    Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
-    covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf
-    where it does not: the density is that of the free components. `size` (m,) is the size of the terms whose difference
-    is `value`, for its rounding. An indefinite covariance gives NaN.
-    """
-    return _log_density(value, covariance, size, looped=len(value) > UNROLL_LIMIT)
 
 
 class Weighed(NamedTuple):

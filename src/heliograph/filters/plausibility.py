@@ -14,13 +14,10 @@ import numpy as np
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.linalg import (
     NEGATIVE_TOLERANCE,
-    add,
-    diagonal_of,
     rounding,
     squared_distance,
     squared_distances,
 )
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, Float, PyTree
 
 LIMIT = 1e6
@@ -32,7 +29,6 @@ of the variance. At d = 1e6 these are 2e-10 and 2e-4 in double precision. In sin
 moments from d = eps^-1/2 = 2,900 on: the bound is there (`greatest_distance`). Any bound far below would be a
 statistical gate, which locks a filter out after an outage. Streams, timelines, services and recordings are in double.
 """
-FEW = 36  # numbers of a state of six and its covariance
 
 
 class Reason(IntEnum):
@@ -120,13 +116,8 @@ def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
     present = ~jnp.isnan(value)
     total = jnp.where(present[:, None] & present, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
-    distance = _distance(total, jnp.where(present, value, 0.0)) if len(value) else jnp.zeros(())
+    distance = squared_distance(total, jnp.where(present, value, 0.0))
     return distance, jnp.sum(present).astype(distance.dtype)
-
-
-@runs_last
-def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
-    return squared_distance(a, x)
 
 
 def judge(
@@ -148,16 +139,16 @@ def judge(
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
     every, certain = _squares(value, covariance, present, size)
-    distance, count = _add_up(every), _add_up(present.astype(value.dtype))
+    distance, count = jnp.sum(every), jnp.sum(present.astype(value.dtype))
 
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     squares, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
-    far = _any_true((free > most) | (larger & jnp.isinf(value))) | (_add_up(free) > most)
+    far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
     # Excluded: all determined, and one of them differs.
-    excluded = _any_true(jnp.isinf(every) & certain) & ~_any_true(~certain & present)
+    excluded = jnp.any(jnp.isinf(every) & certain) & ~jnp.any(~certain & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
 
@@ -167,67 +158,50 @@ def judge(
     predicted = (_finite(before, claim) & ~_is_prediction(prior, claim)) | _overflows(states[0], states[1])
     predicted |= spoilt
     reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
-    came = (count > 0) | _any_true(~jnp.isnan(z))  # also where what was expected is no number
+    came = (count > 0) | jnp.any(~jnp.isnan(z))  # also where what was expected is no number
     reason = jnp.where(unsound & came & ~far, Reason.UNSOUND, reason)
     reason = jnp.where(predicted, Reason.PREDICTION, reason)
     # Inputs that move the mean to where its deviation is below its rounding.
-    digits = _any_true(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(value.dtype)
+    digits = jnp.any(_mask_rounded_away(prior) & ~_mask_rounded_away(before)).astype(value.dtype)
     input_verdict = jnp.nan if claim == "none" else digits
     distance = jnp.where((count > 0) & (sound | (reason > 0)), distance, jnp.nan)
     return Judgement(distance, count, reason.astype(value.dtype), jnp.asarray(input_verdict))
 
 
-def _any_true(which: jax.Array) -> jax.Array:
-    """Test whether any is true; for few without a loop, which would cost more than the operations themselves."""
-    flat = which.reshape(-1)
-    if not 0 < len(flat) <= FEW:
-        return jnp.any(flat)
-    return reduce(jnp.logical_or, [jax.lax.index_in_dim(flat, i, keepdims=False) for i in range(len(flat))])
-
-
-def _add_up(values: jax.Array) -> jax.Array:
-    """Add up values; for few without a loop."""
-    if not 0 < len(values) <= FEW:
-        return jnp.sum(values)
-    return add([jax.lax.index_in_dim(values, i, keepdims=False) for i in range(len(values))])
-
-
 def _squares(value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the squared distances of the components in use, in turn, and which of these the others determine."""
-    if not len(value):
-        return jnp.zeros(0), jnp.zeros(0, dtype=bool)
     padded = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
     squares, determined = squared_distances(padded, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
     return jnp.where(used, squares, 0.0), used & determined
 
 
 def _finite(estimates: Estimate, claim: Claim) -> jax.Array:
-    finite = ~_any_true(~jnp.isfinite(jnp.asarray(estimates.mean)))
-    return finite if claim == "none" else finite & ~_any_true(~jnp.isfinite(jnp.asarray(estimates.covariance)))
+    finite = ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.mean)))
+    return finite if claim == "none" else finite & ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.covariance)))
 
 
 def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
     """Test for finite numbers, with no variance below zero by more than the rounding of the covariance before."""
     if claim == "none":
         return _finite(estimates, claim)
-    left, whole = diagonal_of(jnp.asarray(estimates.covariance)), diagonal_of(jnp.asarray(before.covariance))
+    left, whole = jnp.diagonal(jnp.asarray(estimates.covariance)), jnp.diagonal(jnp.asarray(before.covariance))
     rounded = rounding(NEGATIVE_TOLERANCE, left) * jnp.where(jnp.isfinite(whole), jnp.abs(whole), 0.0)
-    return _finite(estimates, claim) & ~_any_true(left < -rounded)
+    return _finite(estimates, claim) & ~jnp.any(left < -rounded)
 
 
 def _is_prediction(prior: Estimate, claim: Claim) -> jax.Array:
     """Test for finite numbers and no negative variance, to the rounding of the largest: any may have moved into it."""
     if claim == "none":
         return _finite(prior, claim)
-    variances = diagonal_of(jnp.asarray(prior.covariance))
+    variances = jnp.diagonal(jnp.asarray(prior.covariance))
     largest = jnp.max(jnp.abs(variances), initial=0.0)
-    return _finite(prior, claim) & ~_any_true(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
+    return _finite(prior, claim) & ~jnp.any(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
     """Test whether some number of a state became infinite."""
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
-    items = [_any_true(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
+    items = [jnp.any(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
     return reduce(jnp.logical_or, items, jnp.asarray(False))
 
 
@@ -238,6 +212,6 @@ def _is_real(leaf: Array) -> bool:
 def _mask_rounded_away(estimates: Estimate) -> jax.Array:
     """Mask of the states whose deviation is positive but below the rounding of their mean."""
     mean = jnp.asarray(estimates.mean)
-    variance = diagonal_of(jnp.asarray(estimates.covariance))
+    variance = jnp.diagonal(jnp.asarray(estimates.covariance))
     unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)
     return (variance > 0) & (jnp.sqrt(jnp.maximum(variance, 0.0)) < unit)

@@ -11,9 +11,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import add, times_vector
 from heliograph.numerics.module import Module
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -48,15 +46,9 @@ class Law(NamedTuple):
 
     def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
         """Mean and variance of the mixture, (m,) each."""
-        return _two_moments(*self[:3])
-
-
-@runs_last
-def _two_moments(log_share: jax.Array, mean: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    share = jnp.exp(log_share)
-    center = add([(share * mean)[:, j] for j in range(mean.shape[1])])
-    second = share * (variance + (mean - center[:, None]) ** 2)
-    return center, add([second[:, j] for j in range(mean.shape[1])])
+        share = jnp.exp(self.log_share)
+        center = jnp.sum(share * self.mean, axis=1)
+        return center, jnp.sum(share * (self.variance + (self.mean - center[:, None]) ** 2), axis=1)
 
 
 class ReceivedNoise(Module):
@@ -86,17 +78,11 @@ class ReceivedNoise(Module):
         E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's spread acts on the signal and on the branch's
         mean together. With that of the signal alone, Var(g) y^2, it is at least E[g^2] r_j.
         """
-        return _law(self, sensed)
-
-
-@runs_last
-def _law(noise: ReceivedNoise, sensed: jax.Array) -> Law:
-    gain, power, mean = noise.gain[:, None], noise.power[:, None], noise.mean
-    signal = times_vector(noise.output, sensed)[:, None]
-    least = power * noise.variance + noise.late_variance
-    variance = least + (power - gain**2) * mean * (mean + 2 * signal)
-    parts = noise.log_share, gain * mean + noise.late_mean, variance, least
-    return Law(*(jnp.broadcast_to(x, variance.shape) for x in parts))
+        gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
+        signal = (self.output @ sensed)[:, None]
+        least = power * self.variance + self.late_variance
+        variance = least + (power - gain**2) * mean * (mean + 2 * signal)
+        return Law(jnp.asarray(self.log_share), jnp.asarray(gain * mean + self.late_mean), variance, jnp.asarray(least))
 
 
 class SplitChannel(NamedTuple):

@@ -10,7 +10,6 @@ from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
 from heliograph.fusion.mesh.gains import Believed, Weights
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import (
-    SHORT,
     component_weights,
     diagonal_weights,
     matrix_weights,
@@ -23,6 +22,7 @@ from heliograph.fusion.weights import (
 )
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
+from heliograph.numerics.linalg import WRITTEN
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import Array, Bool, Float, PyTree
 
@@ -171,7 +171,7 @@ class DiagonalWeights(AbstractWeights):
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
-        if believed.joint is None or self.with_mean or len(believed.present) > SHORT:
+        if believed.joint is None or self.with_mean or len(believed.present) > WRITTEN:
             return super().neighbour_weights(believed)
         chosen = component_weights(believed.joint, believed.present)
         identity = jnp.eye(chosen.shape[1])

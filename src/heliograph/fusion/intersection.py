@@ -6,21 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.fusion.mesh.gains import Believed, Weights
-from heliograph.numerics.linalg import (
-    add,
-    diagonal,
-    factor,
-    inner,
-    rounding,
-    solve,
-    solver,
-    symmetric,
-    times,
-    times_vector,
-    trace,
-    transpose,
-)
-from heliograph.numerics.over_runs import runs_last, runs_last_of
+from heliograph.numerics.linalg import factor, psd_solve, rounding, solver, symmetric
 from heliograph.numerics.types import Float
 
 GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13
@@ -32,27 +18,25 @@ HALVINGS = 50  # of the interval of one weight, which shrinks to 1e-15
 FLAT = 1e-15  # of its terms: a slope that is rounding
 
 
-@runs_last
 def intersect(
-    means: Float[jax.Array, "count n *#runs"],
-    information: Float[jax.Array, "count n n *#runs"],
-    weights: Float[jax.Array, "count *#runs"],
-) -> tuple[Float[jax.Array, "n *#runs"], Float[jax.Array, "n n *#runs"]]:
+    means: Float[jax.Array, "count n"],
+    information: Float[jax.Array, "count n n"],
+    weights: Float[jax.Array, " count"],
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, from information matrices J.
 
     Differences of the means are used, since the matrices that multiply them have lost the digits that nearly dependent
     components cost: the means themselves may be millions of deviations from zero.
     """
     covariance = inverse(_sum_weighted(weights, information))
-    off = add([w * times_vector(j, x - means[0]) for w, j, x in zip(weights, information, means, strict=True)])
-    return means[0] + times_vector(covariance, off), covariance
+    off = jnp.einsum("k,kab,kb->a", weights, information, means - means[0])
+    return means[0] + covariance @ off, covariance
 
 
 _Progress = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # weights, slack, whether to go on, iteration
 
 
-@runs_last_of(lambda information: (len(information), *information.shape[3:]))
-def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> Float[jax.Array, "count *#runs"]:
+def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[jax.Array, " count"]:
     """Weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
 
     The gradient is g_k = -tr(P J_k P), and max_k tr(P J_k P) - tr P bounds the excess over the minimum (convexity); the
@@ -60,60 +44,50 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> 
     """
     count = information.shape[0]
     # Unit trace on average, so that the start of the multipliers fits.
-    scaled = information / (add([trace(j) for j in information]) / count)
+    scaled = information / (jnp.sum(jax.vmap(jnp.trace)(information)) / count)
 
     def step(carry: _Progress) -> _Progress:
         w, slack, _, iteration = carry
         value, gradient, hessian = _trace_derivatives(scaled, w)
-        slack = jnp.where(iteration == 0, gradient - jnp.min(gradient, axis=0) + 0.1 * value, slack)
+        slack = jnp.where(iteration == 0, gradient - jnp.min(gradient) + 0.1 * value, slack)
         moved = _newton_step(_Point(w, slack, gradient, hessian))
-        # Certificate of the excess; a run below it stays where it is.
-        going = jnp.max(-gradient, axis=0) > (1 + rounding(GAP, value, LOOP)) * value
+        # Certificate of the excess: weights below it stay where they are.
+        going = jnp.max(-gradient) > (1 + rounding(GAP, value, LOOP)) * value
         w, slack = (jnp.where(going, new, old) for new, old in zip(moved, (w, slack), strict=True))
-        return w, slack, going, iteration + 1  # a run that has arrived stays where it is
+        return w, slack, going, iteration + 1
 
-    runs = information.shape[3:]
     # From equal weights, which are inside the simplex.
-    w = jnp.full((count, *runs), 1 / count)
-    start = w, jnp.zeros_like(w), jnp.ones(runs, bool), jnp.asarray(0)
-    w, *_ = jax.lax.while_loop(lambda c: jnp.any(c[2]) & (c[3] < ITERATIONS), step, start)
+    w = jnp.full(count, 1 / count)
+    start = w, jnp.zeros_like(w), jnp.asarray(True), jnp.asarray(0)
+    w, *_ = jax.lax.while_loop(lambda c: c[2] & (c[3] < ITERATIONS), step, start)
     return jnp.asarray(w)
 
 
 class _Point(NamedTuple):
     """Weights and their multipliers; the gradient of tr P and its Hessian."""
 
-    weights: Float[jax.Array, "count *#runs"]
-    slack: Float[jax.Array, "count *#runs"]
-    gradient: Float[jax.Array, "count *#runs"]
-    hessian: Float[jax.Array, "count count *#runs"]
+    weights: Float[jax.Array, " count"]
+    slack: Float[jax.Array, " count"]
+    gradient: Float[jax.Array, " count"]
+    hessian: Float[jax.Array, "count count"]
 
 
 def _trace_derivatives(
-    information: Float[jax.Array, "count n n *#runs"], w: Float[jax.Array, "count *#runs"]
-) -> tuple[Float[jax.Array, "*#runs"], Float[jax.Array, "count *#runs"], Float[jax.Array, "count count *#runs"]]:
+    information: Float[jax.Array, "count n n"], w: Float[jax.Array, " count"]
+) -> tuple[Float[jax.Array, ""], Float[jax.Array, " count"], Float[jax.Array, "count count"]]:
     """Return tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
-    count, n, rest = information.shape[0], information.shape[1], information.shape[3:]
     p = inverse(_sum_weighted(w, information))
-    half = _product(information.reshape(count * n, n, *rest), p).reshape(count, n, n, *rest)  # J_k P
-    full = _product(p, jnp.swapaxes(half, 0, 1).reshape(n, count * n, *rest)).reshape(n, count, n, *rest)
-    gradient = jnp.stack([-trace(full[:, k]) for k in range(count)])
-    upper = {(k, j): inner(half[k], transpose(full[:, j])) for k in range(count) for j in range(k, count)}
-    hessian = jnp.stack([jnp.stack([upper[min(k, j), max(k, j)] for j in range(count)]) for k in range(count)])
-    return trace(p), gradient, 2 * hessian
+    half = information @ p  # J_k P
+    full = p @ half
+    hessian = 2 * symmetric(jnp.einsum("kab,jba->kj", half, full))
+    return jnp.trace(p), -jnp.trace(full, axis1=1, axis2=2), hessian
 
 
-_product = runs_last(times)
-
-
-def _sum_weighted(
-    w: Float[jax.Array, "count *#runs"], information: Float[jax.Array, "count n n *#runs"]
-) -> Float[jax.Array, "n n *#runs"]:
+def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "count n n"]) -> Float[jax.Array, "n n"]:
     """Return sum_k w_k J_k."""
-    return add([w[k] * information[k] for k in range(len(information))])
+    return jnp.einsum("k,kab->ab", w, information)
 
 
-@runs_last
 def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     """Take one Newton step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
 
@@ -122,40 +96,36 @@ def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     w, slack, gradient = point.weights, point.slack, point.gradient
     root = jnp.sqrt(w)  # scaled by it, the matrix stays well conditioned as weights vanish
     # Hessian + diag(s / w), scaled to root(w) (.) root(w).
-    matrix = root[:, None] * point.hessian * root[None] + diagonal(slack)
+    matrix = root[:, None] * point.hessian * root[None] + jnp.diag(slack)
     solve = solver(matrix)
     ones = root * solve(root[:, None])[:, 0]
 
     def direction(target: jax.Array) -> tuple[jax.Array, jax.Array]:
         solved = root * solve((target / root - root * gradient)[:, None])[:, 0]
-        move = solved - jnp.sum(solved, axis=0) / jnp.sum(ones, axis=0) * ones
+        move = solved - jnp.sum(solved) / jnp.sum(ones) * ones
         return move, (target - slack * move) / w - slack
 
     # Predictor: the step with target 0.
-    present = jnp.mean(w * slack, axis=0)
+    present = jnp.mean(w * slack)
     move, slack_move = direction(jnp.zeros_like(w))
-    ahead = jnp.mean(
-        (w + _longest_step(w, move) * move) * (slack + _longest_step(slack, slack_move) * slack_move), axis=0
-    )
+    ahead = jnp.mean((w + _longest_step(w, move) * move) * (slack + _longest_step(slack, slack_move) * slack_move))
     # Corrector: centred, less the predictor's second-order term.
     target = present * jnp.clip(ahead / present, 0.0, 1.0) ** 3 - move * slack_move
     move, slack_move = direction(target)
     length = jnp.minimum(_longest_step(w, move), _longest_step(slack, slack_move))
     w = w + length * move
-    return w / jnp.sum(w, axis=0), slack + length * slack_move
+    return w / jnp.sum(w), slack + length * slack_move
 
 
-def _longest_step(
-    value: Float[jax.Array, "count *#runs"], move: Float[jax.Array, "count *#runs"]
-) -> Float[jax.Array, "*#runs"]:
+def _longest_step(value: Float[jax.Array, " count"], move: Float[jax.Array, " count"]) -> Float[jax.Array, ""]:
     """Return the largest step, at most 1, that keeps value + step move positive."""
     reach = jnp.where(move < 0, -value / jnp.where(move < 0, move, -1.0), jnp.inf)
-    return jnp.minimum(1.0, STEP_BACK * jnp.min(reach, axis=0))
+    return jnp.minimum(1.0, STEP_BACK * jnp.min(reach))
 
 
 def intersect_inversely(
-    a: Float[jax.Array, "n"], p: Float[jax.Array, "n n"], b: Float[jax.Array, "n"], q: Float[jax.Array, "n n"]
-) -> tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]:
+    a: Float[jax.Array, " n"], p: Float[jax.Array, "n n"], b: Float[jax.Array, " n"], q: Float[jax.Array, "n n"]
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Inverse covariance intersection of (a, P) and (b, Q), with the weight w of least trace.
 
     With C = (w P + (1 - w) Q)^-1 and V = (P^-1 + Q^-1 - C)^-1, tr V is convex in w, and its slope is
@@ -187,11 +157,9 @@ def intersect_inversely(
     return replace_known(mean, symmetric(covariance), jnp.stack([a, b]), both)
 
 
-@runs_last_of(jnp.shape)
-def inverse(a: Float[jax.Array, "n n *#runs"]) -> Float[jax.Array, "n n *#runs"]:
+def inverse(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
     """Return A^-1 of a positive definite A."""
-    n = a.shape[0]
-    return symmetric(solve(a, jnp.eye(n).reshape(n, n, *[1] * (a.ndim - 2))))
+    return symmetric(psd_solve(a, jnp.eye(len(a))))
 
 
 def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
@@ -207,19 +175,18 @@ def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count
     return jax.vmap(_invert_widened)(matrices, KNOWN * reference)
 
 
-@runs_last
 def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
     _, scales = factor(a)  # 1 / root of what those before it leave of a component: rounding where that is next to none
-    none = jnp.stack([jnp.where((s == 0) | (s**2 * low > 1), 1.0, 0.0) for s, low in zip(scales, least, strict=True)])
-    return inverse(a + diagonal(none * least))
+    none = jnp.where((scales == 0) | (scales**2 * least > 1), 1.0, 0.0)
+    return inverse(a + jnp.diag(none * least))
 
 
 def replace_known(
-    mean: Float[jax.Array, "n"],
+    mean: Float[jax.Array, " n"],
     covariance: Float[jax.Array, "n n"],
     means: Float[jax.Array, "count n"],
     inputs: Float[jax.Array, "count n n"],
-) -> tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]:
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Replace each component of a fused estimate that an input knows exactly by that input's, of variance zero.
 
     In `inverses` a small number stands for no variance, of which the mean would keep 1e-8 of what the others say.

@@ -12,12 +12,10 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.fusion.intersection import inverse
 from heliograph.numerics.check import array, fail, probabilities, show_value
 from heliograph.numerics.lapack import pseudo_solve, regular_solve
-from heliograph.numerics.linalg import add, diagonal_of, identity, psd_solve, rounding, solve, symmetric, symmetrize
-from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.linalg import WRITTEN, psd_solve, rounding, symmetric, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
-SHORT = 24  # unknowns of equations that are solved side by side
 RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have besides
 
 
@@ -243,7 +241,7 @@ def solve_arrived_weights(
     total = scaled + jnp.diag(jnp.repeat(jnp.where(present, RIDGE, 1.0), n))
     ones = (there[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
     # U^-1 E, and what makes the weights sum to I.
-    solved = psd_solve(total, ones) if degree * n <= SHORT else regular_solve(total, ones)
+    solved = psd_solve(total, ones) if degree * n <= WRITTEN else regular_solve(total, ones)
     weights = (inverse(ones.T @ solved) @ solved.T).reshape(n, degree, n)
     return unit[:, None, None] * weights / unit
 
@@ -253,38 +251,36 @@ def solve_arrived_weights_by_component(
 ) -> Float[jax.Array, "n degree n"]:
     """Diagonal weights of those that are present: the best for each component of the state by itself."""
     degree, n = joint.shape[:2]
-    if degree <= SHORT:
+    if degree <= WRITTEN:
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
     return _weigh_components(partial(solve_arrived_weights, present=present), joint)
 
 
-@runs_last
 def component_weights(
-    joint: Float[jax.Array, "degree n degree n *#runs"], present: Bool[jax.Array, "degree *#runs"]
-) -> Float[jax.Array, "degree n *#runs"]:
-    """Diagonals c_i of the weights of each component by itself.
+    joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
+) -> Float[jax.Array, "degree n"]:
+    """Diagonals c_i of the weights of each component by itself."""
+    component = jnp.stack([joint[:, a, :, a] for a in range(joint.shape[1])])
+    return jax.vmap(_weights_of_component, in_axes=(0, None), out_axes=1)(component, present.astype(joint.dtype))
 
-    Of one component, c = U^-1 1 / 1' U^-1 1 over those that are present, by the factor of U.
-    """
-    degree, n = joint.shape[:2]
-    there = present.astype(joint.dtype)[:, None]
-    # U of all components side by side, with those that are absent apart.
-    component = jnp.stack([joint[:, a, :, a] for a in range(n)], axis=2)
-    # Library sums, which the compiler does not repeat in everything that uses them.
-    mean = jnp.sum(there * diagonal_of(component) / jnp.sum(there, axis=0), axis=0)
+
+def _weights_of_component(
+    joint: Float[jax.Array, "degree degree"], there: Float[jax.Array, " degree"]
+) -> Float[jax.Array, " degree"]:
+    """c = U^-1 1 / 1' U^-1 1 over those that are there, by the factor of U, as `solve_arrived_weights`."""
+    mean = jnp.sum(there * jnp.diagonal(joint)) / jnp.sum(there)
+    # U, with those that are absent apart.
     apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
-    total = there[:, None] * there * component + identity(degree, component) * apart[:, None]
-    solved = solve(total, (there * jnp.ones_like(mean))[:, None])[:, 0]
-    return solved / jnp.sum(solved, axis=0)
+    solved = psd_solve(there[:, None] * there * joint + jnp.diag(apart), there[:, None])[:, 0]
+    return solved / jnp.sum(solved)
 
 
-@runs_last
 def weigh_covariance_by_component(
-    weights: Float[jax.Array, "degree n *#runs"], joint: Float[jax.Array, "degree n degree n *#runs"]
-) -> Float[jax.Array, "n n *#runs"]:
+    weights: Float[jax.Array, "degree n"], joint: Float[jax.Array, "degree n degree n"]
+) -> Float[jax.Array, "n n"]:
     """Covariance C P C' of diagonal weights, a sum over senders at a time."""
-    sums = add([joint[:, :, j] * weights[j] for j in range(len(weights))])
-    return symmetric(add([w[:, None] * s for w, s in zip(weights, sums, strict=True)]))
+    sums = jnp.einsum("iajb,jb->iab", joint, weights)
+    return symmetric(jnp.einsum("ia,iab->ab", weights, sums))
 
 
 def solve_arrived_scalar_weights(

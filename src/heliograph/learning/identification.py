@@ -17,7 +17,7 @@ from heliograph.learning.unidentified import WEAK, Confounded, Rank, find_confou
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import quickly_compiled
-from heliograph.numerics.linalg import congruence, contract, root
+from heliograph.numerics.linalg import cholesky, contract
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.moments.second_moments import second_order
@@ -199,7 +199,7 @@ def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> 
         k, u_k, noise = row
         prior = filter.predict(state, u_k, k)
         received = filter.correct(prior, jnp.zeros(filter.received), k)[1]
-        z = root(jnp.asarray(received.covariance)) @ noise - received.value
+        z = cholesky(jnp.asarray(received.covariance)) @ noise - received.value
         return filter.correct(prior, z, k)[0], z
 
     start = jax.tree.map(jnp.asarray, filter.init())
@@ -229,7 +229,7 @@ def route_sentences(solution: "Solution") -> list[str]:
         mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
         spread = jnp.asarray(moments.nominal.center)
         whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
-        noise = jnp.diagonal(congruence(mean, r) + contract(spread, whole))
+        noise = jnp.diagonal(mean @ r @ mean.T + contract(spread, whole))
         reached = jnp.argmax(jnp.abs(mean), axis=1)
         rows = jnp.arange(len(mean))
         return jnp.stack([mean[rows, reached], spread[rows, rows, reached, reached], noise], axis=1)

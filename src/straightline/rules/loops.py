@@ -9,13 +9,12 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.lowering import IN_MEMORY, NAMED, Lowering, Value, array_of, scalars
+from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
 from straightline.memory import InMemory
 from straightline.nodes import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
 from straightline.rules.elementwise import select
 
 WRITTEN_OUT = 2000  # numbers computed by all turns of a loop that is written out
-KERNEL = 300  # numbers that an operation of a user is taken to compute
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 
@@ -246,7 +245,6 @@ def size_of(lowering: Lowering, jaxpr: Any) -> int:
     for equation in jaxpr.eqns:
         inner = [size_of(lowering, getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
         turns = equation.params["length"] if equation.primitive.name == "scan" else 1
-        inner += [KERNEL] if equation.primitive.name in NAMED else []
         total += turns * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
     lowering.sizes[jaxpr] = total
     return total

@@ -1,109 +1,150 @@
-"""Operations of one's own: a primitive of JAX that native code computes by a function in its place."""
+"""Operations of one's own: a plain function of JAX, which native code computes by another function in its place."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from functools import cache, partial, wraps
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import JaxprEqn, Primitive
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
 
-from straightline.lowering import IN_MEMORY, NAMED, RULES, Lowering, Value, like
-from straightline.memory import LONG, InMemory
-from straightline.nodes import Node
-from straightline.rules.loops import in_memory, repeated
-from straightline.rules.shapes import FEW
-from straightline.rules.views import joined
+from straightline.lowering import IN_MEMORY, Lowering, Value, like
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+Axes = tuple[int | None, ...]  # of each argument: 0 where `vmap` maps its first axis, None where all share it
+
+_primitive: Any = Primitive("operation")
+_primitive.multiple_results = True
 
 
-class Native(NamedTuple):
-    """The function in a primitive's place, for one equation: its parameters, sorted, and the types of its arrays."""
+class _Program(NamedTuple):
+    """One operation on arguments of one shape: its plain function as traced, and what native code computes instead."""
 
     name: str
-    function: Callable[..., Sequence[Any]]
-    params: tuple[tuple[str, Any], ...]
-    types: tuple[Any, ...]
+    plain: ClosedJaxpr
+    native: Callable[..., list[Any]]  # of leaves, as `plain`
+    x64: bool  # whether JAX's numbers were double where it was traced
+
+    def __hash__(self) -> int:
+        return id(self.plain)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Program) and self.plain is other.plain
+
+    def __repr__(self) -> str:
+        return self.name  # by which the texts of two programs differ
 
 
-def operation(primitive: Primitive, native: Callable[..., Sequence[Any]], mapped: str = "") -> None:
-    """Say how native code, and C, compute a primitive of one's own: by a function in its place.
+def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a plain function for which native code, and C, have one of their own.
 
-    So an operation that others compute by a call of a library, or in a form that suits XLA, has one that is written out
-    entry by entry; and what is costly to trace is traced once for equal shapes.
+    What is compiled by XLA, mapped by `vmap` or differentiated is the plain function. Native code takes the other one
+    in its place, of one item after another where `vmap` maps them: where a form that suits XLA, all entries side by
+    side, is not the one that suits a straight line.
 
     Args:
-        primitive: a primitive of JAX with a name of its own, and with parameters that can be hashed.
-        native: a function of JAX, from the primitive's arrays and its parameters as keywords to a list of its results.
-        mapped: the parameter that has the sizes of axes that `vmap` has added, which come last in each array (1 in one
-            that does not differ); `native` is of arrays without them. By default the primitive has no such axes.
+        native: a function of the same arguments with the same results.
 
-    Raises:
-        ValueError: a primitive that native code computes already.
+    Returns:
+        The decorator of the plain function, whose arguments are trees of arrays.
     """
-    name = primitive.name
-    if name in RULES or (name in IN_MEMORY and name not in NAMED):
-        raise ValueError(f"operation: expected a primitive with a name of its own, got {name!r}, which is JAX's")
 
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        params, avals = equation.params, [v.aval for v in equation.outvars]
-        types = tuple(v.aval.dtype for v in equation.invars)  # type: ignore[attr-defined]
-        sizes: tuple[int, ...] = params[mapped] if mapped else ()
-        rest = tuple(sorted((key, value) for key, value in params.items() if key != mapped))
-        shapes = [a.shape[: a.ndim - len(sizes)] for a in avals]  # type: ignore[attr-defined]
-        return _over(lowering, Native(name, native, rest, types), inputs, sizes, shapes)
+    def decorate(plain: Callable[P, R]) -> Callable[P, R]:
+        @cache
+        def program(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_Program, Any]:
+            form: list[Any] = []
 
-    IN_MEMORY[name] = rule
-    NAMED.add(name)
+            def leaves_of(function: Callable[..., R], *leaves: Any) -> list[Any]:
+                args, kwargs = jax.tree.unflatten(tree, leaves)
+                results, structure = jax.tree.flatten(function(*args, **kwargs))
+                form[:] = [structure]
+                return results
 
+            traced = jax.make_jaxpr(partial(leaves_of, plain))(*(like(*kind) for kind in kinds))
+            name = f"{plain.__module__}.{plain.__qualname__}"
+            return _Program(name, traced, partial(leaves_of, native), x64), form[0]
 
-def _over(
-    lowering: Lowering, one: Native, inputs: list[Value], sizes: tuple[int, ...], shapes: list[tuple[int, ...]]
-) -> list[Value]:
-    """Repeat over the last axis: few are written out, many become a loop."""
-    if not sizes:
-        results = zip(_one(lowering, one, inputs), shapes, strict=True)
-        return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
-    count, rest = sizes[-1], sizes[:-1]
-    # A few are written out.
-    if count <= FEW:
-        items = [_over(lowering, one, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
-        return [_together(lowering, list(results)) for results in zip(*items, strict=True)]
-    # Of many, a loop takes apart what differs between them; what they share stays whole.
-    differs = [x.shape[-1] > 1 for x in inputs]
-    rows = [in_memory(lowering, x) if d else _run(x, 0) for x, d in zip(inputs, differs, strict=True)]
+        @wraps(plain)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            leaves, tree = jax.tree.flatten((args, kwargs))
+            leaves = [jnp.asarray(leaf) for leaf in leaves]
+            kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+            this, form = program(tree, kinds, bool(jnp.result_type(float) == np.float64))
+            results: R = jax.tree.unflatten(form, _primitive.bind(*leaves, program=this, levels=(), sizes=()))
+            return results
 
-    def turn(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        row = [_run(x, index) if d else x for x, d in zip(rows, differs, strict=True)]
-        return [], [lowering.nodes(x) for x in _over(lowering, one, row, rest, shapes)]
+        return call
 
-    stacked = repeated(lowering, count, [], turn)[1]
-    return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
+    return decorate
 
 
-def _together(lowering: Lowering, results: list[Value]) -> Value:
-    """Stack results of a few runs along the last axis; in memory if they are long."""
-    x = results[0]
-    if not isinstance(x, InMemory) or x.size <= LONG:
-        return np.stack([lowering.nodes(x) for x in results], axis=-1)
-    if len(results) == 1:
-        return x.view((*x.shape, 1), (*x.strides, 0))
-    whole = joined(lowering, results, (len(results), *x.shape))
-    return whole.view([*whole.shape[1:], len(results)], [*whole.strides[1:], whole.strides[0]])
+def _by_plain(*leaves: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
+    """Compute the plain function under its levels of `vmap`, the innermost first."""
+    function = jaxpr_as_fun(program.plain)
+    for axes in levels:
+        function = jax.vmap(function, in_axes=axes)
+    return list(function(*leaves))
 
 
-def _one(lowering: Lowering, one: Native, inputs: list[Value]) -> list[Value]:
-    """Inline the function for one run, traced once for equal parameters, shapes and types."""
-    kinds = tuple((x.shape, dtype) for x, dtype in zip(inputs, one.types, strict=True))
-    key = one.name, one.params, kinds
+def _shapes(*_: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
+    return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
+
+
+def _over_one_more(
+    leaves: Sequence[Any], axes: Sequence[int | None], *, program: _Program, levels: tuple[Axes, ...],
+    sizes: tuple[int, ...],
+) -> tuple[list[Any], list[int]]:  # fmt: skip
+    """Add a level of `vmap`, whose axis becomes the first one."""
+    moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, axes, strict=True)]
+    level = tuple(None if axis is None else 0 for axis in axes)
+    size = next(x.shape[0] for x, axis in zip(moved, level, strict=True) if axis == 0)
+    results = _primitive.bind(*moved, program=program, levels=(*levels, level), sizes=(size, *sizes))
+    return results, [0] * len(results)
+
+
+def _with_tangents(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> tuple[list[Any], list[Any]]:
+    """Differentiate the plain function by the arguments that have tangents."""
+    moves = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+
+    def of_moving(*moving: Any) -> list[Any]:
+        rest = iter(moving)
+        return _by_plain(*(next(rest) if m else x for m, x in zip(moves, primals, strict=True)), **params)
+
+    at, along = ([x for m, x in zip(moves, values, strict=True) if m] for values in (primals, tangents))
+    results, slopes = jax.jvp(of_moving, at, along)
+    return results, slopes
+
+
+def _by_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline the native function, traced once for equal shapes, in a loop over each level of `vmap`."""
+    program, levels = equation.params["program"], equation.params["levels"]
+    kinds = tuple((v.aval.shape, v.aval.dtype) for v in equation.invars)  # type: ignore[attr-defined]
+    key = program, levels, kinds
     if key not in lowering.kernels:
-        lowering.kernels[key] = jax.make_jaxpr(partial(one.function, **dict(one.params)))(*(like(*k) for k in kinds))
+        function = program.native
+        for axes in levels:
+            function = partial(_one_by_one, function, axes)
+        with jax.enable_x64(program.x64):
+            lowering.kernels[key] = jax.make_jaxpr(function)(*(like(*kind) for kind in kinds))
     return lowering.inline(lowering.kernels[key], inputs)
 
 
-def _run(x: Value, index: Node | int) -> Value:
-    """Return one run's part of an argument whose last axis is that of runs, or a number shared by all."""
-    if isinstance(x, InMemory):
-        last = x.view([x.shape[-1], *x.shape[:-1]], [x.strides[-1], *x.strides[:-1]])
-        return last.row(0 if x.shape[-1] == 1 else index)
-    flat = x.reshape(-1, x.shape[-1])
-    return flat[:, min(int(index), x.shape[-1] - 1)].reshape(x.shape[:-1])  # type: ignore[arg-type]
+def _one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
+    def of_one(moving: list[Any]) -> list[Any]:
+        rest = iter(moving)
+        return function(*(x if axis is None else next(rest) for x, axis in zip(leaves, axes, strict=True)))
+
+    results: list[Any] = jax.lax.map(of_one, [x for x, axis in zip(leaves, axes, strict=True) if axis == 0])
+    return results
+
+
+_primitive.def_impl(jax.jit(_by_plain, static_argnames=("program", "levels", "sizes")))
+_primitive.def_abstract_eval(_shapes)
+batching.primitive_batchers[_primitive] = _over_one_more
+ad.primitive_jvps[_primitive] = _with_tangents
+mlir.register_lowering(_primitive, mlir.lower_fun(_by_plain, multiple_results=True))
+IN_MEMORY["operation"] = _by_native

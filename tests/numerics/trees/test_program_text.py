@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.trees.program_text import text_of
+from straightline import operation
 
 
 def text(table, power: int = 2, dtype=np.float64, below: float = 1.0) -> str:
@@ -43,20 +43,20 @@ def test_another_constant_or_parameter_is_another_text(change):
         assert text(np.eye(3)) != text(**{"table": np.eye(3), **change})
 
 
-@runs_last
+@operation(lambda x: x + x)
 def doubled(x):
     return 2 * x
 
 
-@runs_last
+@operation(lambda x: x**2)
 def squared(x):
     return x * x
 
 
-def test_kernels_of_the_same_shapes_differ_by_their_names():
-    """A kernel's arithmetic is not traced for the text: it is the library's, whose version is compared beside it."""
+def test_operations_of_the_same_shapes_differ_by_their_names():
+    """What they compute is not in the text: it is the library's, whose version is compared beside it."""
 
-    def text_with(kernel):
-        return text_of(jax.make_jaxpr(jax.vmap(kernel))(np.zeros((3, 2))))
+    def text_with(one):
+        return text_of(jax.make_jaxpr(jax.vmap(one))(np.zeros((3, 2))))
 
     assert text_with(doubled) == text_with(doubled) != text_with(squared)

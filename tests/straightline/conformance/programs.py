@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from straightline import present
+from straightline import operation, present
 from tests.straightline.conformance.case import Case
 
 X = np.array([0.0, -0.0, 1.5, -2.0, np.nan, np.inf, 40.0])
@@ -42,6 +42,12 @@ def tripled(x: jax.Array) -> jax.Array:
 
 
 tripled.def_vmap(lambda size, batched, x: (3 * x, batched[0]))
+
+
+@operation(lambda x: (x + x) + (x + x))
+def quadrupled(x: jax.Array) -> jax.Array:
+    """A function with another one in its place in native code."""
+    return 4 * x
 
 
 def _dear(x: jax.Array) -> jax.Array:
@@ -93,6 +99,7 @@ CASES: dict[str, list[Case]] = {
     "custom_vjp_call": _of(doubled),
     "custom_vjp_call_jaxpr": _of(doubled),
     "custom_vmap_call": _of(tripled),
+    "operation": _of(lambda x: (quadrupled(x), jax.vmap(quadrupled)(x * jnp.arange(40.0)))),
     "checkpoint": _of(jax.checkpoint(lambda x: x + 1)),
     "remat": _of(jax.checkpoint(lambda x: x + 1)),
     "remat2": _of(jax.checkpoint(lambda x: x + 1)),

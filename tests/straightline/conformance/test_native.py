@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 
 from straightline.compiled import Compiled
-from straightline.lowering import IN_MEMORY, NAMED, RULES, traced
+from straightline.lowering import IN_MEMORY, RULES, traced
 from straightline.nodes import Unsupported
 from tests.straightline.conformance import arrays, elementwise, matrices, programs
 from tests.straightline.conformance.case import Case, in_single, is_taken
@@ -38,7 +38,7 @@ CASES = arrays.CASES | elementwise.CASES | matrices.CASES | programs.CASES
 ADDED = {"add", "sub", "add_any", "reduce_sum", "cumsum", "dot_general", "scatter-add", "scatter_add", "scatter-sub"}
 PRODUCTS = {"dot_general"}
 SINGLE = {"cumsum": 90.0}  # units in single precision, where they are more than in double
-RULES_OF_ALL = sorted({*RULES, *IN_MEMORY} - NAMED)
+RULES_OF_ALL = sorted({*RULES, *IN_MEMORY})
 MOST = 12  # cases of an operation
 ONE_AT_A_TIME = {
     "scan",

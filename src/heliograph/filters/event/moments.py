@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, below_diagonal, join_columns, outer, rounding_of, triangular
+from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns
 from heliograph.filters.event.parts import GaussianSum
 from heliograph.filters.gaussian.belief import image_of, process_noise
@@ -14,6 +14,7 @@ from heliograph.filters.gaussian.signal import gain_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.linalg import outer
 
 
 class LinkMoments(NamedTuple):

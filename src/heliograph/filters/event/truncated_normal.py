@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.over_runs import runs_last
+from straightline import operation
 
 REACH = (
     74.0  # density beyond sqrt(t^2 + REACH), t the interval's point nearest 0, is exp(-REACH / 2) = 8e-17 of that at t
@@ -32,23 +32,18 @@ PAIR = 2  # computed side by side: of one alone each operation waits for the one
 Moments = Callable[..., TruncatedNormal]
 
 
-def _one_by_one(moments: Moments) -> Moments:
-    """Compute moments for one pair of entries of equal arrays after another: native code has their arithmetic once."""
+def _pair_by_pair(moments: Moments) -> Moments:
+    """Make moments an operation that native code computes for a pair of entries after another, with its code once."""
 
-    def written(*ends: jax.Array) -> TruncatedNormal:
+    def native(*ends: jax.Array) -> TruncatedNormal:
         width = 1 if ends[0].size % PAIR else PAIR
         every = jax.lax.map(lambda pair: moments(*pair), [end.reshape(-1, width) for end in ends])
         return TruncatedNormal(*(moment.reshape(ends[0].shape) for moment in every))
 
-    return written
+    return operation(native)(moments)
 
 
-def _kernel(moments: Moments) -> Moments:
-    """Return a kernel of moments between ends that are arrays of one shape."""
-    return runs_last(moments, shapes=lambda *ends: TruncatedNormal(*[ends[0].shape] * 3), written=_one_by_one(moments))
-
-
-@_kernel
+@_pair_by_pair
 def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     """Log mass, mean and variance of N(0, 1) cut to [lower, upper], either of which may be infinite.
 
@@ -99,7 +94,7 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     return TruncatedNormal(log_mass, jnp.where(turned, -mean, mean), variance)
 
 
-@_kernel
+@_pair_by_pair
 def upper_tail(lower: jax.Array) -> TruncatedNormal:
     """Log mass, mean and variance of N(0, 1) above `lower`: `truncated_normal` by a tenth of its operations.
 

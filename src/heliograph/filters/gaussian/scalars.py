@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.linalg import inner, rounding, solver, times, trace, transpose
+from heliograph.numerics.linalg import rounding, solver
 from heliograph.numerics.types import Array
 
 START = 0.1
@@ -27,30 +27,28 @@ Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(b
 
 
 def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
-    """Scalars (count, runs) as given, and where they are NaN the fixed point of `sweep`, separately for each run.
+    """Scalars (count,) as given, and where they are NaN the fixed point of `sweep`.
 
     Alternating minimisation converges slowly, so this is Newton's method, after one sweep from START. Where a Newton
-    step is too long the sweep itself is taken; a run that has converged is not changed. The last step is taken for all
-    runs, outside the loop: its derivative is that of the root, by the implicit function theorem, in reverse mode too.
+    step is too long the sweep itself is taken. The last step is taken outside the loop: its derivative is that of the
+    root, by the implicit function theorem, in reverse mode too.
     """
     # No derivatives inside the loop.
     fixed = jax.lax.stop_gradient(parts)
     free = jnp.isnan(given)
 
     def moving(t: jax.Array, previous: jax.Array) -> jax.Array:
-        return jnp.any(free & (jnp.abs(t - previous) > rounding(CONVERGED, t, LOOP)), axis=0)
+        return jnp.any(free & (jnp.abs(t - previous) > rounding(CONVERGED, t, LOOP)))
 
     def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        t, previous, sweeps = carry
+        t, _, sweeps = carry
         refined, slopes = sweep(t, *fixed)
-        better = jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes))
-        return jnp.where(moving(t, previous), better, t), t, sweeps + 1
+        return jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes)), t, sweeps + 1
 
-    # Newton's method on the logarithms, until every run has converged.
+    # Newton's method on the logarithms, until they stay.
     first = jnp.log(jnp.where(free, START, given))
-    first = jnp.broadcast_to(first, (len(given), *fixed[-1].shape))
     carry = first, jnp.where(free, -jnp.inf, first), jnp.asarray(0)
-    t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), again, carry)[0]
+    t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & moving(c[0], c[1]), again, carry)[0]
     # One Newton step with derivatives: dt = (I - J)^-1 df.
     refined, slopes = sweep(t, *parts)
     return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
@@ -64,7 +62,7 @@ def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
     else:
         (a, b), (c, d) = (1 - slopes[0][0], -slopes[0][1]), (-slopes[1][0], 1 - slopes[1][1])
         step = jnp.stack([d * rest[0] - b * rest[1], a * rest[1] - c * rest[0]]) / (a * d - b * c)
-    safe = jnp.all(jnp.abs(step) < LONGEST, axis=0)
+    safe = jnp.all(jnp.abs(step) < LONGEST)
     return t + jnp.where(safe, step, rest)
 
 
@@ -79,10 +77,10 @@ def young_sweep(
     """Compute the next scalars by the last gain: beta_1 = sqrt(tr W S / tr P), beta_2 = sqrt(tr W S / tr W M)."""
     beta = jnp.exp(t)
     weight, (s, m) = _weight(young_omega(beta, base, shift, mean_part), power, (shift, mean_part))
-    ws, wm = times(weight, shift), times(weight, mean_part)
-    shift_trace, mean_trace = trace(ws), trace(wm)
-    by_first = [2 / beta[0] * inner(transpose(s), x) for x in (ws, wm)]  # d tr W X / d log beta_1
-    by_second = [2 / beta[1] * inner(transpose(s), x) - 2 * beta[1] * inner(transpose(m), x) for x in (ws, wm)]
+    ws, wm = weight @ shift, weight @ mean_part
+    shift_trace, mean_trace = jnp.trace(ws), jnp.trace(wm)
+    by_first = [2 / beta[0] * jnp.vdot(s.T, x) for x in (ws, wm)]  # d tr W X / d log beta_1
+    by_second = [2 / beta[1] * jnp.vdot(s.T, x) - 2 * beta[1] * jnp.vdot(m.T, x) for x in (ws, wm)]
     first, first_slopes = _root_ratio(shift_trace, [by_first[0], by_second[0]], whole, [None, None])
     second, second_slopes = _root_ratio(
         shift_trace, [by_first[0], by_second[0]], mean_trace, [by_first[1], by_second[1]]
@@ -96,8 +94,8 @@ def zero_mean_sweep(
     """Compute the next scalar by the last gain: beta = sqrt(tr W S / tr explained) with Omega = base + S / beta."""
     beta = jnp.exp(t[0])
     weight, (s,) = _weight(base + shift / beta, power, (shift,))
-    ws = times(weight, shift)
-    refined, slopes = _root_ratio(trace(ws), [2 / beta * inner(transpose(s), ws)], whole, [None])
+    ws = weight @ shift
+    refined, slopes = _root_ratio(jnp.trace(ws), [2 / beta * jnp.vdot(s.T, ws)], whole, [None])
     return refined[None], [slopes]
 
 
@@ -105,7 +103,7 @@ def _weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> 
     """W = Omega^-1 C C' Omega^-1 of K = C' Omega^-1, and Omega^-1 X of others: in matrices of the data's size."""
     solve = solver(omega)
     first, *rest = jnp.split(solve(jnp.concatenate([power, *others], axis=1)), 1 + len(others), axis=1)
-    return solve(transpose(first)), rest
+    return solve(first.T), rest
 
 
 def _root_ratio(

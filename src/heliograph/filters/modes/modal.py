@@ -19,7 +19,6 @@ from heliograph.factors.columns import (
     Columns,
     below_diagonal,
     join_columns,
-    outer,
     rounding_of,
     side_by_side,
     triangular,
@@ -36,6 +35,7 @@ from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import outer
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree

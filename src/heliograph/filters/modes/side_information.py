@@ -12,7 +12,6 @@ from heliograph.factors.columns import (
     Columns,
     below_diagonal,
     join_columns,
-    outer,
     reciprocal,
     rounding_of,
     side_by_side,
@@ -45,6 +44,7 @@ from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import memories
 from heliograph.random_affine.modes import joint_modes

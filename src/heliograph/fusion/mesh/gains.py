@@ -19,8 +19,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, eliminate, square_root
 from heliograph.factors.gaussian import given, observe
-from heliograph.numerics.linalg import diagonal, solve, symmetrize, times, transpose
-from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.linalg import psd_solve, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 
 
@@ -94,13 +93,12 @@ def correct(
     return after.covariance, np.eye(n) - after.covariance @ information
 
 
-@runs_last
 def information_of(
     gain: jax.Array, noise: jax.Array, used: jax.Array
-) -> tuple[Float[jax.Array, "n m *#runs"], Float[jax.Array, "n n *#runs"]]:
+) -> tuple[Float[jax.Array, "n m"], Float[jax.Array, "n n"]]:
     """H' R^-1 and H' R^-1 H of the components that are used."""
     there = used.astype(gain.dtype)
     h = there[:, None] * gain
-    r = there[:, None] * noise * there[None] + diagonal(1 - there)
-    weighted = transpose(solve(r, h))
-    return weighted, times(weighted, h)
+    r = there[:, None] * noise * there[None] + jnp.diag(1 - there)
+    weighted = psd_solve(r, h).T
+    return weighted, weighted @ h

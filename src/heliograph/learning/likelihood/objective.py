@@ -27,7 +27,7 @@ from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
-from heliograph.numerics.linalg import solve
+from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.module import same
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.erasure import condition_on_arrival
@@ -271,7 +271,7 @@ def _score_innovation(
     e, s = jnp.where(present, e, 0.0), jnp.where(both, s, 0.0)
     de, ds = jnp.where(present, de, 0.0), jnp.where(both, ds, 0.0)
     # S^-1 (e, de, dS) by one factorisation
-    solved = solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))
+    solved = psd_solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))
     w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
     score = -de @ w - jnp.einsum("iai->a", q) / 2 + jnp.einsum("i,aij,j->a", w, ds, w) / 2
     return density, score, de @ v + jnp.einsum("iaj,jbi->ab", q, q) / 2

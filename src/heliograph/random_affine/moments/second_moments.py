@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of
 from heliograph.numerics.caching import cache_by_object
-from heliograph.numerics.linalg import contract, diagonal, diagonal_of, summed
+from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, is_zero, library, stack_parts
 from heliograph.numerics.types import Float
@@ -47,8 +47,8 @@ class QuadraticMap(Module):
         mask = present[:, None] & present[None, :]
         center = self.middle(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        unit = jnp.sqrt(_or_one(jnp.abs(diagonal_of(center)) + diagonal_of(entries)))
-        return center + diagonal(unit * summed(entries / unit, 1))
+        unit = jnp.sqrt(_or_one(jnp.abs(jnp.diagonal(center)) + jnp.diagonal(entries)))
+        return center + jnp.diag(unit * jnp.sum(entries / unit, axis=1))
 
     def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """C:W alone, which is all where the law is known."""

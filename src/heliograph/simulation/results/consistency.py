@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from heliograph.engine.choice import compile_on_call
 from heliograph.model.plant import AnyPlant, angles_among
 from heliograph.numerics.angle import angles_at, wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
-from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -125,17 +126,15 @@ def _square_normalised(
     there, n = ~np.isnan(x), x.shape[-1]
     both = there[..., :, None] & there[..., None, :]
     filled = np.where(both, covariance, np.eye(n) * ~there[..., None, :])
-    # The axis of steps last.
     parts = filled.reshape(-1, n, n), np.where(there, x, 0.0).reshape(-1, n), np.nan_to_num(size).reshape(-1, n)
-    first, *others = (np.moveaxis(values, 0, -1) for values in parts)
-    value = np.asarray(_distance(first, *others)).reshape(x.shape[:-1])
+    value = np.asarray(_distances(*parts)).reshape(x.shape[:-1])
     # Each missing component added nothing: 0^2 / 1.
     return np.asarray(np.where(there.any(axis=-1), value, np.nan))
 
 
-@compile_in_float64
-def _distance(a: Array, x: Array, size: Array) -> Array:
-    return squared_distance(jnp.asarray(a), jnp.asarray(x), size)
+@compile_on_call
+def _distances(a: Array, x: Array, size: Array) -> Array:
+    return jax.vmap(squared_distance)(jnp.asarray(a), jnp.asarray(x), jnp.asarray(size))
 
 
 def consistency(

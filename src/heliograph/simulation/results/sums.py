@@ -55,23 +55,21 @@ class Statistics(AbstractReducer[StatisticsByName]):
         truth = jnp.asarray(step["truth"])
         parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
         n = len(truth)
-        # The axis of parts last.
-        means = [jnp.asarray(estimate.mean).reshape(-1, n).T for estimate in parts]
-        claimed = [jnp.moveaxis(jnp.asarray(estimate.covariance).reshape(-1, n, n), 0, -1) for estimate in parts]
+        means = [jnp.asarray(estimate.mean).reshape(-1, n) for estimate in parts]
+        claimed = [jnp.asarray(estimate.covariance).reshape(-1, n, n) for estimate in parts]
         # Errors and their NEES, and where these are invalid.
-        errors = [truth[:, None] - mean for mean in means]
-        nees = [squared_distance(b, e, truth[:, None]) for b, e in zip(claimed, errors, strict=True)]
-        joined, distance = jnp.concatenate(errors, axis=1), jnp.concatenate(nees)
-        finite = jnp.all(jnp.isfinite(joined), axis=0)
+        errors = [truth - mean for mean in means]
+        distances = jax.vmap(squared_distance, in_axes=(0, 0, None))
+        nees = [distances(b, e, truth) for b, e in zip(claimed, errors, strict=True)]
+        joined, distance = jnp.concatenate(errors), jnp.concatenate(nees)
+        finite = jnp.all(jnp.isfinite(joined), axis=1)
         bad = jnp.stack([~finite, jnp.isnan(distance)])
         # Pairs i <= j of symmetric matrices.
         rows, columns = np.triu_indices(n)
         sums = {
-            "pairs": jnp.stack([joined[i] * joined[j] for i, j in zip(rows, columns, strict=True)], axis=-1),
+            "pairs": joined[:, rows] * joined[:, columns],
             "nees": distance,
-            "claimed": tuple(
-                jnp.stack([b[i, j] for i, j in zip(rows, columns, strict=True)], axis=-1) for b in claimed
-            ),
+            "claimed": tuple(b[:, rows, columns] for b in claimed),
             "failed": bad,
             "uplinks": step["uplinks"],
         }
