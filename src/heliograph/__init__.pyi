@@ -125,6 +125,9 @@ from .simulation.results.sums import (
 from .forecasting.forecast import (
     forecast as forecast,
 )
+from .forecasting.backtest import (
+    backtest as backtest,
+)
 from .learning.description import (
     free as free,
 )

@@ -8,6 +8,10 @@ from .threshold import (
     Crossing as Crossing,
     crossing as crossing,
 )
+from .backtest import (
+    Backtest as Backtest,
+    Score as Score,
+)
 from .prediction import (
     Forecast as Forecast,
     Prediction as Prediction,

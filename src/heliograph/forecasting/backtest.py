@@ -1,0 +1,254 @@
+"""Backtests: forecasts from each row of a recording, against what came later."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.engine.choice import compute_once
+from heliograph.forecasting.forecast import Target, targets_of
+from heliograph.forecasting.outlook import Moments, Outlook
+from heliograph.forecasting.scores import LEVELS, Law, Mean, below, crps, log_score, overlapping_mean
+from heliograph.model.origin import Origin
+from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.check import check_count, fail, items
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.simulation.arguments import inputs_of
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.recorded import run
+from heliograph.simulation.results.record import Record
+
+if TYPE_CHECKING:  # an extra
+    import pandas as pd
+
+
+ByNode = TypeAliasType("ByNode", Mapping[str, ArrayLike])
+Rows = TypeAliasType("Rows", Float[ArrayLike, "steps ..."] | None)
+Coverage = TypeAliasType("Coverage", tuple[Mean, ...])  # of each level
+
+
+class Score(NamedTuple):
+    """How forecasts of one number at one horizon did, each mean with a standard error that knows their overlap.
+
+    Args:
+        node: of the filter.
+        filter: its name.
+        part: "state", against the true state, or "received", against what arrived.
+        name: of the number.
+        horizon: rows ahead.
+        compared: number of forecasts whose number came.
+        bias: mean of what came less what was forecast.
+        mse: mean square of it.
+        coverage: share within the central intervals of 50, 80 and 95 %.
+        log_score: mean log density of what came, in nats; the larger the better.
+        crps: mean continuous ranked probability score, in the number's unit; the smaller the better.
+    """
+
+    node: str
+    filter: str
+    part: str
+    name: str
+    horizon: int
+    compared: int
+    bias: Mean
+    mse: Mean
+    coverage: Coverage
+    log_score: Mean
+    crps: Mean
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square error."""
+        return float(np.sqrt(self.mse.value))
+
+    def row(self) -> dict[str, object]:
+        """Return the score as a row of a table, with standard errors in columns of their own."""
+        shares = zip(LEVELS, self.coverage, strict=True)
+        means = {"bias": self.bias, "mse": self.mse, **{f"coverage {level:.0%}": share for level, share in shares},
+                 "log score": self.log_score, "crps": self.crps}  # fmt: skip
+        numbers = {column: value for name, mean in means.items() for column, value in
+                   ((name, mean.value), (f"{name} error", mean.error))}  # fmt: skip
+        return {**dict(zip(self._fields[:6], self[:6], strict=True)), "rmse": self.rmse, **numbers}
+
+
+@readable
+@dataclass(frozen=True)
+class Backtest:
+    """Scores of a network's forecasts on a recording.
+
+    Args:
+        horizons: rows ahead.
+        rows: of the recording.
+        scores: one for each filter, number and horizon.
+    """
+
+    horizons: tuple[int, ...]
+    rows: int
+    scores: tuple[Score, ...]
+
+    def of(self, node: str, filter: str, name: str, horizon: int) -> Score:
+        """Return the score of one number at one horizon: of what is received first, else of the state.
+
+        Args:
+            node: of the filter, "fused" of a central one.
+            filter: its name.
+            name: of a received number or a state.
+            horizon: rows ahead.
+
+        Raises:
+            ValueError: there is no such score.
+        """
+        asked = node, filter, name, horizon
+        found = [s for s in self.scores if (s.node, s.filter, s.name, s.horizon) == asked]
+        if not found:
+            known = ", ".join(dict.fromkeys(f"{s.node}/{s.filter} {s.name}" for s in self.scores))
+            raise fail("score", f"one of {known} at {list(self.horizons)}", f"{node}/{filter} {name} at {horizon}")
+        return found[-1]
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return a table with a row for each score, and columns of means and their standard errors.
+
+        Raises:
+            ModuleNotFoundError: without pandas (extra "results").
+        """
+        import pandas as pd
+
+        return pd.DataFrame([score.row() for score in self.scores])
+
+
+def backtest(
+    network: Network,
+    measurements: ByNode,
+    horizons: Sequence[int],
+    inputs: Rows = None,
+    time: Rows = None,
+    truth: Rows = None,
+    skip: int = 10,
+) -> Backtest:
+    """Forecast from each row of a recording, and score what was said against what came: a rolling origin.
+
+    Filters run over the rows once, as by `hg.run`; behind each row they predict as if nothing more arrived, with the
+    inputs that the recording has. Scored is what arrived later, and the true states where they are known.
+
+    Args:
+        network: the network.
+        measurements: for each node an array (steps, received), as of `hg.run`.
+        horizons: rows ahead, such as [1, 3, 12].
+        inputs: (steps, inputs); by default a plant without inputs is assumed.
+        time: (steps,); 0, 1, ... by default.
+        truth: true states (steps, n), NaN where they are not known; None by default.
+        skip: rows at the start from which nothing is forecast, while filters settle; 10 by default.
+
+    Raises:
+        ValueError: what `hg.run` refuses; horizons that reach beyond the data; no filter whose forecasts can be scored.
+
+    Source: rolling-origin evaluation, Tashman, Out-of-sample tests of forecasting accuracy (2000).
+    """
+    record = run(network, measurements, inputs, time, truth)
+    rows = len(record.time)
+    ahead = sorted({check_count("horizon", h) for h in items("horizons", horizons, "numbers of rows")})
+    first = check_count("skip", skip, 0)
+    if not ahead or ahead[-1] + first >= rows:
+        raise fail("backtest", f"horizons that, behind {first} skipped rows, end within the {rows} rows of data", ahead)
+    u = inputs_of(network, inputs, rows)
+    origin = record.origin
+    assert isinstance(origin, Origin)  # hg.run sets it
+    scores = list[Score]()
+    for target in targets_of(origin):
+        if (target.node, target.filter) in _with_filter(network):
+            scores += _score_filter(target, record, u, ahead, first)
+    if not scores:
+        raise fail("backtest", "a filter that claims a covariance, and data to compare with", "none")
+    return Backtest(tuple(ahead), rows, tuple(scores))
+
+
+def _with_filter(network: Network) -> set[tuple[str, str]]:
+    """Estimates that are those of a filter, which can be stepped by itself."""
+    central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
+    return set(network.places) | central
+
+
+def _score_filter(target: Target, record: Record, u: np.ndarray, ahead: list[int], first: int) -> list[Score]:
+    """Score what one filter says ahead of each number that it receives, and of each state whose truth is known."""
+    filter, node = target.outlook.filter, target.node
+    if filter.claim == "none":
+        return []
+    z = record.measurements.get(node)
+    if z is None:  # of a central filter, all nodes' numbers
+        z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
+    z = z if filter.received else z[:, :0]
+    states, received = roll(target.outlook, z, u, ahead)
+    used = filter.angles_used()
+    parts = [] if received is None else [("received", target.received, received, z, used.received if used else ())]
+    if record.truth is not None:
+        parts.append(("state", filter.states, states, record.truth, used.states if used else ()))
+    return [
+        _score((node, target.filter, part, name), h, _law(moments, i, j), values[:, i], first, i in angles)
+        for part, names, moments, values, angles in parts
+        for i, name in enumerate(names)
+        for j, h in enumerate(ahead)
+    ]
+
+
+def _law(moments: Moments, number: int, horizon: int) -> Law:
+    """Law of one number at one horizon, from each row."""
+    means, variances = np.asarray(moments.means), np.asarray(moments.covariances)
+    return Law(np.asarray(moments.weights)[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
+
+
+def _score(
+    of: tuple[str, str, str, str], horizon: int, law: Law, values: np.ndarray, first: int, is_angle: bool
+) -> Score:
+    """Score forecasts from each row against the number `horizon` rows later."""
+    law, came = Law(*(part[first:-horizon] for part in law)), values[first + horizon :]
+    # An angle within half a turn of what was expected.
+    came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
+    error, chance = came - law.mean, below(law, came)
+    known = np.where(np.isnan(error), np.nan, 0.0)
+    coverage = tuple(overlapping_mean((np.abs(chance - 0.5) <= level / 2) + known, horizon) for level in LEVELS)
+    bias, mse = overlapping_mean(error, horizon), overlapping_mean(error**2, horizon)
+    density, ranked = (overlapping_mean(score(law, came), horizon) for score in (log_score, crps))
+    return Score(*of, horizon, int(np.sum(~np.isnan(error))), bias, mse, coverage, density, ranked)
+
+
+def roll(outlook: Outlook, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]) -> tuple[Moments, Moments | None]:
+    """Forecast from each row at each horizon: states, and what would arrive, (rows, horizons, K, ...), with variances.
+
+    Inputs ahead are those of the rows; behind the last one it stays.
+    """
+    longest = horizons[-1]
+    padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
+    windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
+    arguments = outlook, z, u, windows, np.asarray(horizons) - 1
+    rolled: tuple[Moments, Moments | None] = compute_once(_roll, _by_xla, arguments)
+    return rolled
+
+
+def _roll(outlook: Outlook, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array) -> PyTree:
+    filter, length = outlook.filter, windows.shape[1]
+
+    def with_variances(moments: Moments | None) -> Moments | None:
+        if moments is None:
+            return None
+        variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
+        return Moments(moments.weights[places], moments.means[places], variances[places])
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        k, z_k, u_k, window = row
+        after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
+        numbers = k + 1 + jnp.arange(length)
+        _, (states, _, received) = jax.lax.scan(lambda s, ahead: outlook.step(s, *ahead), after, (window, numbers))
+        return after, (with_variances(states), with_variances(received))
+
+    start = jax.tree.map(jnp.asarray, filter.init())
+    rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(windows)
+    return jax.lax.scan(body, start, rows)[1]
+
+
+_by_xla = quickly_compiled(_roll)

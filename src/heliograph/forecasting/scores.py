@@ -1,0 +1,89 @@
+"""Scores of forecasts against what came: coverage, log score, CRPS, and standard errors of means that overlap."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+LEVELS = (0.5, 0.8, 0.95)  # probabilities of the central intervals whose coverage is counted
+LOG_TURN = float(np.log(2 * np.pi))
+BANDWIDTH = 1.3  # times the root of the number of rows
+
+
+class Law(NamedTuple):
+    """Mixtures of Gaussians, one for each row: weights, means and variances (rows, K)."""
+
+    weights: np.ndarray
+    means: np.ndarray
+    variances: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean of each (rows,)."""
+        return np.asarray(np.sum(self.weights * self.means, axis=1))
+
+
+def below(law: Law, values: np.ndarray) -> np.ndarray:
+    """Probability that each lies below what came (rows,): uniform between 0 and 1 where the laws are right."""
+    return np.asarray(np.sum(law.weights * ndtr((values[:, None] - law.means) / np.sqrt(law.variances)), axis=1))
+
+
+def log_score(law: Law, values: np.ndarray) -> np.ndarray:
+    """Log density of what came (rows,), in nats: the larger the better."""
+    terms = (
+        np.log(law.weights)
+        - ((values[:, None] - law.means) ** 2 / law.variances + np.log(law.variances) + LOG_TURN) / 2
+    )
+    top = terms.max(axis=1)
+    return np.asarray(top + np.log(np.sum(np.exp(terms - top[:, None]), axis=1)))
+
+
+def crps(law: Law, values: np.ndarray) -> np.ndarray:
+    """Continuous ranked probability score (rows,), in the unit of what came: the smaller the better.
+
+    E|X - z| - E|X - X'| / 2 of independent X and X' of the law; of one Gaussian s (t (2 Phi(t) - 1) + 2 phi(t) -
+    pi^(-1/2)) with t = (z - m) / s.
+
+    Source: Gneiting and Raftery, Strictly proper scoring rules (2007); Grimit et al. (2006) for mixtures.
+    """
+    away = np.sum(law.weights * _mean_size(values[:, None] - law.means, law.variances), axis=1)
+    between = np.zeros(len(values))
+    for i in range(law.weights.shape[1]):
+        pair = _mean_size(law.means[:, i : i + 1] - law.means, law.variances[:, i : i + 1] + law.variances)
+        between += law.weights[:, i] * np.sum(law.weights * pair, axis=1)
+    return np.asarray(away - between / 2)
+
+
+def _mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """E|Y| of a Gaussian Y."""
+    deviation = np.sqrt(variance)
+    t = mean / deviation
+    return np.asarray(mean * (2 * ndtr(t) - 1) + 2 * deviation * np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi))
+
+
+class Mean(NamedTuple):
+    """A mean over rows with its standard error."""
+
+    value: float
+    error: float
+
+
+def overlapping_mean(values: np.ndarray, horizon: int) -> Mean:
+    """Mean of a series (rows,), NaN where nothing came, and its standard error.
+
+    Forecasts from neighbouring rows share what happens in between, so errors of horizon h are correlated over h - 1
+    rows at least. Var = n^-2 sum_l w_l sum_t d_t d_{t+l} with Bartlett's weights over max(h - 1, 1.3 sqrt n) lags.
+
+    Source: Newey and West (1987); the number of lags by Lazarus, Lewis, Stock and Watson, HAR inference (2018).
+    """
+    came = ~np.isnan(values)
+    count = int(came.sum())
+    if not count:
+        return Mean(float("nan"), float("nan"))
+    mean = float(values[came].mean())
+    apart = np.where(came, values - mean, 0.0)
+    lags = min(max(horizon - 1, int(BANDWIDTH * count**0.5)), len(values) - 1)
+    total = apart @ apart
+    for lag in range(1, lags + 1):
+        total += 2 * (1 - lag / (lags + 1)) * (apart[lag:] @ apart[:-lag])
+    return Mean(mean, float(np.sqrt(np.maximum(total, 0.0)) / count))

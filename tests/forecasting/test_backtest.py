@@ -1,0 +1,84 @@
+"""Backtests: scores against formulas, honest forecasts pass, and those that trust a mean gain do not."""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import ndtr
+
+import heliograph as hg
+from heliograph.forecasting.scores import Law, crps, log_score, overlapping_mean
+
+
+def world(loss=1.0):
+    plant = hg.LinearPlant([[0.9]], 0.5, [0.0], 2.0, states=["x"])
+    sensor = hg.LinearSensor([[1.0]], 0.3, outputs=["y"])
+    link = hg.perfect(1) if loss == 1.0 else hg.erasure(hg.perfect(1), loss)
+    return hg.Network(plant, {"a": hg.Node(sensor, link, {"f": hg.kalman_filter(plant, sensor)})})
+
+
+def test_one_step_scores_are_those_of_the_innovations():
+    """Behind each row the forecast of the next is the filter's own innovation, with its covariance."""
+    network = world(0.8)
+    z = hg.simulate(network, 200, 3).measurements
+    score = hg.backtest(network, z, [1], skip=10).of("a", "f", "y", 1)
+    found = network.nodes["a"].filters["f"].run(z["a"])
+    e, s = found.innovations[11:, 0], found.innovation_covariances[11:, 0, 0]
+    e, s = e[~np.isnan(e)], s[~np.isnan(e)]
+    assert score.compared == len(e)
+    assert score.bias.value == pytest.approx(e.mean(), rel=1e-10)
+    assert score.mse.value == pytest.approx(np.mean(e**2), rel=1e-10)
+    assert score.log_score.value == pytest.approx(np.mean(-(e**2 / s + np.log(2 * np.pi * s)) / 2), rel=1e-10)
+    assert score.coverage[2].value == pytest.approx(np.mean(np.abs(e) < 1.959963984540054 * np.sqrt(s)), rel=1e-12)
+
+
+def test_an_honest_filter_covers_ahead_and_a_wrong_one_does_not():
+    network = world(0.8)
+    simulated = hg.simulate(network, 2000, 5)
+    found = hg.backtest(network, simulated.measurements, [1, 5], truth=simulated.truth)
+    for score in found.scores:
+        for level, share in zip((0.5, 0.8, 0.95), score.coverage, strict=True):
+            assert abs(share.value - level) < 4 * share.error, score
+    assert {score.part for score in found.scores} == {"state", "received"}
+    plant = hg.LinearPlant([[0.9]], 0.05, [0.0], 2.0, states=["x"])
+    wrong = {"f": hg.kalman_filter(plant, hg.LinearSensor([[1.0]], 0.03, outputs=["y"]))}
+    sure = hg.Network(network.plant, {"a": hg.Node(network.nodes["a"].sensor, network.nodes["a"].channel, wrong)})
+    score = hg.backtest(sure, simulated.measurements, [5]).of("a", "f", "y", 5)
+    assert score.coverage[2].value < 0.95 - 10 * score.coverage[2].error
+    assert score.log_score.value < found.of("a", "f", "y", 5).log_score.value
+    assert score.crps.value > found.of("a", "f", "y", 5).crps.value
+
+
+def test_scores_of_a_mixture_are_their_integrals():
+    law = Law(np.array([[0.3, 0.7]]), np.array([[-1.0, 2.0]]), np.array([[0.25, 1.5]]))
+
+    def below(x):
+        return 0.3 * ndtr((x + 1) / 0.5) + 0.7 * ndtr((x - 2) / np.sqrt(1.5))
+
+    expected = (
+        quad(lambda x: (below(x) - (x >= 0.4)) ** 2, -30, 0.4)[0] + quad(lambda x: (below(x) - 1) ** 2, 0.4, 30)[0]
+    )
+    assert crps(law, np.array([0.4]))[0] == pytest.approx(expected, rel=1e-7)
+    slope = (below(0.4 + 1e-5) - below(0.4 - 1e-5)) / 2e-5
+    assert log_score(law, np.array([0.4]))[0] == pytest.approx(np.log(slope), rel=1e-7)
+
+
+def test_standard_errors_know_the_overlap():
+    """Sums of 8 neighbours: their mean's error over 400 series is as said; the naive one is 2.8 times too small."""
+    generator = np.random.default_rng(0)
+    noise = generator.normal(size=(400, 1007))
+    series = np.stack([np.convolve(row, np.ones(8), "valid") for row in noise])
+    said = np.mean([overlapping_mean(row, 8).error for row in series])
+    true = series.mean(axis=1).std()
+    assert said == pytest.approx(true, rel=0.15)  # of which Bartlett's weights take a tenth
+    assert series.std() / np.sqrt(1000) < true / 2.5
+
+
+@pytest.mark.parametrize(
+    ("horizons", "said"),
+    [([30], "end within the 20 rows of data"), ([], "end within"), ([0], "horizon"), (3, "horizons: expected a list")],
+)
+def test_a_backtest_longer_than_the_data_is_refused(horizons, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        hg.backtest(world(), {"a": np.zeros(20)}, horizons)
