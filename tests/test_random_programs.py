@@ -67,3 +67,11 @@ def test_native_code_computes_a_sample_as_xla_does(programs):
     for number in range(FIRST + 1, FIRST + SAMPLE):
         verdict = judged.judged(number)
         assert not verdict.differs, f"program {number}: {verdict.differs}\n{flow.program(number).text}"
+
+
+@pytest.mark.slow
+def test_a_guard_whose_results_another_function_reads(programs):
+    """Of a long program, which is several functions: all of what its branches give is merged before any is stored."""
+    _, judge = programs
+    verdict = judge.judged(822)
+    assert (verdict.differs, verdict.refused) == ("", "") and verdict.compared

@@ -344,7 +344,10 @@ class Writer:
         self.line(f"br label %{name}.end")
         self.start(f"{name}.end")
         self.scopes.pop()
-        # Results are zero where the body was skipped.
+        # Results are zero where the body was skipped. All phi nodes come before what keeps one of them.
+        merged = []
         for k, value in zip(used, values, strict=True):
             kind = vector(guard.results[k].type)
-            self._keep(guard.results[k], self.add(f"phi {kind} [{value}, %{after}], [zeroinitializer, %{before}]"))
+            merged.append(self.add(f"phi {kind} [{value}, %{after}], [zeroinitializer, %{before}]"))
+        for k, result in zip(used, merged, strict=True):
+            self._keep(guard.results[k], result)
