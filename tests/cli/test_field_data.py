@@ -276,6 +276,42 @@ def test_ways_to_say_what_a_file_has(folder, capsys, case):
     agrees(run(folder, capsys, name, text, f'{{"{name}": {source}}}')[2], *expected)
 
 
+MINUTES = [f"2026-09-27T10:0{k}:00Z" for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "kept"),
+    [
+        ([MINUTES[0], "1970-01-01T00:00:05Z", *MINUTES[1:]], [0, 2, 3]),  # a clock that counts since it began
+        ([MINUTES[0], "2000-01-01T00:00:00Z", "2000-01-01T00:01:00Z", *MINUTES[1:]], [0, 3, 4]),
+        ([*MINUTES[:2], "2036-02-07T06:28:16Z", MINUTES[2]], [0, 1, 3]),
+        (["1970-01-01T00:00:05Z", "1970-01-01T00:01:05Z", *MINUTES], [2, 3, 4]),
+    ],
+    ids=["1970", "2000", "2036", "at the start"],
+)
+def test_stamps_of_a_clock_that_was_not_set_are_refused_where_arrivals_are_not_known(folder, capsys, stamps, kept):
+    text = "t,v\n" + "".join(f"{stamp},{20 + k / 10}\n" for k, stamp in enumerate(stamps))
+    out, err, table = run(folder, capsys, "log.csv", text, '{"log.csv": field("v", node="a", time="t")}')
+    agrees(table, [0, 60, 120], [20 + k / 10 for k in kept])
+    assert "a: 3 used\n" in out and "a time that was set, near the others in order" in err
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        [f"{year}-07-01T00:00:00Z" for year in range(1970, 1990)],  # once a year, from 1970 on
+        ["2010-01-01T00:00:00Z", "2020-01-01T00:00:00Z", "2026-01-01T00:00:00Z", "2026-01-02T00:00:00Z"],
+        [f"20{10 + 7 * k % 16}-0{1 + k % 9}-01T00:00:00Z" for k in range(40)],  # in no order
+        ["1970-01-01T00:00:01Z", "1970-01-01T00:00:02Z"],
+    ],
+    ids=["each year", "rare", "in no order", "since it began"],
+)
+def test_rare_stamps_are_used(folder, capsys, stamps):
+    text = "t,v\n" + "".join(f"{stamp},{20 + k / 10}\n" for k, stamp in enumerate(stamps))
+    out, err, table = run(folder, capsys, "log.csv", text, '{"log.csv": field("v", node="a", time="t")}')
+    assert f"a: {len(stamps)} used\n" in out and not err and len(table["x"]) == len(stamps)
+
+
 def test_a_zero_among_dates_was_not_set(folder, capsys):
     text = '{"at": 1790503200, "v": 20.1}\n{"at": 0, "v": 99}\n{"at": 1790503260, "v": 20.2}\n'
     out, err, table = run(folder, capsys, "log.jsonl", text, '{"log.jsonl": field("v", node="a", time="at")}')

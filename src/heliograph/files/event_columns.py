@@ -16,6 +16,7 @@ from heliograph.simulation.node import Node
 
 SECOND = 10**9  # nanoseconds
 YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
+CENTURY = 946_684_800 * SECOND  # 2000-01-01
 
 USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
 
@@ -58,8 +59,9 @@ class Columns:
     def without_unset(self, name: str) -> tuple[str, str, int]:
         """Leave out stamps that were not set; return what to say of the clock, why some were left out, and how many.
 
-        A stamp that is more than a year before its arrival, or zero where the others are of our days, was not set;
-        where most are, they are of another clock, and each event arrives when it was measured.
+        A stamp that is more than a year before its arrival was not set; where most are, they are of another clock, and
+        each event arrives when it was measured. Where arrivals are not known, neither was one that is more than a year
+        away from the messages before and after it, which go on from one to the other.
         """
         time, arrival, _ = self.arrays()
         late = arrival - time
@@ -68,13 +70,33 @@ class Columns:
         if np.median(late) > YEAR:
             self.arrival = array("q", self.time)
             return f"{name}: stamps and arrivals are of two clocks: each event arrives when it was measured", "", 0
-        unset = (late > YEAR) | ((time == 0) & bool(np.median(np.abs(time)) > YEAR))
+        near, unset = ("that of arrival", late > YEAR) if late.any() else ("the others in order", _find_astray(time))
         count = int(np.count_nonzero(unset))
         if not count:
             return "", "", 0
         got = f"{np.datetime64(int(time[np.argmax(unset)]), 'ns')} in {count} of {len(time)} messages"
         self.keep(~unset)
-        return "", str(fail(name, "a time that was set, near that of arrival", got)), count
+        return "", str(fail(name, f"a time that was set, near {near}", got)), count
+
+
+def _find_astray(time: np.ndarray) -> Bool[np.ndarray, " events"]:
+    """Mask of the stamps, in the order of their messages, of a clock that was not set.
+
+    They are more than a year outside of all others, and a stretch of fewer messages than those before and after it,
+    between which is less than a year; or, at the start, of the first year since 1970, where clocks begin to count, and
+    all others are of this century.
+    """
+    stretches = np.split(np.arange(len(time)), np.flatnonzero(np.abs(np.diff(time)) > YEAR) + 1)
+    astray = np.zeros(len(time), dtype=bool)
+    for before, one, after in zip(stretches, stretches[1:], stretches[2:], strict=False):
+        returns = abs(int(time[after[0]]) - int(time[before[-1]])) <= YEAR
+        astray[one] = returns and len(one) < len(before) + len(after)
+    first, later = stretches[0], time[len(stretches[0]) :][~astray[len(stretches[0]) :]]
+    astray[first] = len(later) and later.min() >= CENTURY and np.all((time[first] >= 0) & (time[first] < YEAR))
+    if not astray.any():
+        return astray
+    others = time[~astray]
+    return np.asarray(astray & ((time < others.min() - YEAR) | (time > others.max() + YEAR)))
 
 
 class Events(NamedTuple):

@@ -282,7 +282,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
             f"{path}, header", "names of columns", f"a comment, {show_value(line)}: {_suggest_without_comments(path)}"
         )
     check_separators(path, header)
-    _check_distinct(f"{path}, header", header)
+    _check_distinct(path, header)
 
 
 def check_separators(path: Path, header: Sequence[str]) -> None:
@@ -327,7 +327,7 @@ def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarr
         table = pq.ParquetFile(path).read()
     except pa.ArrowInvalid as error:
         raise fail(str(path), "a Parquet file", str(error).splitlines()[0]) from None
-    _check_distinct(f"{path}, header", table.column_names)
+    _check_distinct(path, table.column_names)
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         if only is not None and name not in only:
