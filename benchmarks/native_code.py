@@ -7,8 +7,9 @@ ROUNDS, in seconds of processor (all threads), so that other programs disturb li
 `ode`: ten steps of Runge-Kutta of order four of Lorenz's system for a million particles. `option`: the price of an
 Asian option, 50 normal draws a path; straightline and JAX draw by Threefry with JAX's keys, C by xoshiro256+ and the
 polar method, Numba by its own generator. `controller`: steps of a controller: its C by hand or by `to_c`, called from a
-loop in C, and calls of one step from Python. Times count only after results agree: to 1e-10 of each particle and of the
-controller's last output, and to five deviations of the price.
+loop in C, and calls of one step from Python. `float32` is straightline in single precision. Times count only after
+results agree: to 1e-10 of each particle and of the controller's last output, in float32 to 1e-4, and to five deviations
+of the price.
 """
 
 import ctypes
@@ -214,6 +215,7 @@ def odes(c: ctypes.CDLL) -> dict[str, Way]:
     """Ways to advance the particles; each returns them."""
     x = np.random.default_rng(0).normal(size=(PARTICLES, 3))
     code, by_jax = straightline.compile(advanced, x[0]), jax.jit(jax.vmap(advanced))
+    floats, single = x.astype(np.float32), straightline.compile(advanced, x[0], single=True)
 
     def by_hand() -> np.ndarray:
         y = np.empty_like(x)
@@ -221,6 +223,7 @@ def odes(c: ctypes.CDLL) -> dict[str, Way]:
         return y
 
     ways: dict[str, Way] = {"straightline": lambda: code(x), "c": by_hand, "jax": lambda: np.asarray(by_jax(x))}
+    ways["float32"] = lambda: single(floats)
     if (numba := compiled_by_numba()) is not None:
         ways["numba"] = lambda: numba["ode"](x)
     return ways
@@ -229,7 +232,7 @@ def odes(c: ctypes.CDLL) -> dict[str, Way]:
 def options(c: ctypes.CDLL) -> dict[str, Way]:
     """Ways to price the option; each returns the price and its standard error."""
     key = jax.random.key(0)
-    code = straightline.accumulate(payoff, key)
+    code, single = straightline.accumulate(payoff, key), straightline.accumulate(payoff, key, single=True)
     by_jax = jax.jit(lambda key, n: jax.tree.map(jnp.sum, jax.vmap(lambda n: payoff(key, n)[0])(n)))
     numbers = np.arange(PATHS, dtype=np.uint32)
 
@@ -244,6 +247,7 @@ def options(c: ctypes.CDLL) -> dict[str, Way]:
 
     ways: dict[str, Way] = {
         "straightline": lambda: priced(code(key, runs=PATHS)[0]),
+        "float32": lambda: priced(single(key, runs=PATHS)[0]),
         "c": by_hand,
         "jax": lambda: priced(by_jax(key, numbers)),
     }
@@ -316,7 +320,8 @@ def main() -> None:
         c = library(Path(folder))
         times, particles = measured(odes(c))
         for name, value in particles.items():
-            np.testing.assert_allclose(value, particles["c"], rtol=1e-10, atol=1e-10, err_msg=name)
+            error = 1e-4 if name == "float32" else 1e-10
+            np.testing.assert_allclose(value, particles["c"], rtol=error, atol=error, err_msg=name)
         results["ode"] = {"ns_per_particle_step": scaled(times, PARTICLES * TURNS)}
         times, prices = measured(options(c))
         for name, (price, error) in prices.items():

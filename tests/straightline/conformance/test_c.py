@@ -7,7 +7,7 @@ from straightline.nodes import Unsupported
 from tests.straightline.conformance.c import COMPILERS, by_c
 from tests.straightline.conformance.case import Case
 from tests.straightline.conformance.engines import by_xla
-from tests.straightline.conformance.test_native import CASES, ONE_AT_A_TIME, compare, some, thinned
+from tests.straightline.conformance.test_native import CASES, ONE_AT_A_TIME, compare, singles, some, thinned
 
 LEFT_OUT = {*ONE_AT_A_TIME, "lgamma"}  # the sign that lgamma returns beside is a variable of the C library
 MOST = 8  # runs of a case
@@ -47,6 +47,15 @@ def test_the_commonest_rules_compute_in_c_what_xla_computes(tmp_path):
     """Saturated conversions, integers that wrap around, divisions by zero, the sign of a zero."""
     cases = [thinned(case, 15) for name in DAILY for case in CASES[name]]
     cases = [c for c in cases if "uint32" not in c.label.split(" as ")[1:]]
+    results = by_c(cases, tmp_path, COMPILERS[0])
+    compare("add", cases, [x for leaves in results for x in leaves], by_xla(cases), COMPILERS[0])
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+def test_floats_are_floats_in_c(tmp_path):
+    """The same of numbers of single precision, with doubles where JAX converts, and functions of libm in float."""
+    cases = [thinned(case, 15) for name in (*DAILY, "exp", "atan2") for case in singles(name)[:1]]
+    cases += [c for c in CASES["convert_element_type"] if "float32" in c.label]
     results = by_c(cases, tmp_path, COMPILERS[0])
     compare("add", cases, [x for leaves in results for x in leaves], by_xla(cases), COMPILERS[0])
 
