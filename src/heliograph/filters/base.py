@@ -173,6 +173,14 @@ class AbstractFilter(Module):
         """`estimate(state)` after the correction of step k, for a filter that looks its covariance up by the step."""
         return self.estimate(state)
 
+    @property
+    def is_linear(self) -> bool:
+        """True if of its state only the mean depends on data, affinely, and is the estimate of the plant's state.
+
+        Then each of its steps is a `LinearStep`.
+        """
+        return False
+
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
         """Return the same filter for these inputs and complete data, with all that does not depend on z precomputed."""
         return self

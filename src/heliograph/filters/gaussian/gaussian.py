@@ -64,6 +64,11 @@ class GaussianFilter(AbstractBeliefFilter):
         unknown = signal.about_mean() if self.linear else signal
         return correct_signal(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
 
+    @property
+    def is_linear(self) -> bool:
+        """True where the gains depend on no data."""
+        return self.linear
+
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
         return plan(self, inputs) if self.linear else self

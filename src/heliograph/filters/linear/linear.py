@@ -92,6 +92,11 @@ class LinearFilter(AbstractSizedFilter):
         claim: Claim = self.claim if self.mean_known else "nominal"
         return smoother_step_of(step.before, step.prior, step.after, moved, claim)
 
+    @property
+    def is_linear(self) -> bool:
+        """Always True: its gains depend on the moments before any data."""
+        return True
+
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
         return plan(self, inputs)

@@ -1,10 +1,8 @@
 """Precomputed linear filters: gains and covariances for each step, where nothing but the mean depends on data."""
 
 from dataclasses import replace
-from functools import lru_cache
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -75,6 +73,11 @@ class PlannedFilter(AbstractSizedFilter):
     start: Array
     projection: Array | None
     past: OverTime | None = None
+
+    @property
+    def is_linear(self) -> bool:
+        """True unless the plant's state is a projection of its mean."""
+        return self.projection is None
 
     @in_float64
     def init(self) -> PlannedMean:
@@ -240,27 +243,6 @@ def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.A
     output = jnp.where(present[:, None], -output, 0.0)
     total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
     return Linearised(prior.mean, jnp.where(present, gain, 0.0), output, total - output @ prior.covariance @ output.T)
-
-
-def is_linear_filter(filter: AbstractFilter) -> bool:
-    """Test whether only the mean of the filter depends on data, and estimates the plant's state alone."""
-    leaves, tree = jax.tree.flatten(filter)
-    return _is_linear(tree, tuple(map(_shape, leaves)))
-
-
-def _shape(leaf: Any) -> object:
-    if not eqx.is_array(leaf):
-        return leaf
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)  # type: ignore[no-untyped-call]
-
-
-@lru_cache(maxsize=1024)
-def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[object, ...]) -> bool:
-    """Answer `is_linear_filter` by structure and shapes, so that filters of one structure are traced once."""
-    with jax.enable_x64(True):
-        filter = jax.tree.unflatten(tree, leaves)
-        planned = eqx.filter_eval_shape(lambda single: single.planned(jnp.zeros((1, len(single.inputs)))), filter)
-    return isinstance(planned, PlannedFilter) and planned.projection is None
 
 
 def _seen(covariance: jax.Array, projection: Array | None) -> jax.Array:

@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import homogeneous
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.linear.plan import Linearised, LinearStep, is_linear_filter, linear_step
+from heliograph.filters.linear.plan import Linearised, LinearStep, linear_step
 from heliograph.fusion.all_reports import ReportsBelief, begin, estimate_state, propagate_errors, receive_reports
 from heliograph.fusion.cross_covariance import (
     Errors,
@@ -31,7 +31,7 @@ from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper, weakest
-from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, structure, unstack
+from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles, without_output_names
 from heliograph.numerics.check import fail
@@ -267,14 +267,12 @@ def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
 def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
-    seen = set()
     for name, (sensor, _, filter) in nodes.items():
         where = f"fusion by {rule}: node {name!r}"
         if not isinstance(first(sensor), LinearSensor):
             raise fail(where, "a LinearSensor", type(first(sensor)).__name__)
-        if structure(filter) not in seen and not is_linear_filter(filter):
+        if not filter.is_linear:
             raise fail(where, "a filter of the plant's state whose gains depend on no data", type(filter).__name__)
-        seen.add(structure(filter))
 
 
 def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
