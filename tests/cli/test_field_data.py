@@ -294,6 +294,9 @@ def test_stamps_of_a_clock_that_was_not_set_are_refused_where_arrivals_are_not_k
     out, err, table = run(folder, capsys, "log.csv", text, '{"log.csv": field("v", node="a", time="t")}')
     agrees(table, [0, 60, 120], [20 + k / 10 for k in kept])
     assert "a: 3 used\n" in out and "a time that was set, near the others in order" in err
+    counted = "n,t,v\n" + "".join(f"{k},{stamp},{20 + k / 10}\n" for k, stamp in enumerate(stamps))
+    source = '{"log.csv": field("v", node="a", time="t", sequence="n")}'
+    assert "a: 3 used\n" in run(folder, capsys, "log.csv", counted, source)[0]  # and none lost
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from heliograph.simulation.node import Node
 
 SECOND = 10**9  # nanoseconds
 YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
+NO_COUNTS = np.zeros(0, dtype=np.int64)
 CENTURY = 946_684_800 * SECOND  # 2000-01-01
 
 USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
@@ -29,6 +30,7 @@ class Columns:
         size: numbers of each event.
         numbers: whether times are floats.
         period: after how many messages the count begins at 0 again; 0 if it does not.
+        unset: of the messages whose stamps were not set: moments near which they came, and their counts.
     """
 
     size: int
@@ -38,6 +40,7 @@ class Columns:
     arrival: "array[Any]" = field(init=False)
     sequence: "array[int]" = field(default_factory=lambda: array("q"))
     values: "array[float]" = field(default_factory=lambda: array("d"))
+    unset: tuple[np.ndarray, np.ndarray] = field(init=False, default=(NO_COUNTS, NO_COUNTS))
 
     def __post_init__(self) -> None:
         self.time, self.arrival = (array("d" if self.numbers else "q") for _ in range(2))
@@ -56,6 +59,17 @@ class Columns:
         """Return the values, a row for each event."""
         return np.array(self.values).reshape(len(self.time), self.size)
 
+    def count_lost(self) -> int | None:
+        """Count the gaps in the node's count, in the order of its times; None without a count.
+
+        A message whose stamp was not set is none that was lost.
+        """
+        time, _, sequence = self.arrays()
+        if not len(time) or sequence.min() < 0:
+            return None
+        moments, counts = self.unset
+        return count_gaps(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
+
     def without_unset(self, name: str) -> tuple[str, str, int]:
         """Leave out stamps that were not set; return what to say of the clock, why some were left out, and how many.
 
@@ -63,7 +77,7 @@ class Columns:
         each event arrives when it was measured. Where arrivals are not known, neither was one that is more than a year
         away from the messages before and after it, which go on from one to the other.
         """
-        time, arrival, _ = self.arrays()
+        time, arrival, sequence = self.arrays()
         late = arrival - time
         if not len(time):
             return "", "", 0
@@ -75,6 +89,10 @@ class Columns:
         if not count:
             return "", "", 0
         got = f"{np.datetime64(int(time[np.argmax(unset)]), 'ns')} in {count} of {len(time)} messages"
+        # They came when those did that were set just before them, or first.
+        set_before = np.maximum.accumulate(np.where(unset, -1, np.arange(len(time))))
+        near_them = time[np.where(set_before < 0, np.argmin(unset), set_before)]
+        self.unset = (arrival if late.any() else near_them)[unset], sequence[unset]
         self.keep(~unset)
         return "", str(fail(name, f"a time that was set, near {near}", got)), count
 

@@ -9,7 +9,6 @@ from heliograph.files.event_columns import (
     USED,
     Columns,
     Events,
-    count_gaps,
     count_verdicts,
     counts_losses,
     fill_forward,
@@ -262,12 +261,8 @@ class EventTable:
         events, verdicts = self._judge_events(window, ahead)
         names = [*self.network.names, INPUTS]
         counts = {names[node]: found for node, found in count_verdicts(events.node, verdicts).items()}
-        gaps = {}
-        for node, name in enumerate(self.network.names):
-            columns, mine = self.columns[name], events.of(events.node == node)
-            if len(columns.time) and min(columns.sequence) >= 0:
-                gaps[name] = count_gaps(mine.time, mine.sequence, columns.period)
-        return counts, gaps
+        lost = {name: self.columns[name].count_lost() for name in self.network.names}
+        return counts, {name: count for name, count in lost.items() if count is not None}
 
     def count_absent(self, window: float = np.inf, ahead: float = AHEAD) -> dict[str, int]:
         """Count by node the events that a timeline uses and that have no value, only a time.
@@ -277,9 +272,9 @@ class EventTable:
             ahead: how much later than its arrival the time of an event may be (default a tenth of a second).
         """
         events, verdicts = self._judge_events(window, ahead)
-        counts = {}
-        for node, (name, matrix) in enumerate(zip((*self.network.names, INPUTS), self._matrices(), strict=True)):
-            used = events.place[(events.node == (-1 if name == INPUTS else node)) & (verdicts == USED)]
+        counts, nodes = {}, [*enumerate(self.network.names), (-1, INPUTS)]
+        for (node, name), matrix in zip(nodes, self._matrices(), strict=True):
+            used = events.place[(events.node == node) & (verdicts == USED)]
             counts[name] = int(np.sum(np.isnan(matrix[used]).all(axis=1)))
         return counts
 
