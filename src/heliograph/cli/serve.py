@@ -51,12 +51,16 @@ class ServeOptions:
         list[str] | None,
         Parameter(help="Name by which others ask for the page, as of a proxy; may be given again.", negative=""),
     ] = None
+    forecast: Annotated[
+        str, Parameter(help="How far ahead forecasts are published beside estimates: 5s,1min, or steps.")
+    ] = ""
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False
 
     def settings(self, reference: str) -> "ServiceSettings":
         """Load the network, and return the settings of its service."""
         from heliograph.files.network_file import load_module
         from heliograph.live.fleet import Options
+        from heliograph.numerics.dates import horizons_in
         from heliograph.serving.brokers.url import address
         from heliograph.serving.running import ServiceSettings, name_of, of_node, store_of
 
@@ -79,6 +83,7 @@ class ServeOptions:
             name=name_of(reference),
             accept_changes=self.accept_changes,
             every=self.every,
+            forecast=horizons_in(self.forecast) if self.forecast else None,
         )
         return settings if self.node is None else of_node(settings, self.node)
 

@@ -14,18 +14,18 @@ from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import FleetAngles, Judges
 from heliograph.live.lanes import shared_lanes
 from heliograph.live.plant import LinkCounts
+from heliograph.live.row_origin import estimates_by_name, row_origin
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.senders import SenderStatus
 from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, description
 from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.live.stored.snapshot import check_same, pack, unpack
-from heliograph.model.estimate import Estimate, JudgedEstimate, lower_unsound_claim
+from heliograph.model.estimate import Estimate, JudgedEstimate
 from heliograph.model.origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import split_by_name
 from heliograph.simulation.results.record import Record
 
 
@@ -206,13 +206,7 @@ class Timeline:
     @property
     def origin(self) -> Origin:
         """Return the filters' states at `now`, from which `hg.forecast` predicts; late events are taken as before."""
-        (slot, now), pool, steps = self._slot_now(), self._fleet.pool, self._lanes.step_rows
-        row = pool.table[slot].copy()
-        held, dt = row[pool.held], self._lanes.dt
-        inputs = held if dt is None else np.insert(held, dt, np.nan)
-        state, spacing = steps.state.tree(row[pool.state]), 1.0 if dt is None else float("nan")
-        estimates = self._arrange_outputs(row[pool.outputs])
-        return Origin(self.network, state, int(row[pool.at.start]) + 1, inputs, now, spacing, estimates)
+        return row_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
         """Return the slot of the row at `now`, which is looked ahead to where there is none, and its time."""
@@ -370,13 +364,4 @@ class Timeline:
 
     def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Arrange outputs by node and filter."""
-        estimates = self._lanes.step_rows.outputs.tree(outputs)
-        mean = split_by_name(self.network, estimates, lambda estimate: np.asarray(estimate.mean), -3)
-        covariance = split_by_name(self.network, estimates, lambda estimate: np.asarray(estimate.covariance), -4)
-        return {
-            node: {
-                name: lower_unsound_claim(Estimate(mean[node][name], covariance[node][name], claim))
-                for name, claim in claims.items()
-            }
-            for node, claims in self._lanes.claims.items()
-        }
+        return estimates_by_name(self._lanes, outputs)

@@ -86,6 +86,46 @@ class SenderOutput(BaseModel):
     dead: bool
 
 
+class OutputAhead(BaseModel):
+    """What a sensor would measure at one horizon.
+
+    Args:
+        mean: expected value.
+        deviation: claimed standard deviation; null where nothing is claimed.
+    """
+
+    mean: float | None
+    deviation: float | None
+
+
+class FilterAhead(BaseModel):
+    """Forecast of one filter at one horizon; null stands for a number that is not finite.
+
+    Args:
+        mean: state, n numbers.
+        covariance: n rows of n numbers; null if the filter claims no covariance.
+        claim: what the covariance is: exact, upper, nominal or none.
+        outputs: what the filter's sensor would measure, by name; left out where it is not known.
+    """
+
+    mean: list[float | None]
+    covariance: list[list[float | None]] | None
+    claim: Claim
+    outputs: dict[str, OutputAhead] = {}
+
+
+class Horizon(BaseModel):
+    """Forecasts of a plant's filters at one horizon, with inputs held.
+
+    Args:
+        time: of the horizon: steps, seconds or an ISO 8601 date.
+        estimates: of each filter, by node and filter.
+    """
+
+    time: float | str
+    estimates: dict[str, dict[str, FilterAhead]]
+
+
 class Estimates(BaseModel):
     """Estimates of a plant's filters after the row at `time`, by node and filter; fused ones under "fused".
 
@@ -95,6 +135,7 @@ class Estimates(BaseModel):
         plant: name of the plant.
         time: time of the row: steps, seconds or an ISO 8601 date.
         estimates: the filters' estimates by node and filter.
+        forecast: of provisional ones, what is forecast at each horizon; left out unless asked for.
         senders: of provisional ones, senders that decide when to send, by node; left out where there are none.
     """
 
@@ -105,6 +146,7 @@ class Estimates(BaseModel):
     plant: str
     time: float | str
     estimates: dict[str, dict[str, FilterOutput]]
+    forecast: list[Horizon] = Field([], description="Of provisional ones: what is ahead, where it is asked for.")
     senders: dict[str, SenderOutput] = Field({}, description="Of provisional ones: senders that decide when to send.")
 
 

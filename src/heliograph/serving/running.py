@@ -16,6 +16,7 @@ from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
 from heliograph.numerics.check import TINY, check_count, fail, scalar
+from heliograph.serving.ahead import Spans
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, word
@@ -158,6 +159,7 @@ class ServiceSettings:
         accept_changes: whether the plants of a store whose network has changed go on with what fits.
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
             hardly changed; None for never.
+        forecast: how far ahead forecasts are published beside provisional estimates; None for not at all.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -178,6 +180,7 @@ class ServiceSettings:
     name: str = ""
     accept_changes: bool = False
     every: float | None = None
+    forecast: Spans | None = None
 
     def __post_init__(self) -> None:
         if self.hosts and self.page is None:
@@ -302,7 +305,7 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     with signals(stop), contextlib.ExitStack() as owning:
         # The store first, whose state the service goes on from.
         store = await asyncio.to_thread(patiently, lambda: _open_store(settings, fleet, owning), stop)
-        resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every)
+        resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every, settings.forecast)
         try:
             service.resume()
             broker = settings.broker

@@ -19,6 +19,7 @@ from heliograph.live.rows import HeldRow
 from heliograph.live.stored.plant_codec import plant_bytes, plant_from
 from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.collector import no_collector
+from heliograph.serving.ahead import Ahead, Spans
 from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
 from heliograph.serving.message import AnyMessage, Message, Payload, read_messages
@@ -67,6 +68,7 @@ class Service:
             known less well than its filter can use.
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
             hardly changed; None for never.
+        forecast: how far ahead provisional estimates are accompanied by forecasts; None for not at all.
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class Service:
         store: StoreProtocol,
         say: Callable[[str], None] | None = None,
         every: float | None = None,
+        forecast: Spans | None = None,
     ):
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
@@ -83,6 +86,7 @@ class Service:
         self._writer, self._using = EstimateWriter(fleet.lanes), Using(fleet, self.plants)
         self._exchange, self._silence = Exchange(fleet, self._moment), Silence(fleet, every)
         self._angles, self._doubt = FleetAngles(fleet), say
+        self._ahead = None if forecast is None else Ahead(fleet, forecast)
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
@@ -306,7 +310,11 @@ class Service:
         """Return the provisional estimates after these rows, and what the senders' silence means."""
         outputs = []
         self._silence.told(rows)
-        for (plant, _), body in zip(rows, self._lines(b"provisional", rows), strict=True):
+        for (plant, row), body in zip(rows, self._lines(b"provisional", rows), strict=True):
+            if self._ahead is not None:
+                ahead = [{"time": self._moment(plant, time), "estimates": estimates}
+                         for time, estimates in self._ahead.forecasts(row)]  # fmt: skip
+                body = b'%b,"forecast":%b}' % (body[:-1], line(ahead))
             if self.fleet.deciding:
                 senders = {name: status._asdict() | {"dead": status.dead}
                            for name, status in self.fleet.senders(plant).items()}  # fmt: skip
