@@ -6,8 +6,9 @@ DOUBTFUL = 1
 def check(network: str, /) -> int:
     """Show your own network as a diagram, and what is doubtful in it before any data.
 
-    Judged are states that no sensor shows, errors that grow without end, memory of links that a filter ignores, and
-    what links share. The exit status is 0 where nothing is doubtful, 1 where something is, and 2 for bad input.
+    Judged are states that no sensor shows, errors that grow without end, memory of links that a filter ignores, what
+    links share, and what native code does not take, such as a filter of your own, with the line. The exit status is 0
+    where nothing is doubtful, 1 where something is, and 2 for bad input.
 
     Parameters
     ----------

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import jax
 import numpy as np
 
+from heliograph.engine.limits import LONG, SHORT
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.collector import no_collector
@@ -26,8 +27,6 @@ R = TypeVar("R")
 
 SETTING = "HELIOGRAPH_ENGINE"
 COMPILED = 256  # functions whose code is held at once
-LONG = 400_000  # operations, those that fold among them: a longer program is left to XLA
-SHORT = 8_000  # operations: native code of 11,000 takes as long to make as a program of XLA, one of a thousand a third
 ENGINES = ("native", "xla")
 
 
@@ -73,6 +72,14 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     if not callable(function):
         raise fail("function of one run", "a function of arrays", show_value(function))
     return chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
+
+
+def refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
+    """Return why native code does not take a function of these arguments, "" if it does or if XLA is forced."""
+    if setting() == "xla":
+        return ""
+    with jax.enable_x64(True):
+        return _find_code(function, arguments, [False] * len(arguments), LONG).why
 
 
 def chosen(

@@ -6,7 +6,8 @@ from typing import NamedTuple, cast
 import jax
 import jax.numpy as jnp
 
-from heliograph.engine.choice import SHORT, compute_once
+from heliograph.engine.choice import compute_once
+from heliograph.engine.limits import SHORT
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.engine.limits import MESH_NUMBERS, MESH_ROWS
 from heliograph.fusion.cross_covariance import Motion, Observation, propagate_state
 from heliograph.fusion.intersection import inverse
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of
@@ -29,8 +30,6 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 DENSE = 200  # nodes whose joint covariance is propagated at every step
-STRAIGHT = 3_000  # numbers of all covariances that are sent in a step: of more native code takes longer to make,
-JOINT = 40  # as of more rows of a joint covariance
 Arrived = Bool[Array, "node rounds degree"]  # which messages arrived, each node's from itself first
 Ahead = Sequence[Sequence[Array]]  # parts and covariance of weights, by part of the nodes; none where there are none
 
@@ -110,7 +109,7 @@ class Mesh(Module):
         """Return whether a step has too many operations for native code, in which they are written one by one."""
         n = len(first(self.plant).states)
         sent = self.edges.rounds * np.count_nonzero(self.edges.present) * n * n
-        return bool(sent > STRAIGHT or (self.needs_joint and len(self.senders) * n > JOINT))
+        return bool(sent > MESH_NUMBERS or (self.needs_joint and len(self.senders) * n > MESH_ROWS))
 
     def init(self) -> MeshState:
         """Return the state before the first step: the plant's mean and covariance at every node."""

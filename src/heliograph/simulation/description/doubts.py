@@ -24,6 +24,7 @@ from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
 from heliograph.simulation.description.diagram import list_rounded, list_shared
+from heliograph.simulation.description.fallbacks import list_fallbacks
 from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import wide_at_the_start
 from heliograph.simulation.network import Network
@@ -62,6 +63,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
+    lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"

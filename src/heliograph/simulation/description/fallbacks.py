@@ -1,0 +1,53 @@
+"""What native code refuses in a network, so that XLA computes it: which filters and fusions, and why."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.disk.quoting import join_names
+from heliograph.engine.choice import refusal
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.centres.mesh import DENSE, mesh_of
+from heliograph.simulation.network import Network
+
+SHOWN = 3  # of many that are refused for one reason
+
+
+def list_fallbacks(network: Network) -> list[str]:
+    """Return a line for each reason for which XLA computes filters or fusions: who, and why."""
+    by_reason: dict[str, list[str]] = {}
+    for who, why in (*_filters(network), *_meshes(network)):
+        by_reason.setdefault(why, []).append(who)
+    return [f"{_join(those)}: {why}" for why, those in by_reason.items()]
+
+
+def _filters(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield each filter whose step is refused, with the reason."""
+    central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
+    places = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
+    for where, filters in (*places, ("", central)):
+        for label, filter in filters.items():
+            z, u = jnp.zeros(filter.received), jnp.zeros(len(filter.inputs))
+            state = jax.tree.map(jnp.asarray, filter.init())
+            if why := refusal(_step, filter, state, z, u, jnp.asarray(0)):
+                yield f"filter {label!r}{where}", why
+
+
+def _step(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
+    state, z, u, k = arguments
+    return filter.step(state, z, u, k)
+
+
+def _meshes(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield each fusion between neighbours whose step is too long to be written out."""
+    for name, fusion in network.meshes.items():
+        nodes = len(network.mesh_nodes(name))
+        if (nodes <= DENSE or not fusion.rule.needs_joint) and mesh_of(network, name).is_long:
+            yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"
+
+
+def _join(names: list[str]) -> str:
+    more = len(names) - SHOWN
+    return f"{', '.join(names[:SHOWN])} and {more} more" if more > 0 else join_names(names)

@@ -1,0 +1,87 @@
+"""Who falls back to XLA in a network, and why: filters of one's own too, and meshes that are too large."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+import heliograph as hg
+from heliograph.simulation.description.doubts import doubts_before_data
+from heliograph.simulation.description.fallbacks import list_fallbacks
+
+PLANT = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0)
+SENSOR = hg.LinearSensor(np.eye(2), 0.1)
+
+
+class Own(hg.filters.AbstractFilter):
+    """A filter whose gain is a fixed share, by a function of the innovation's size."""
+
+    claim: str = eqx.field(static=True, default="nominal")
+    states: tuple = eqx.field(static=True, default=PLANT.states)
+    inputs: tuple = eqx.field(static=True, default=())
+    received: int = eqx.field(static=True, default=2)
+    by_svd: bool = eqx.field(static=True, default=False)
+
+    @hg.filters.in_float64
+    def init(self):
+        return jnp.zeros(2)
+
+    @hg.filters.predicts
+    def predict(self, state, u=(), k=0):
+        return 0.9 * state
+
+    @hg.filters.corrects
+    def correct(self, state, z, k=0):
+        innovation = hg.filters.gaussian_innovation(z, state, jnp.eye(2))
+        error = jnp.where(jnp.isnan(z), 0.0, innovation.value)
+        size = jnp.linalg.svd(error[:, None])[1][0] if self.by_svd else jnp.sqrt(error @ error)
+        return state + error / (2 + size), innovation
+
+    @hg.filters.estimates
+    def estimate(self, state):
+        return hg.model.Estimate(state, jnp.eye(2), self.claim)
+
+
+def network(filters, count=1):
+    nodes = {f"n{i}": hg.Node(SENSOR, hg.perfect(2), filters) for i in range(count)}
+    return hg.Network(PLANT, nodes)
+
+
+def test_a_network_that_native_code_takes_says_nothing():
+    assert list_fallbacks(network({"own": Own(), "kalman": hg.kalman_filter(PLANT, SENSOR)})) == []
+
+
+def test_a_filter_of_one_s_own_that_is_refused_is_named_with_its_line():
+    """Once for all nodes that have it; and native code forced or not, nothing is raised."""
+    item = network({"own": Own(by_svd=True), "kalman": hg.kalman_filter(PLANT, SENSOR)}, 5)
+    (line,) = list_fallbacks(item)
+    names = "filter 'own' of node 'n0', filter 'own' of node 'n1', filter 'own' of node 'n2' and 2 more"
+    assert line.startswith(f"{names}: svd at ") and "test_fallbacks.py:" in line
+    notes = [words for serious, words in doubts_before_data(item) if not serious]
+    assert f"by XLA, which takes longer: {line}" in notes
+
+
+def test_nothing_falls_back_where_xla_is_forced(monkeypatch):
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "xla")
+    assert list_fallbacks(network({"own": Own(by_svd=True)})) == []
+
+
+def test_a_mesh_of_many_neighbours_is_named():
+    names = [f"n{i}" for i in range(30)]
+    nodes = {name: hg.Node(SENSOR, hg.perfect(2), {"own": hg.kalman_filter(PLANT, SENSOR)}) for name in names}
+    near = {name: tuple(other for other in names if other != name) for name in names}
+    mesh = hg.Fusion("own", hg.CovarianceIntersection(), neighbours=near)
+    item = hg.Network(PLANT, nodes, {"mesh": mesh})
+    assert list_fallbacks(item) == ["fusion 'mesh': between 30 neighbours, too many to be written out"]
+    few = {name: (names[i - 1], names[(i + 1) % 30]) for i, name in enumerate(names)}
+    assert list_fallbacks(hg.Network(PLANT, nodes, {"mesh": replace(mesh, neighbours=few)})) == []
+
+
+def test_states_of_more_rows_than_are_written_out_run_natively():
+    """Loops over 30 states of the factors, with what they divide by."""
+    n = 30
+    plant = hg.LinearPlant(0.9 * np.eye(n) + 0.05 * np.eye(n, k=1), np.eye(n), np.zeros(n), np.eye(n))
+    sensor = hg.LinearSensor(np.eye(1, n), 0.1)
+    filter = hg.kalman_filter(plant, sensor)
+    assert list_fallbacks(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"kalman": filter})})) == []
