@@ -13,52 +13,13 @@ from heliograph.live.lanes import Lanes
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
-
-WALK = """
-import heliograph as hg
-import jax.numpy as jnp
-
-plant = hg.LinearPlant(
-    lambda u: jnp.eye(1), lambda u: 1e-4 * u[0] * jnp.eye(1), [20.0], 1.0, states=["x"], inputs=["dt"]
-)
-sensor = hg.LinearSensor([[1.0]], 0.04, outputs=["y"])
-network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)})})
-field = hg.files.json_field
-"""
+from tests.cli.walk import WALK, agrees, kalman, run
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def run(folder, capsys, name, text, sources="{}", *options):
-    """Standard output and error of `heliograph run`, and its table; None where it refuses."""
-    (folder / "net.py").write_text(f"{WALK}\nsources = {sources}\n")
-    (folder / name).write_text(text)
-    (folder / "out.csv").unlink(missing_ok=True)
-    code = cli.main(["run", "net.py", "--measurements", name, "--out", "out.csv", *options])
-    said = capsys.readouterr()
-    assert code == (0 if (folder / "out.csv").exists() else 2), said.err
-    return said.out, said.err, hg.files.read_table("out.csv") if code == 0 else None
-
-
-def kalman(times, values):
-    """The last mean and deviation of the walk's filter, by hand."""
-    m, p, before = 20.0, 1.0, times[0]
-    for t, y in zip(times, values, strict=True):
-        p, before = p + 1e-4 * (t - before), t
-        gain = 0.0 if np.isnan(y) else p / (p + 0.04)
-        y = m if np.isnan(y) else y  # did not arrive
-        m, p = m + gain * (y - m), p - gain * p
-    return m, np.sqrt(p)
-
-
-def agrees(table, times, values):
-    """Up to rounding."""
-    assert len(table["x"]) == len(times)
-    np.testing.assert_allclose([table["x"][-1], table["x.sd"][-1]], kalman(times, values), rtol=1e-12)
 
 
 def served(folder, lines):
@@ -276,45 +237,6 @@ def test_ways_to_say_what_a_file_has(folder, capsys, case):
     agrees(run(folder, capsys, name, text, f'{{"{name}": {source}}}')[2], *expected)
 
 
-MINUTES = [f"2026-09-27T10:0{k}:00Z" for k in range(3)]
-
-
-@pytest.mark.parametrize(
-    ("stamps", "kept"),
-    [
-        ([MINUTES[0], "1970-01-01T00:00:05Z", *MINUTES[1:]], [0, 2, 3]),  # a clock that counts since it began
-        ([MINUTES[0], "2000-01-01T00:00:00Z", "2000-01-01T00:01:00Z", *MINUTES[1:]], [0, 3, 4]),
-        ([*MINUTES[:2], "2036-02-07T06:28:16Z", MINUTES[2]], [0, 1, 3]),
-        (["1970-01-01T00:00:05Z", "1970-01-01T00:01:05Z", *MINUTES], [2, 3, 4]),
-    ],
-    ids=["1970", "2000", "2036", "at the start"],
-)
-def test_stamps_of_a_clock_that_was_not_set_are_refused_where_arrivals_are_not_known(folder, capsys, stamps, kept):
-    text = "t,v\n" + "".join(f"{stamp},{20 + k / 10}\n" for k, stamp in enumerate(stamps))
-    out, err, table = run(folder, capsys, "log.csv", text, '{"log.csv": field("v", node="a", time="t")}')
-    agrees(table, [0, 60, 120], [20 + k / 10 for k in kept])
-    assert "a: 3 used\n" in out and "a time that was set, near the others in order" in err
-    counted = "n,t,v\n" + "".join(f"{k},{stamp},{20 + k / 10}\n" for k, stamp in enumerate(stamps))
-    source = '{"log.csv": field("v", node="a", time="t", sequence="n")}'
-    assert "a: 3 used\n" in run(folder, capsys, "log.csv", counted, source)[0]  # and none lost
-
-
-@pytest.mark.parametrize(
-    "stamps",
-    [
-        [f"{year}-07-01T00:00:00Z" for year in range(1970, 1990)],  # once a year, from 1970 on
-        ["2010-01-01T00:00:00Z", "2020-01-01T00:00:00Z", "2026-01-01T00:00:00Z", "2026-01-02T00:00:00Z"],
-        [f"20{10 + 7 * k % 16}-0{1 + k % 9}-01T00:00:00Z" for k in range(40)],  # in no order
-        ["1970-01-01T00:00:01Z", "1970-01-01T00:00:02Z"],
-    ],
-    ids=["each year", "rare", "in no order", "since it began"],
-)
-def test_rare_stamps_are_used(folder, capsys, stamps):
-    text = "t,v\n" + "".join(f"{stamp},{20 + k / 10}\n" for k, stamp in enumerate(stamps))
-    out, err, table = run(folder, capsys, "log.csv", text, '{"log.csv": field("v", node="a", time="t")}')
-    assert f"a: {len(stamps)} used\n" in out and not err and len(table["x"]) == len(stamps)
-
-
 def test_a_zero_among_dates_was_not_set(folder, capsys):
     text = '{"at": 1790503200, "v": 20.1}\n{"at": 0, "v": 99}\n{"at": 1790503260, "v": 20.2}\n'
     out, err, table = run(folder, capsys, "log.jsonl", text, '{"log.jsonl": field("v", node="a", time="at")}')
@@ -332,43 +254,6 @@ def test_a_message_without_a_value_is_not_counted_as_used(folder, capsys):
     mapped = "n,t,v\n" + "\n".join(row.removeprefix("a,") for row in rows)
     source = '{"log.csv": field("v", node="a", time="t", sequence="n")}'
     assert "a: 2 used, 1 without a value\n" in run(folder, capsys, "log.csv", mapped, source)[0]
-
-
-def rows(*fields):
-    """Eight messages of two senders that differ in the last field."""
-    stamps = [f"2026-09-27T10:0{k}:00Z" for k in range(8)]
-    return [[stamp, 20 + k / 10, *(f[k % 2] for f in fields)] for k, stamp in enumerate(stamps)]
-
-
-@pytest.mark.parametrize("name", ["entity_id", "_field", "devEui", "id"])
-def test_several_senders_that_are_read_as_one_sensor_are_said(folder, capsys, name):
-    """A field that names a sender and has several values, of a table and of a topic's payloads."""
-    senders = (7, 12) if name == "id" else ("attic", "cellar")
-    table = "\n".join([f"t,v,{name},note", *(",".join(map(str, row)) for row in rows(senders, ("ok", "low")))])
-    said = f"field {name!r} of log.csv has 2 values ({senders[0]}, {senders[1]}) in what is read as one sensor"
-    assert said in run(folder, capsys, "log.csv", table, '{"log.csv": field("v", node="a", time="t")}')[0]
-    lines = [
-        json.dumps({"topic": "rtl_433/events", "payload": json.dumps({"t": t, "v": v, name: sender})})
-        for t, v, sender in rows(senders)
-    ]
-    source = '{"rtl_433/events": field("v", node="a", time="t")}'
-    assert (
-        f"field {name!r} of rtl_433/events has 2 values"
-        in run(folder, capsys, "log.jsonl", "\n".join(lines), source)[0]
-    )
-
-
-@pytest.mark.parametrize("how", ['where={"id": 7}', 'where={"id": [7, 12]}', 'plant="id"'])
-def test_senders_that_are_told_apart_are_not(folder, capsys, how):
-    table = "\n".join(["t,v,id", *(",".join(map(str, row)) for row in rows((7, 12)))])
-    source = f'{{"log.csv": field("v", node="a", time="t", {how})}}'
-    options = ("--plant", "7") if "plant" in how else ()
-    assert "one sensor" not in run(folder, capsys, "log.csv", table, source, *options)[0]
-
-
-def test_a_field_that_names_each_message_names_no_senders(folder, capsys):
-    table = "\n".join(["t,v,id", *(f"{t},{v},{k}" for k, (t, v) in enumerate(rows()))])
-    assert "one sensor" not in run(folder, capsys, "log.csv", table, '{"log.csv": field("v", node="a", time="t")}')[0]
 
 
 def test_the_option_for_messages_that_come_late(folder, capsys):
