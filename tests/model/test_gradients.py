@@ -230,3 +230,37 @@ def test_a_trace_reads_no_number_to_choose_a_claim():
 
     with jax.enable_x64(True):
         jax.jit(claim)(0.7)
+
+
+Z = np.random.default_rng(1).normal(size=(4, 1))
+FILTERS = {
+    "kalman": hg.kalman_filter, "extended": hg.extended_filter, "cubature": hg.cubature_filter,
+    "unscented": hg.unscented_filter, "linear": lambda *parts: hg.linear_filter(*parts, hg.hop(1.0, 0.0)),
+    "side information": lambda *parts: hg.filters.side_information_filter(*parts, hg.hop(1.0, 0.0)),
+}  # fmt: skip
+
+
+def textbook(p):
+    """Log-likelihood of x+ = .9 x + w, z = x + v by the Kalman filter's formulas; P0, Q and R are parameters."""
+    mean, variance, total = 0.0, p[0], 0.0
+    for z in Z[:, 0]:
+        mean, variance = 0.9 * mean, 0.81 * variance + p[1]
+        s = variance + p[2]
+        total -= ((z - mean) ** 2 / s + jnp.log(2 * np.pi * s)) / 2
+        mean, variance = mean + variance / s * (z - mean), variance * p[2] / s
+    return total
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.3), (0.0, 0.2, 0.3), (1.0, 0.0, 0.3), (1.0, 0.2, 0.0), (0.0, 0.2, 0.0)])
+def test_derivatives_by_variances_at_zero(name, at):
+    """Of the start, and of the noises of plant and sensor: to one side there is a slope."""
+
+    def likelihood(p):
+        plant = hg.LinearPlant([[0.9]], jnp.reshape(p[1], (1, 1)), [0.0], jnp.reshape(p[0], (1, 1)))
+        return hg.log_likelihood(FILTERS[name](plant, hg.LinearSensor([[1.0]], jnp.reshape(p[2], (1, 1)))), Z)
+
+    with jax.enable_x64(True):
+        slopes, expected = (jax.grad(f)(jnp.array(at)) for f in (likelihood, textbook))
+    np.testing.assert_allclose(slopes, expected, rtol=1e-10, atol=1e-12)  # rounding of some hundred operations

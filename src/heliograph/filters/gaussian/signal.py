@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, eliminate, join_columns, rounding_of, triangular, unit_of
+from heliograph.factors.columns import Columns, eliminate, join_columns, rounding_of, square_root, triangular, unit_of
 from heliograph.factors.gaussian import Gaussian, Innovations, observe
 from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
@@ -95,7 +95,7 @@ def size_of(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     only inputs hold a plant.
     """
     law = sensor.noise
-    reach = jnp.abs(jnp.asarray(sensor.matrix)) @ jnp.sqrt(start) + jnp.abs(jnp.asarray(law.mean))
+    reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
     variances: jax.Array = jnp.diagonal(jnp.asarray(law.covariance))
     return reach**2 + variances
 
@@ -112,7 +112,7 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
 
 def noise_through(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
-    rounding = rounding_of((jnp.abs(gain) @ jnp.sqrt(signal.size)) ** 2)
+    rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
     plain = triangular(join_columns(signal.noise.through(gain), link, rounding))
     return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of
+from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, square_root
 from heliograph.factors.gaussian import Gaussian, given, merge, move, observe
 from heliograph.filters.base import (
     AbstractSizedFilter,
@@ -233,7 +233,7 @@ class MixtureFilter(AbstractSizedFilter):
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching."""
         c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
-        prior, size = state.law[c.mode] * jnp.asarray(c.weight), jnp.sqrt(start_of(self.plant))
+        prior, size = state.law[c.mode] * jnp.asarray(c.weight), square_root(start_of(self.plant))
         present = ~jnp.isnan(z)
 
         # Kalman update of one combination, with the rounding of what it says of the state.

@@ -15,6 +15,7 @@ from heliograph.factors.columns import (
     reciprocal,
     rounding_of,
     side_by_side,
+    square_root,
     triangular,
     unit_lower,
     unit_of,
@@ -238,7 +239,7 @@ def _describe_received(
     def noise_of(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
         sent = x.through(measure).covariance + p * noise
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
-        rounding = rounding_of((jnp.abs(gain[:, :-1]) @ jnp.sqrt(size)) ** 2).times(p)
+        rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)
         return triangular(join_columns(plain, rounding, factor_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
 
     # Output matrix of zeta less the mean output; modes of probability zero have none.
