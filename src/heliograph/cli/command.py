@@ -10,6 +10,7 @@ from typing import TextIO
 from cyclopts import CycloptsError
 
 from heliograph.cli.app import app, completion
+from heliograph.cli.backtest import backtest
 from heliograph.cli.check import check
 from heliograph.cli.design import design
 from heliograph.cli.export import export
@@ -35,6 +36,7 @@ COMMANDS: dict[Callable[..., object], str] = {
     inspect: "drive.mcap --network my_network.py",
     run: "my_network.py --measurements data.csv --out estimates.csv --report report",
     fit: "my_network.py --measurements data.csv --out fitted",
+    backtest: "my_network.py --measurements data.csv --horizons 1,3,12 --out backtested",
     serve: "my_network.py --broker mqtt://localhost:1883/plants --page 8000",
     replay: "data.csv --network my_network.py --speed 10 --loss 0.1 | heliograph serve my_network.py --store none",
     export: "my_network.py --filter relay_aware --out step.c",

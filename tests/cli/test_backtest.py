@@ -1,0 +1,45 @@
+"""`heliograph backtest`: a page by horizon; horizons that are none, or longer than the data, are one line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from heliograph import cli
+
+NETWORK = """
+import heliograph as hg
+plant = hg.LinearPlant([[0.9]], 0.5, [0.0], 2.0, states=["level"])
+sensor = hg.LinearSensor([[1.0]], 0.5, outputs=["height"])
+network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(1), {"f": hg.kalman_filter(plant, sensor)})})
+"""
+
+
+@pytest.fixture
+def call(tmp_path):
+    (tmp_path / "level.py").write_text(NETWORK)
+    draws = np.random.default_rng(0).normal(size=(2, 60))
+    level, rows = 0.0, []
+    for k in range(60):
+        level = 0.9 * level + 0.5**0.5 * draws[0, k]
+        rows.append(f"{k},{level + 0.5**0.5 * draws[1, k]}\n")
+    (tmp_path / "data.csv").write_text("time,height\n" + "".join(rows))
+    out = str(tmp_path / "results")
+    return ["backtest", str(tmp_path / "level.py"), "--measurements", str(tmp_path / "data.csv"), "--out", out]
+
+
+@pytest.mark.slow
+def test_a_backtest_is_a_page_by_horizon(call, tmp_path, capsys):
+    assert cli.main([*call, "--horizons", "1,5"]) == 0
+    folder = tmp_path / "results" / "backtest"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert [score["horizon"] for score in summary["scores"]] == [1, 5]
+    assert "a/f received height, 5 ahead" in capsys.readouterr().out
+    assert "By horizon" in (folder / "report.html").read_text()
+    assert cli.main([*call, "--horizons", "80"]) == 2
+    assert "end within the 60 rows of data" in capsys.readouterr().err
+
+
+def test_horizons_are_rows(call, capsys):
+    assert cli.main([*call, "--horizons", "5s"]) == 2
+    assert "--horizons: expected numbers of rows" in capsys.readouterr().err
