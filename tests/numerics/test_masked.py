@@ -1,5 +1,7 @@
 """What is masked, None or NA did not arrive: at every door the numbers are those of NaN, bit for bit."""
 
+import warnings
+
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -133,3 +135,15 @@ def test_one_number_that_is_absent_did_not_arrive(absent):
 def test_masks_within_a_list_are_kept():
     parts = [np.ma.array([1.0, 2.0], mask=[False, True]), np.ma.array([3.0, 4.0], mask=[True, False])]
     np.testing.assert_array_equal(fill_masked(parts), [[1.0, np.nan], [np.nan, 4.0]])
+
+
+@pytest.mark.parametrize("zone", [None, "UTC"])
+def test_rows_that_are_known_by_unequal_dates_are_said(zone):
+    """As the same dates in time= are: a plant without dt takes each row for one step."""
+    dates = pd.DatetimeIndex(["2020-01-01", "2020-01-02", "2020-01-03", "2020-01-07"], tz=zone)
+    for rows in (pd.Series(np.ones(4), index=dates), pd.DataFrame({"flow": np.ones(4)}, index=dates)):
+        with pytest.warns(UserWarning, match=r"^time: steps of 1 and 4 days: a plant without the input dt"):
+            hg.run(NETWORK, {"a": rows})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hg.run(NETWORK, {"a": pd.Series(np.ones(4), index=pd.date_range("2020", periods=4, tz=zone))})

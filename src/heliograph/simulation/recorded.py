@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +98,7 @@ def run(
     u = inputs_of(network, inputs, steps)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
-    if time is not None and TIME_STEP not in network.inputs and (said := unequal_steps(clock)):
+    if TIME_STEP not in network.inputs and (said := unequal_steps(_dates_of(some) if time is None else clock)):
         warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=2)
     for name, node in network.nodes.items():
         z[name] = _drop_beyond_limits(name, node, z[name])
@@ -133,6 +134,13 @@ def _origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> O
     if TIME_STEP in network.inputs and len(u) > 1:
         spacing = float(np.median(u[1:, network.inputs.index(TIME_STEP)]))
     return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last)
+
+
+def _dates_of(rows: object) -> np.ndarray:
+    """Dates by which the rows of a table or column are known; none where it has none."""
+    index: Any = getattr(rows, "index", None)
+    dated = getattr(getattr(index, "dtype", None), "kind", "") == "M"
+    return np.asarray(index.to_numpy(dtype="datetime64[ns]") if dated else [], "datetime64[ns]")
 
 
 def _drop_beyond_limits(
