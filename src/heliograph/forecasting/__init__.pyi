@@ -12,6 +12,11 @@ from .backtest import (
     Backtest as Backtest,
     Score as Score,
 )
+from .unexplained import (
+    Residuals as Residuals,
+    predict_rows as predict_rows,
+    residuals as residuals,
+)
 from .prediction import (
     Forecast as Forecast,
     Prediction as Prediction,

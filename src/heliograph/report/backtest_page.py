@@ -50,8 +50,8 @@ def _coverage(found: "heliograph.forecasting.Backtest") -> Figure:
         for place, marker in ((1, "s"), (2, "o")):
             shares, errors = zip(*((s.coverage[place].value, 2 * s.coverage[place].error) for s in scores), strict=True)
             label = quote_for_figure(f"{key[0]}/{key[1]} {key[3]}") if place == 2 else None
-            axes.errorbar([s.horizon for s in scores], shares, errors, color=COLOURS[number % len(COLOURS)], marker=marker,
-                          markersize=4, linewidth=1, label=label)  # fmt: skip
+            colour, places = COLOURS[number % len(COLOURS)], [s.horizon for s in scores]
+            axes.errorbar(places, shares, errors, label=label, color=colour, marker=marker, markersize=4, linewidth=1)
     for claimed in CLAIMED[1:]:
         axes.axhline(claimed, color=MUTED, linewidth=1)
     axes.set(xlabel="rows ahead", ylabel="share inside", ylim=(None, 1.02), xticks=found.horizons)

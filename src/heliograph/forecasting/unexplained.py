@@ -1,0 +1,188 @@
+"""What a model did not predict: one step ahead at every row, and tests of the standardised residuals."""
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import chi2, f
+
+from heliograph.engine.choice import compute_once
+from heliograph.filters.base import AbstractFilter, FilterAngles
+from heliograph.filters.rows import data_of
+from heliograph.forecasting.outlook import Outlook, outlook_of, output_claim, prediction_of
+from heliograph.forecasting.prediction import Array, Forecast, InputsAhead
+from heliograph.model.over_time import first
+from heliograph.numerics.angle import nearest
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.simulation.node import name_received
+
+FALSE = 0.01  # probability of any false doubt, of all tests together
+LEAST = 20  # residuals for tests
+NORMAL = 1.959963984540054  # quantile of an interval of 95 %
+
+
+def predict_rows(
+    filter: AbstractFilter,
+    z: Float[ArrayLike, "steps received"],
+    u: Float[ArrayLike, "steps inputs"] | None = None,
+) -> Forecast:
+    """Predict each row given those before it: states, outputs and what arrives, at rows where nothing arrived too.
+
+    Args:
+        filter: a filter.
+        z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
+        u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+
+    Returns:
+        A forecast one step ahead whose horizons are the rows: `received.mean[k]` is E[z_k | z_0 ... z_(k-1)].
+
+    Raises:
+        ValueError: data of another size than the filter's, no rows.
+    """
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    rows, inputs = data_of(filter, z, u)
+    if not len(rows):
+        raise fail("measurements", "at least one row", "none")
+    outlook = outlook_of(filter)
+    states, outputs, received = compute_once(_predict, _by_xla, (outlook, rows, inputs))
+    angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
+    names = name_received(() if sensor is None else tuple(sensor.outputs), filter.received)
+    measured = outputs and prediction_of(outputs, tuple(sensor.outputs), output_claim(filter, outlook), sensor.angles)
+    arriving = received and prediction_of(received, names, filter.claim, angles.received)
+    whole = prediction_of(states, filter.states, filter.claim, angles.states)
+    given: InputsAhead = "given" if filter.inputs else "none"
+    return Forecast(np.ones(len(rows), int), np.arange(float(len(rows))), whole, measured, arriving, given)
+
+
+def _predict(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        k, z_k, u_k = row
+        prior, moments = outlook.step(state, u_k, k)
+        return outlook.filter.correct(prior, z_k, k)[0], moments
+
+    start = jax.tree.map(jnp.asarray, outlook.filter.init())
+    return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+
+
+_by_xla = quickly_compiled(_predict)
+
+
+@readable
+@dataclass(frozen=True)
+class Residuals:
+    """Standardised residuals (z - E z) / deviation of each output, white and normal of variance 1 where all is right.
+
+    p-values are NaN where too few values came.
+
+    Args:
+        names: of the outputs, m of them.
+        values: residuals (steps, m), NaN where nothing arrived.
+        predicted: what was predicted at each row.
+        autocorrelation: over the first lags (lags, m).
+        band: half-width of the interval of 95 % about zero for one of them (m,).
+        ljung_box: p-values (m,) that all are zero.
+        normality: p-values (m,) of skewness and kurtosis together, by Jarque and Bera.
+        variance: p-values (m,) that the variance of the last third is that of the first.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    predicted: Forecast = field(repr=False)
+    autocorrelation: Array
+    band: Array
+    ljung_box: Array
+    normality: Array
+    variance: Array
+
+    def doubts(self) -> list[str]:
+        """List what speaks against the model, a line each, with the number of tests in mind."""
+        tests = {"correlated over time": self.ljung_box, "not normal": self.normality,
+                 "of a variance that changes": self.variance}  # fmt: skip
+        made = sum(int(np.sum(np.isfinite(p))) for p in tests.values())
+        return [
+            f"residuals of {name} are {said} (p = {p[i]:.1g} of {made} tests)"
+            for i, name in enumerate(self.names)
+            for said, p in tests.items()
+            if p[i] < FALSE / made
+        ]
+
+
+def residuals(
+    filter: AbstractFilter,
+    z: Float[ArrayLike, "steps received"],
+    u: Float[ArrayLike, "steps inputs"] | None = None,
+    lags: int = 10,
+) -> Residuals:
+    """Standardise what a filter did not predict, and test it: correlation, normality, changing variance.
+
+    Args:
+        filter: a filter that claims a covariance.
+        z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
+        u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+        lags: number of autocorrelations; 10 by default.
+
+    Raises:
+        ValueError: data of another size than the filter's, a filter that claims nothing or uses no measurements.
+
+    Source: Ljung and Box (1978), of gaps Stoffer and Toloi (1992); Jarque and Bera (1980); Durbin and Koopman, Time
+        Series Analysis by State Space Methods, Section 2.12.
+    """
+    predicted, count = predict_rows(filter, z, u), check_count("lags", lags)
+    law = predicted.received
+    if law is None or law.claim == "none":
+        raise fail("residuals", "a filter that claims a covariance of what arrives", type(filter).__name__)
+    rows = data_of(filter, z, u)[0]
+    angles = (filter.angles_used() or FilterAngles((), ())).received
+    values = (nearest(np.asarray(rows), law.mean, angles) - law.mean) / law.deviation
+    columns = [values[:, i] for i in range(values.shape[1])]
+    correlations = np.stack([_autocorrelation(e, count) for e in columns], axis=1)
+    came = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)
+    white = np.array([_ljung_box(e, count) for e in columns])
+    normal, steady = (np.array([test(e) for e in columns]) for test in (_jarque_bera, _same_variance))
+    band = NORMAL / np.sqrt(came)
+    return Residuals(law.names, values, predicted, correlations, band, white, normal, steady)
+
+
+def _pairs(e: np.ndarray, lag: int) -> np.ndarray:
+    """Products of residuals this far apart, of which both came."""
+    products = e[lag:] * e[: len(e) - lag]
+    return np.asarray(products[~np.isnan(products)])
+
+
+def _autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
+    """r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came."""
+    e = e - np.nanmean(e) if np.any(~np.isnan(e)) else e
+    total = np.nansum(e**2)
+    return np.array([_pairs(e, lag).sum() / total if total > 0 else np.nan for lag in range(1, lags + 1)])
+
+
+def _ljung_box(e: np.ndarray, lags: int) -> float:
+    """P-value of n (n + 2) sum r_l^2 / n_l, n_l pairs of lag l, which is chi-squared."""
+    n = int(np.sum(~np.isnan(e)))
+    if n < LEAST:
+        return float("nan")
+    counts = np.array([max(len(_pairs(e, lag)), 1) for lag in range(1, lags + 1)])
+    return float(chi2.sf(n * (n + 2) * np.sum(_autocorrelation(e, lags) ** 2 / counts), lags))
+
+
+def _jarque_bera(e: np.ndarray) -> float:
+    """P-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis."""
+    came = e[~np.isnan(e)]
+    if len(came) < LEAST:
+        return float("nan")
+    t = (came - came.mean()) / came.std()
+    return float(chi2.sf(len(came) * (np.mean(t**3) ** 2 + (np.mean(t**4) - 3) ** 2 / 4) / 6, 2))
+
+
+def _same_variance(e: np.ndarray) -> float:
+    """P-value, of both sides, of the ratio of the sums of squares in the last and in the first third."""
+    came = e[~np.isnan(e)]
+    h = len(came) // 3
+    if h < LEAST // 2:
+        return float("nan")
+    ratio = float(np.sum(came[-h:] ** 2) / np.sum(came[:h] ** 2))
+    return float(2 * min(f.sf(ratio, h, h), f.cdf(ratio, h, h)))
