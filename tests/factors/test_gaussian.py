@@ -11,10 +11,10 @@ from scipy.stats import multivariate_normal
 from heliograph.factors.columns import Columns, columns_of, nothing, rounding_of, triangular
 from heliograph.factors.gaussian import (
     Gaussian,
-    Image,
     append_rows,
     backwards,
     given,
+    image_by_slopes,
     leading,
     merge,
     move,
@@ -55,8 +55,8 @@ def test_moving_adds_the_noise(n, m):
     x = given(mean, p)
     np.testing.assert_allclose(x.covariance, p, **EXACT)
     by_rows = move(x, f, b, columns_of(q))
-    by_sum = transform(x, Image(f @ x.mean + b, f @ x.root, nothing(n)), columns_of(q))
-    for moved in (by_rows, by_sum):
+    by_image = transform(image_by_slopes(f @ x.mean + b, f @ x.root, x), columns_of(q))
+    for moved in (by_rows, by_image):
         np.testing.assert_allclose(moved.mean, f @ mean + b, **EXACT)
         np.testing.assert_allclose(moved.covariance, f @ p @ f.T + q, rtol=1e-10, atol=1e-10)
 

@@ -23,6 +23,8 @@ from heliograph.factors.columns import (
     inverse,
     is_positive,
     join_columns,
+    nothing,
+    reciprocal,
     triangular,
     unit_lower,
     unit_of,
@@ -102,16 +104,32 @@ def move(x: Gaussian, matrix: Array, shift: Array, noise: Columns) -> Gaussian:
 class Image(NamedTuple):
     """f(x) of x = m + L xi, to second moments: mean + slopes xi + what is uncorrelated with xi.
 
-    Shapes: mean (p,), slopes (p, n), curvature (p, columns), the last a sum of squares.
+    `explained` is slopes diag(d) slopes'. Column j of its matrix is slopes_j times `unit`_j, what f moves by while xi_j
+    moves by that: points give that difference itself.
+
+    Shapes: mean (p,), explained (p, n), unit (n,), curvature (p, columns), the last a sum of squares.
     """
 
     mean: Float[jax.Array, " p"]
-    slopes: Float[jax.Array, "p n"]
+    explained: Columns
+    unit: Float[Array, " n"]
     curvature: Columns
 
-    def columns_from(self, x: Gaussian) -> Columns:
-        """Return the covariance of f(x)."""
-        return join_columns(Columns(self.slopes, x.variances), self.curvature)
+    @property
+    def slopes(self) -> jax.Array:
+        """Slopes in xi, 0 in what is known, (p, n)."""
+        return jnp.asarray(self.explained.matrix * reciprocal(jnp.asarray(self.unit)))
+
+    @property
+    def columns(self) -> Columns:
+        """Covariance of f(x)."""
+        return join_columns(self.explained, self.curvature)
+
+
+def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: Columns | None = None) -> Image:
+    """Image of an f of which the slopes in xi are computed, affine where it has no curvature."""
+    rest = nothing(len(mean)) if curvature is None else curvature
+    return Image(mean, Columns(slopes, x.variances), np.ones(len(x.mean)), rest)
 
 
 def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns) -> Gaussian:
@@ -129,9 +147,17 @@ def leading(x: Gaussian, n: int) -> Gaussian:
     return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
 
 
-def transform(x: Gaussian, image: Image, noise: Columns) -> Gaussian:
-    """Return the law of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w."""
-    return of_sum(image.mean, Columns(image.slopes, x.variances), image.curvature, noise)
+def sum_unexplained(image: Image, noise: Columns) -> Columns:
+    """Return n columns of what f(x) + w has beside its slopes: curvature + Cov w, `noise` as `triangular` makes it."""
+    return of_sum(image.mean, image.curvature, noise).columns if len(image.curvature.weights) else noise
+
+
+def transform(image: Image, noise: Columns) -> Gaussian:
+    """Return the law of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
+
+    Slopes by orthogonal rows, as `move` does: a prior may tie what a precise measurement has to tell apart.
+    """
+    return of_columns(image.mean, join_columns(image.explained, sum_unexplained(image, noise)))
 
 
 class Innovations(NamedTuple):

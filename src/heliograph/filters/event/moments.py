@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns
+from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns, sum_unexplained
 from heliograph.filters.event.parts import GaussianSum
 from heliograph.filters.gaussian.belief import image_of, process_noise
 from heliograph.filters.gaussian.signal import gain_noise, signal_of
@@ -52,7 +52,7 @@ def predict_jointly(
     n = len(start)
     rest = len(both.mean) - n
     image = image_of(plant, transform, leading(both, n), u)
-    noise = join_columns(image.curvature, process_noise(plant, u, start))
+    noise = sum_unexplained(image, process_noise(plant, u, start))
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, rest))), both.root[n:]])
     fresh = Columns(jnp.pad(noise.matrix, ((0, rest), (0, 0))), noise.weights)
     mean = jnp.concatenate([image.mean + plant.noise_mean(), both.mean[n:]])

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.columns import Columns, columns_of, join_columns, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, Image, given, move, of_sum
+from heliograph.factors.gaussian import Gaussian, Image, given, move, sum_unexplained
 from heliograph.factors.gaussian import transform as transformed
 from heliograph.filters.base import (
     AbstractSizedFilter,
@@ -110,7 +110,7 @@ def predict_gaussian(
     if isinstance(plant, LinearPlant):
         return move(x, plant.transition_matrix(u), plant.shift(u), noise)
     image = transform.image(plant.moves(u, x.mean), x)
-    return transformed(x, image._replace(mean=image.mean + plant.noise_mean()), noise)
+    return transformed(image._replace(mean=image.mean + plant.noise_mean()), noise)
 
 
 class PredictsByTransform(Protocol):
@@ -134,10 +134,8 @@ def smoother_step_by_transform(
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     before, prior, after = step[:3] if whole is None else map(whole, step[:3])
     image = image_of(plant, filter.transform, before, u)
-    noise = process_noise(plant, u, start_of(filter.plant, start))
-    if len(image.curvature.weights):  # summed as the prediction by a transform is
-        noise = of_sum(image.mean, noise, image.curvature).columns
-    return smoother_step_of(before, prior, after, (image.slopes, noise), filter.claim, plant.angles)
+    rest = sum_unexplained(image, process_noise(plant, u, start_of(filter.plant, start)))
+    return smoother_step_of(before, prior, after, (image.slopes, rest), filter.claim, plant.angles)
 
 
 def prior_of(

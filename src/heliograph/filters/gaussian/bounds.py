@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal, triangular
-from heliograph.factors.gaussian import Gaussian, observe, of_sum
+from heliograph.factors.gaussian import Gaussian, observe, of_columns
 from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
 from heliograph.filters.gaussian.signal import Received, Signal, factor_spread, homogeneous
 from heliograph.numerics.check import array, fail, instance
@@ -107,7 +107,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
     parts = base + absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
     beta = smallest_scalars(zero_mean_sweep, scalar, parts)[0]
     after = observe(prior, slopes, z.innovation, factor_spread(base + shift / beta - of_state), present)[0]
-    wider = of_sum(after.mean, after.columns, Columns(explained, beta * share))
+    wider = of_columns(after.mean, join_columns(after.columns, Columns(explained, beta * share)))
     return keep_unless(jnp.any(present), wider, after)
 
 

@@ -83,7 +83,7 @@ def signal_of(
     else:
         image = transform.image(continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles), prior)
     mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
-    second = join_columns(Columns(image.slopes, prior.variances), noise).covariance + jnp.outer(mean, mean)
+    second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
     size = size_of(sensor, start) if isinstance(sensor, LinearSensor) else jnp.diagonal(second)
     return Signal(prior, mean, image.slopes, noise, second, size)
 

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, eliminate, nothing, reciprocal, square_root
-from heliograph.factors.gaussian import Gaussian, Image, given
+from heliograph.factors.columns import Columns, decorrelate, eliminate, reciprocal, square_root
+from heliograph.factors.gaussian import Gaussian, Image, given, image_by_slopes
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array
@@ -43,7 +43,7 @@ class AbstractTransform(Module):
         x = given(mean, covariance)
         image = self.image(function, x)
         cross = (x.root * x.variances) @ image.slopes.T
-        return Transformed(image.mean, image.columns_from(x).covariance, cross)
+        return Transformed(image.mean, image.columns.covariance, cross)
 
     def image(self, function: Function, x: Gaussian) -> Image:
         """The same as slopes in xi of x = m + L xi and the rest, uncorrelated with it; by default from `apply`."""
@@ -54,7 +54,7 @@ def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
     """Slopes (D^-1 L^-1 Cov(x, f))' and as curvature what Cov f has more than slopes D slopes'."""
     slopes = decorrelate(x.root, moments.cross).T * reciprocal(x.variances)
     rest = moments.covariance - (slopes * x.variances) @ slopes.T
-    return Image(moments.mean, slopes, eliminate(rest))
+    return image_by_slopes(moments.mean, slopes, x, eliminate(rest))
 
 
 class Cubature(AbstractTransform):
@@ -72,10 +72,11 @@ class Cubature(AbstractTransform):
         n = len(x.mean)
         steps = square_root(n * x.variances)
         ahead, behind = evaluate_at_points(function, x, steps)
-        even = (ahead + behind) / 2
-        mean = jnp.sum(even, axis=1) * (1 / n)
-        slopes = (ahead - behind) / 2 * reciprocal(steps)
-        return Image(mean, slopes, Columns(even - mean[:, None], jnp.full(n, 1 / n)))
+        even = ahead + behind
+        middle = jnp.sum(even, axis=1) * (1 / n)
+        weights = np.full(n, 1 / (4 * n))  # of what is twice as large
+        curvature = Columns(even - middle[:, None], weights)
+        return Image(middle / 2, Columns(ahead - behind, weights), 2 * steps, curvature)
 
 
 def evaluate_at_points(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -93,12 +94,12 @@ class Linearization(AbstractTransform):
     def image(self, function: Function, x: Gaussian) -> Image:
         """Evaluate f and its Jacobian at the mean."""
         mean = function(x.mean)
-        return Image(mean, jax.jacfwd(function)(x.mean) @ x.root, nothing(len(mean)))
+        return image_by_slopes(mean, jax.jacfwd(function)(x.mean) @ x.root, x)
 
 
 def linear_image(matrix: Array, mean: jax.Array, x: Gaussian) -> Image:
     """Image of a linear function with this matrix and this value at the mean, which every transform reproduces."""
-    return Image(mean, jnp.asarray(matrix @ x.root), nothing(len(mean)))
+    return image_by_slopes(mean, jnp.asarray(matrix @ x.root), x)
 
 
 class PolynomialMoments(AbstractTransform):
@@ -133,7 +134,8 @@ class PolynomialMoments(AbstractTransform):
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
         rest = values - center[:, None] - slopes @ points.T
-        return Image(center, slopes * reciprocal(deviations), eliminate(Columns(rest, weights).covariance))
+        explained = Columns(slopes, np.ones(len(deviations)))
+        return Image(center, explained, deviations, eliminate(Columns(rest, weights).covariance))
 
 
 def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:
@@ -151,7 +153,7 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
     mixed = both - ahead[:, rows] - ahead[:, columns] + start
     weights = np.concatenate([np.full(n, 2.0), np.ones(len(rows))])
     curvature = Columns(jnp.concatenate([squares, mixed], axis=1), weights)
-    return Image(start[:, 0] + jnp.sum(squares, axis=1), slopes * reciprocal(deviations), curvature)
+    return Image(start[:, 0] + jnp.sum(squares, axis=1), Columns(slopes, np.ones(n)), deviations, curvature)
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, reciprocal, square_root
+from heliograph.factors.columns import Columns, square_root
 from heliograph.factors.gaussian import Gaussian, Image
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
 from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_at_points
@@ -76,12 +76,13 @@ class Unscented(AbstractTransform):
         scale = alpha**2 * (n + kappa)
         steps, here = square_root(scale * x.variances), function(x.mean)
         ahead, behind = (values - here[:, None] for values in evaluate_at_points(function, x, steps))
-        even = (ahead + behind) / 2
+        even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
-        shift = middle * (n / scale)
-        weights = jnp.append(jnp.full(n, 1.0) / scale, alpha**2 * kappa / n + beta)
-        curvature = Columns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), weights)
-        return Image(here + shift, (ahead - behind) / 2 * reciprocal(steps), curvature)
+        shift = middle * (n / (2 * scale))
+        weights = jnp.full(n, 1 / (4 * scale))  # of what is twice as large
+        of_shift = jnp.append(weights, alpha**2 * kappa / n + beta)
+        curvature = Columns(jnp.concatenate([even - middle[:, None], shift[:, None]], axis=1), of_shift)
+        return Image(here + shift, Columns(ahead - behind, weights), 2 * steps, curvature)
 
 
 def unscented_filter(
