@@ -46,8 +46,7 @@ def in_fractions(plant, sensor, z):
 def test_a_wide_prior_and_a_precise_sensor_keep_their_digits(wide, precise, moved):
     """Every smoothed variance within 2 % of the exact one; the worst, .8 %, where they are 1e28 apart.
 
-    A state that moves without noise is known to its rounding, 4 eps of its prior: there that is a tenth of what the
-    sensor leaves, and is not asked for.
+    A state that moves without noise is known to its rounding, which the next test is of.
     """
     plant = hg.LinearPlant(A, moved * np.eye(2), [0, 0], wide * np.eye(2))
     sensor, z = hg.LinearSensor(H, [[precise]]), np.zeros((TIME, 1))
@@ -61,6 +60,18 @@ def test_a_wide_prior_and_a_precise_sensor_keep_their_digits(wide, precise, move
     for smoothing, moments in expected.items():
         found = np.diagonal(smoothing.estimates(steps).covariance, axis1=1, axis2=2)
         np.testing.assert_allclose(found, [np.diagonal(covariance) for _, covariance in moments], rtol=0.02)
+
+
+def test_what_moves_without_noise_is_known_to_the_rounding_of_its_prior():
+    """Position and velocity 1e28 apart: 4 eps of 1e7 at each step, some .8 % of what the sensor leaves.
+
+    They add up to 18 % of a smoothed variance, and none is below the exact one.
+    """
+    plant, sensor, z = hg.LinearPlant(A, 0.0, [0, 0], 1e14), hg.LinearSensor(H, 1e-14), np.zeros((TIME, 1))
+    exact, result = in_fractions(plant, sensor, z), hg.rts_smoother(hg.kalman_filter(plant, sensor), z)
+    found = np.diagonal(result.covariances, axis1=1, axis2=2)
+    ratio = found / [np.diagonal(exact(k, TIME - 1)[1]) for k in range(TIME)]
+    assert np.all(ratio > 1 - 1e-3) and np.all(ratio < 1.2)
 
 
 @pytest.mark.parametrize("seed", [0, 5, 6])

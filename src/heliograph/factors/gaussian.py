@@ -232,7 +232,15 @@ def _measure_scalar(
     since L is lower.
     """
     product = d * f
-    s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(f * product, (0,))], 0)), (0,))
+    return _measure_product(root, d, f, (product, f * product), noise)
+
+
+def _measure_product(
+    root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Measure f' xi + v as `_measure_scalar`, given diag(d) f and f_j^2 d_j: both are zero of what says nothing."""
+    product, power = products
+    s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], 0)), (0,))
     after, kept, w = _revise_columns(root, d, product, f, s)
     return after, kept, w * inverse(s[0]), s[0]
 
@@ -328,18 +336,24 @@ def backwards(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) 
 
     Shapes: slopes (n, n); noise N (n, n), unit lower, as `triangular` makes it, and r (n,).
     """
-    n, zero = len(x.mean), jnp.zeros((), x.variances.dtype)
-    top = jnp.concatenate([x.root, jnp.zeros((n, n), x.variances.dtype)], axis=1)
-    next_, d = jnp.concatenate([slopes, noise.matrix], axis=1), jnp.concatenate([x.variances, noise.weights])
-    rounding = (UNITS * n**3 * unit_of(slopes)) ** 2 * (next_**2 @ d)
+    n, root = len(x.mean), jnp.concatenate([x.root, slopes])
+    whole = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
+    rounding = (UNITS * n**3 * unit_of(slopes)) ** 2 * whole
+    beside, weights = jnp.concatenate([jnp.zeros((n, n), slopes.dtype), noise.matrix]), jnp.asarray(noise.weights)
 
     def measure_part(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        f = root[n + i]
-        is_informative = f[:n] @ (d[:n] * f[:n]) > rounding[i]
-        return _measure_scalar(root, d, jnp.concatenate([jnp.where(is_informative, f[:n], 0.0), f[n:]]), zero)[:3]
+        # Of omega, part i has its own component left, and determines it: those before it are determined.
+        f, own, r = root[n + i], beside[:, i], weights[i]
+        product = d * f
+        power = f * product
+        says = jnp.sum(power) > rounding[i]
+        products = jnp.append(jnp.where(says, product, 0.0), r), jnp.append(jnp.where(says, power, 0.0), r)
+        rows = jnp.concatenate([root, own[:, None]], axis=1)
+        rows, d, gain, _ = _measure_product(rows, jnp.append(d, r), jnp.append(f, 1.0), products, jnp.zeros_like(r))
+        return rows[:, :n], d[:n], gain
 
-    root, d, gains = _measure_parts(measure_part, n, jnp.concatenate([top, next_]), d)
-    left = Gaussian(x.mean, below_diagonal(root[:n, :n]), d[:n])
+    root, d, gains = _measure_parts(measure_part, n, root, x.variances)
+    left = Gaussian(x.mean, below_diagonal(root[:n]), d)
     return Backwards(left, gains[:n], ahead, below_diagonal(gains[n:]))
 
 
