@@ -107,15 +107,24 @@ def _written(w: Writer) -> None:
         w.let(f"{x.name}.at[{places}].{method}({entry}, {draw.choice(WRITES)})", x.kind, x.shape, True)
 
 
+def _moderate(x: Variable) -> str:
+    """A factor of a product. Where sums overflow on their way, their order decides between an infinity and NaN."""
+    return (
+        f"jnp.where(jnp.isfinite({x.name}), jnp.clip({x.name}, -1e60, 1e60), {x.name})"
+        if x.kind == "float64"
+        else x.name
+    )
+
+
 def _products(w: Writer) -> None:
     x = w.find(lambda v: v.shape != () and v.size > 0)
     y = None if x is None else w.find(lambda v: v.kind == x.kind and v.shape[:1] == x.shape[-1:])
     if x is None:
         return
     if len(x.shape) == 2 and w.random.random() < 0.3:
-        w.let(f"{x.name} @ {x.name}.T", x.kind, (x.shape[0], x.shape[0]), True)
+        w.let(f"{_moderate(x)} @ {_moderate(x)}.T", x.kind, (x.shape[0], x.shape[0]), True)
     elif y is not None and x.kind != "bool":
-        w.let(f"{x.name} @ {y.name}", x.kind, (*x.shape[:-1], *y.shape[1:]), True)
+        w.let(f"{_moderate(x)} @ {_moderate(y)}", x.kind, (*x.shape[:-1], *y.shape[1:]), True)
     elif len(x.shape) == 1 and x.size < 6 and x.kind != "bool":
         w.let(f"jnp.outer({x.name}, {x.name})", x.kind, (x.size, x.size), True)
 
