@@ -18,12 +18,11 @@ def check(network: str, /) -> int:
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_network
-    from heliograph.simulation.description.diagram import text_of
     from heliograph.simulation.description.doubts import doubts_before_data
 
     # The diagram, then a line for each doubt.
     loaded = load_network(network)
-    print("\n".join(map(visible, text_of(loaded).splitlines())))
+    print("\n".join(map(visible, loaded.diagram().splitlines())))
     lines = doubts_before_data(loaded)
     print()
     for line in lines:

@@ -214,4 +214,4 @@ def _mask_rounded_away(estimates: Estimate) -> jax.Array:
     mean = jnp.asarray(estimates.mean)
     variance = jnp.diagonal(jnp.asarray(estimates.covariance))
     unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)
-    return (variance > 0) & (jnp.sqrt(jnp.maximum(variance, 0.0)) < unit)
+    return jnp.asarray((variance > 0) & (jnp.sqrt(jnp.maximum(variance, 0.0)) < unit))

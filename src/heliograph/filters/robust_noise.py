@@ -82,7 +82,12 @@ class ReceivedNoise(Module):
         signal = (self.output @ sensed)[:, None]
         least = power * self.variance + self.late_variance
         variance = least + (power - gain**2) * mean * (mean + 2 * signal)
-        return Law(jnp.asarray(self.log_share), jnp.asarray(gain * mean + self.late_mean), variance, jnp.asarray(least))
+        return Law(
+            jnp.asarray(self.log_share),
+            jnp.asarray(gain * mean + self.late_mean),
+            jnp.asarray(variance),
+            jnp.asarray(least),
+        )
 
 
 class SplitChannel(NamedTuple):

@@ -16,7 +16,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.results.whiteness import MemoryTest, innovations_of, memory_of
+from heliograph.simulation.results.whiteness import MemoryTest, innovations_of
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 
@@ -137,7 +137,7 @@ def _score_expected(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: i
     likelihood, white = (np.asarray(values)[cut:] for values in innovations_of(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
-    return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)
+    return Expected(likelihood, white, MemoryTest.of(white, lags, claimed=True) if enough else None)
 
 
 def compare_laws(a: Predictive, b: Predictive) -> Comparison:

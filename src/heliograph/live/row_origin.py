@@ -1,5 +1,7 @@
 """Forecasts of live plants start from a row: its filters' states, the inputs held there, and its estimates."""
 
+from operator import attrgetter
+
 import numpy as np
 
 from heliograph.live.fleet import Fleet
@@ -28,8 +30,8 @@ def row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
 def estimates_by_name(lanes: Lanes, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
     """Arrange the outputs of a row, or of rows, by node and filter."""
     estimates = lanes.step_rows.outputs.tree(outputs)
-    mean = split_by_name(lanes.network, estimates, lambda estimate: np.asarray(estimate.mean), -3)
-    covariance = split_by_name(lanes.network, estimates, lambda estimate: np.asarray(estimate.covariance), -4)
+    mean = split_by_name(lanes.network, estimates, attrgetter("mean"), -3)
+    covariance = split_by_name(lanes.network, estimates, attrgetter("covariance"), -4)
     return {
         node: {
             name: lower_unsound_claim(Estimate(mean[node][name], covariance[node][name], claim))

@@ -34,7 +34,7 @@ class Estimate(Module):
     claim: Claim = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        weakest([self.claim])
+        check_claim(self.claim)
 
     @property
     def claims(self) -> np.ndarray:
@@ -78,6 +78,12 @@ class Innovation(Module):
     weight: "Float[Array, '... m'] | None" = None
 
 
+def check_claim(claim: object) -> None:
+    """Raise ValueError where there is no such claim."""
+    if not isinstance(claim, str) or claim not in STRENGTH:
+        raise fail("claim", f"one of {', '.join(STRENGTH)}", show_value(claim))
+
+
 def weakest(claims: list[Claim]) -> Claim:
     """The strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them.
 
@@ -90,8 +96,7 @@ def weakest(claims: list[Claim]) -> Claim:
     if not items("claims", claims, "claims"):
         raise fail("claims", "at least one", "none")
     for claim in claims:
-        if not isinstance(claim, str) or claim not in STRENGTH:
-            raise fail("claim", f"one of {', '.join(STRENGTH)}", show_value(claim))
+        check_claim(claim)
     return min(claims, key=STRENGTH.__getitem__)
 
 

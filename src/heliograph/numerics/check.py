@@ -111,7 +111,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     )
     if not matches:
         raise fail(name, _shape_words(shape, numbers.ndim), f"shape {numbers.shape}")
-    if is_traced(numbers):
+    if not isinstance(numbers, np.ndarray):  # traced
         return numbers
     wrong = np.isinf(numbers) if missing else ~np.isfinite(numbers)
     if np.any(wrong):
@@ -131,11 +131,12 @@ def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
 
 
 def _numbers(name: str, value: ArrayLike) -> Any:
+    traced = is_traced(value)
     try:
-        numbers = jnp.asarray(value) if is_traced(value) else np.asarray(fill_masked(value))
+        numbers = jnp.asarray(value) if traced else np.asarray(fill_masked(value))
         if numbers.dtype.kind in "USmM":  # text and dates are no numbers, though they may read as such
             raise ValueError
-        known = None if is_traced(value) else numbers.astype(np.float64 if numbers.dtype.kind != "c" else complex)
+        known = None if traced else numbers.astype(np.float64 if numbers.dtype.kind != "c" else complex)
     except (TypeError, ValueError, OverflowError):
         raise fail(name, "an array of numbers", show_value(value)) from None
     if np.issubdtype(numbers.dtype, np.complexfloating):

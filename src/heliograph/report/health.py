@@ -19,7 +19,7 @@ from heliograph.simulation.claims import beliefs
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
+from heliograph.simulation.results.whiteness import MemoryTest, whitened_innovations
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 FALSE = 0.01  # probability of a false warning by one kind of test, of all filters together
@@ -240,7 +240,7 @@ def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     lags = min(LAGS, len(came) // 10)
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):
         return None
-    return memory_of(came, lags, claimed=True)
+    return MemoryTest.of(came, lags, claimed=True)
 
 
 def _state_shares(receiver: Node | ReceivingNode) -> Float[np.ndarray, " received"] | None:

@@ -35,7 +35,7 @@ from heliograph.simulation.claims import (
     nominal_fused,
     nominal_nodes,
 )
-from heliograph.simulation.description.diagram import short_text_of, table_of
+from heliograph.simulation.description.diagram import short_text_of, table_of, text_of
 from heliograph.simulation.index import Kind, Place, group_by_structure, places_of
 from heliograph.simulation.node import FUSED as FUSED
 from heliograph.simulation.node import (
@@ -311,6 +311,10 @@ class Network(Module):
             }
         every = find_received_angles(self.plant, self.common.sensor, self.common.channel)
         return {name: tuple(i - row.start for i in every if i in row) for name, row in self.rows.items()}
+
+    def diagram(self) -> str:
+        """Return all of the network as lines of text, of which `repr` shows the first."""
+        return text_of(self)
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""

@@ -157,11 +157,13 @@ def _drop_beyond_limits(
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
     """Say of which outputs filters that weigh left out most, a line each."""
-    names = {node: list(network.nodes[node].received_names) for node in record.measurements}
-    names[FUSED] = [f"{node}: {name}" for node in record.measurements for name in names[node]]
     for node, filters in record.weighed.items():
+        if node == FUSED:
+            names = [f"{one}: {name}" for one in record.measurements for name in network.nodes[one].received_names]
+        else:
+            names = list(network.nodes[node].received_names)
         for filter in filters:
-            for name, summary in zip(names[node], record.outputs(node, filter), strict=True):
+            for name, summary in zip(names, record.outputs(node, filter), strict=True):
                 yield from summary.describe_left_out(f"{node}/{filter}", name)
 
 

@@ -1,6 +1,7 @@
 """Results by names of nodes and filters, from the axes of groups and kinds in which a network is computed."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def collect_weighed(network: Network, batch: PyTree) -> dict[str, dict[str, Weig
 
 
 def split_by_name(
-    network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
+    network: Network, batch: PyTree, read: Callable[[PyTree], Any], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:
     """Results of `read` by node and filter: each kind's part split at its axes (filter, node), the first at `axis`.
 
@@ -85,12 +86,12 @@ def split_by_name(
     parts = batch["estimates"]
     kinds = (network.kinds + network.mesh_kinds)[: len(parts)]  # judgements are of filters alone
     for (group, filters), estimate in zip(kinds, parts, strict=True):
-        values = np.moveaxis(read(estimate), (axis, axis + 1), (0, 1))
+        values = np.moveaxis(np.asarray(read(estimate)), (axis, axis + 1), (0, 1))
         for name, rows in zip(filters, values, strict=True):
             for node, row in zip(network.groups[group], rows, strict=True):
                 by_node[node][name] = row
     if network.fused:
-        by_node[FUSED] = {name: read(estimate) for name, estimate in batch["fused"].items()}
+        by_node[FUSED] = {name: np.asarray(read(estimate)) for name, estimate in batch["fused"].items()}
     return by_node
 
 

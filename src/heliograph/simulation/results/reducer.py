@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Generic, NamedTuple
 
 import jax
@@ -121,8 +122,8 @@ class Trajectories(AbstractReducer[Record]):
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
     """Record from the scan's output; nodes in the network's order."""
     measurements = measurements_of(network, batch["measurements"])
-    mean = split_by_name(network, batch, lambda e: np.asarray(e.mean), -3)
-    covariance = split_by_name(network, batch, lambda e: np.asarray(e.covariance), -4)
+    mean = split_by_name(network, batch, attrgetter("mean"), -3)
+    covariance = split_by_name(network, batch, attrgetter("covariance"), -4)
     estimates = {
         node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
         for node, claims in network.claims().items()

@@ -48,6 +48,35 @@ class MemoryTest:
         """True if innovations one step apart are correlated, at 1 %."""
         return self.p_value < 0.01
 
+    @staticmethod
+    def of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> "MemoryTest":
+        """Test whitened innovations; their power only where they are in units of a filter's claim (`claimed`).
+
+        Raises:
+            ValueError: too few steps for the lags, nothing but zeros, innovations beyond all numbers.
+        """
+        if len(white) < 10 * lags:
+            raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
+        if not np.any(np.nan_to_num(white)):
+            raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
+        if np.isinf(white).any():
+            raise fail("data", "innovations that are finite numbers of their deviations", "infinite ones")
+        # Correlations and their standard errors by lag: the same in any unit, so in one whose squares are numbers.
+        unit = 2.0 ** (int(np.frexp(np.nanmax(np.abs(white)))[1]) - 1)
+        white = white / unit
+        size, size_error = average_correlated(_average_components(white**2))
+        parts = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
+        correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
+        # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
+        p_value = (
+            float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0]))
+            if error[0] > 0
+            else float(correlation[0] == 0)
+        )
+        share = float(correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0])
+        power = (size * unit * unit, size_error * unit * unit) if claimed else (np.nan, np.nan)
+        return MemoryTest(correlation, error, p_value, share, *power)
+
 
 def memory_test(
     data: Float[ArrayLike, "steps received"],
@@ -74,34 +103,7 @@ def memory_test(
     """
     check_count("lags", lags)
     white = _standardise(data) if filter is None else whitened_innovations(data, filter, inputs)
-    return memory_of(white, lags, claimed=filter is not None)
-
-
-def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> MemoryTest:
-    """Test whitened innovations; their power only where they are in units of a filter's claim (`claimed`).
-
-    Raises:
-        ValueError: too few steps for the lags, nothing but zeros, innovations beyond all numbers.
-    """
-    if len(white) < 10 * lags:
-        raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
-    if not np.any(np.nan_to_num(white)):
-        raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
-    if np.isinf(white).any():
-        raise fail("data", "innovations that are finite numbers of their deviations", "infinite ones")
-    # Correlations and their standard errors by lag: the same in any unit, so in one whose squares are numbers.
-    unit = 2.0 ** (int(np.frexp(np.nanmax(np.abs(white)))[1]) - 1)
-    white = white / unit
-    size, size_error = average_correlated(_average_components(white**2))
-    parts = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
-    correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
-    # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
-    p_value = (
-        float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
-    )
-    share = float(correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0])
-    power = (size * unit * unit, size_error * unit * unit) if claimed else (np.nan, np.nan)
-    return MemoryTest(correlation, error, p_value, share, *power)
+    return MemoryTest.of(white, lags, claimed=filter is not None)
 
 
 def _standardise(data: ArrayLike) -> Float[np.ndarray, "steps m"]:

@@ -1,6 +1,7 @@
 """Which column of a network's outputs holds what: each filter's estimate, and its judgement of what it received."""
 
 from functools import partial
+from operator import attrgetter
 from typing import NamedTuple
 
 import jax
@@ -65,8 +66,8 @@ class FilterColumns(NamedTuple):
 def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
     """Locate each filter's estimate, by reading a row that holds its own column numbers as a row of estimates."""
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
-    mean = split_by_name(network, numbered, lambda estimate: np.asarray(estimate.mean), -3)
-    covariance = split_by_name(network, numbered, lambda estimate: np.asarray(estimate.covariance), -4)
+    mean = split_by_name(network, numbered, attrgetter("mean"), -3)
+    covariance = split_by_name(network, numbered, attrgetter("covariance"), -4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
     tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
