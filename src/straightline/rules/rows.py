@@ -12,9 +12,9 @@ from jax.extend.core import JaxprEqn
 
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
 from straightline.memory import LARGE, LONG, InMemory
-from straightline.nodes import Node, Unsupported
+from straightline.nodes import Node
 from straightline.rules.elementwise import ELEMENTWISE
-from straightline.rules.loops import in_memory, repeated
+from straightline.rules.loops import Turn, in_memory, repeated
 
 OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
@@ -85,7 +85,10 @@ def like_row(equation: JaxprEqn, **params: Any) -> Any:
 
 
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Loop over the first batch axis, else the first free axis of the left argument, else that of the right one."""
+    """Loop over the first batch axis, else the first free axis of the left argument, else that of the right one.
+
+    A sum over all axes is accumulated over the first of them.
+    """
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     to_number = not result_shape(equation) and all(x.size <= LARGE for x in inputs)
     if to_number or not is_long(inputs) or _has_few_terms(lowering, equation, inputs):
@@ -97,8 +100,9 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     in_left, in_right = (left_batch[0], right_batch[0]) if left_batch else (free_left, None)
     if in_left is None:
         in_right = free_right
-    if in_left is None and in_right is None:
-        raise Unsupported("a sum of products over a long array")
+    summed = in_left is None and in_right is None
+    if summed:
+        (in_left, *left), (in_right, *right) = left, right
     # Dimension numbers of one row: without the axis that is looped over.
     numbers = tuple(
         tuple(
@@ -115,7 +119,18 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         return as_nodes(lowering, ([], list(lowering.equation(row_equation, rows))))
 
     count = (b if in_left is None else a).shape[0]
-    return list(repeated(lowering, count, [], turn)[1])
+    return _accumulated(lowering, equation, count, turn) if summed else list(repeated(lowering, count, [], turn)[1])
+
+
+def _accumulated(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
+    """Sum a number that each turn of a loop gives."""
+    pair: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
+
+    def add(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        return [np.asarray(RULES["reduce_sum"](lowering, pair, [np.stack([carry[0], *turn(row, [])[1]])])[0])], []
+
+    start = RULES["reduce_sum"](lowering, pair, [np.empty(0, dtype=object)])[0]
+    return list(repeated(lowering, count, [start], add)[0])
 
 
 def _has_few_terms(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> bool:

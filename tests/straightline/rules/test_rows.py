@@ -37,3 +37,18 @@ def test_a_table_with_numbers_that_are_written_out_is_written_out_too():
         return jax.numpy.where(np.triu(np.ones((9, 9), bool)), square + x[0], (square + x[0]).T)
 
     assert explain(mirrored, np.zeros(9)) == "99 operations"
+
+
+def test_a_sum_over_all_entries_of_long_arrays_is_accumulated():
+    """Arrays that are not loaded whole, (65, 65): to rounding of 4,225 terms of size 1, whose sum is some 65."""
+    table = np.random.default_rng(1).normal(size=(65, 65))
+
+    def total(x):
+        square = x[:, None] * x[None]
+        return jax.numpy.einsum("ab,ab->", table, square), jax.numpy.vdot(square, square)
+
+    data = np.random.default_rng(2).normal(size=(3, 65))
+    with jax.enable_x64(True):
+        computed = over_runs(total, data)
+        expected = [[x @ table @ x for x in data], [(x @ x) ** 2 for x in data]]
+    np.testing.assert_allclose(computed, expected, rtol=1e-12)
