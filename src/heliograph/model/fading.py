@@ -26,6 +26,7 @@ from heliograph.random_affine.modes import (
     mix_maps,
 )
 from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, components
+from heliograph.random_affine.superposed import terms_without_common_memory
 
 
 def gilbert_elliott(
@@ -215,8 +216,8 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    steps = [joint_modes(step) for step in unstack(channel)]
-    return not harmless(steps, not isinstance(channel, OverTime))
+    terms = zip(*(terms_without_common_memory(step) for step in unstack(channel)), strict=True)
+    return any(not harmless([joint_modes(step) for step in term], not isinstance(channel, OverTime)) for term in terms)
 
 
 def uncertain_chain(channel: Channel) -> bool:

@@ -12,7 +12,7 @@ from heliograph.numerics.caching import cache_arrays, cache_by_object
 from heliograph.numerics.check import check_count, fail, instance, items, show_value
 from heliograph.numerics.traced import library, scatter
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, memories
 from heliograph.random_affine.combine import (
     AbstractCombination,
     Corners,
@@ -34,7 +34,7 @@ from heliograph.random_affine.moments.monomials import (
     sum_plan,
     times_one,
 )
-from heliograph.random_affine.noise import AbstractNoise, Matrix, in_groups, noise_vector
+from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise, in_groups, noise_vector
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y
 
@@ -257,3 +257,30 @@ def sensed_by_link(matrix: Matrix, noise: AbstractNoise, channel: AbstractRandom
     ]
     everything = tuple(range(np.shape(matrix)[1]))
     return Series([Superposed(links, first.noise, [everything] * len(links), len(everything)), *rest])
+
+
+def terms_without_common_memory(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+    """Return maps that share no memory, independent of each other, whose sum is the channel; one if it is no sum.
+
+    The maps of a sum that share one stay together, and so do those without; the first has the noise.
+    """
+    if not isinstance(channel, Superposed):
+        return [channel]
+    groups: list[tuple[set[str], list[int]]] = []  # memories, and the maps that have them
+    for i, affine in enumerate(channel.maps):
+        held, members = set(memories(affine)), [i]
+        joined = [group for group in groups if group[0] & held or not (group[0] or held)]
+        for group in joined:
+            groups.remove(group)
+            held, members = held | group[0], group[1] + members
+        groups.append((held, members))
+    none = as_noise("noise of a term", 0.0, channel.outputs)
+    return [
+        Superposed(
+            [channel.maps[i] for i in members],
+            channel.noise if first == 0 else none,
+            [channel.places[i] for i in members],
+            channel.inputs,
+        )
+        for first, (_, members) in enumerate(groups)
+    ]

@@ -16,6 +16,7 @@ from heliograph.filters.gaussian.sequential import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.linear.polynomial import Centre, PolynomialFilter
 from heliograph.filters.linear.scheduled import LinearSystemFilter
+from heliograph.filters.modes.additive import AdditiveModalFilter
 from heliograph.filters.modes.mixture import Components, MixtureFilter
 from heliograph.filters.modes.modal import ModalFilter, ObservationModel
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
@@ -90,6 +91,11 @@ def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
         case ModalFilter() | UncertainModalFilter():
             plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
             return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
+        case AdditiveModalFilter():
+            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            return replace(
+                filter, plant=plant, sensor=sensor, terms=tuple(_rescale_by_mode(t, units) for t in filter.terms)
+            )
         case SideInformationFilter(flagged=False) | MultipleModelFilter():
             plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
             return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))

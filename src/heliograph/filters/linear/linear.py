@@ -14,6 +14,7 @@ from heliograph.filters.gaussian.signal import Signal, size_of
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, move_of, predict_belief, prior_belief
 from heliograph.filters.linear.plan import plan
+from heliograph.filters.modes.additive import additive_modal_filter, independent_terms
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
 from heliograph.filters.modes.uncertain import uncertain_modal_filter
@@ -168,6 +169,9 @@ def linear_filter(
             return side_information_filter(plant, sensor, channel)
         if uncertain_chain(channel):
             return uncertain_modal_filter(plant, sensor, channel)
+        terms = independent_terms(channel)
+        if len(terms) > 1:
+            return additive_modal_filter(plant, sensor, terms)
         return modal_filter(plant, sensor, channel)
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update

@@ -9,6 +9,7 @@ The covariance of zeta is carried by factors; the moments before any data, which
 matrices.
 """
 
+from abc import abstractmethod
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -109,16 +110,14 @@ class Output(NamedTuple):
 
 
 class AbstractModalFilter(AbstractSizedFilter):
-    """Linear filter of the state jointly with the modes of links with memory: its state estimates zeta."""
+    """Linear filter of x~ times functions of the modes of links with memory: its state estimates these products."""
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: ObservationModel | OverTime
-    initial: Float[Array, " M"]
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
-        """Return x = sum_j zeta^j, and the covariance of its error."""
+        """Return x, a projection of zeta, and the covariance of its error."""
         projection, x = self._projection(), state.gaussian
         return Estimate(projection @ x.mean, Columns(projection @ x.root, x.variances).covariance, self.claim)
 
@@ -127,15 +126,27 @@ class AbstractModalFilter(AbstractSizedFilter):
         return plan(self, inputs, self._projection())
 
     def moved_noise(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
-        """Covariance (N, N) of the process noise and of the rounding of zeta, by E[1{next} 1{next}'] of the modes."""
+        """Covariance (N, N) of the process noise and of the rounding of zeta, by E[phi phi'] of the next functions."""
         parts = noise_in_mode(at(self.plant, k), u, start_of(self.plant))
         return Columns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
 
+    @abstractmethod
     def _projection(self) -> Float[np.ndarray, "n N"]:
+        """Matrix (n, N) that maps zeta to x."""
+
+
+class AbstractJointModalFilter(AbstractModalFilter):
+    """Linear filter of the state jointly with the mode of all links together."""
+
+    channel: ObservationModel | OverTime
+    initial: Float[Array, " M"]
+
+    def _projection(self) -> Float[np.ndarray, "n N"]:
+        """x = sum_j zeta^j."""
         return sum_of_modes(len(self.states), len(self.initial))
 
 
-class ModalFilter(AbstractModalFilter):
+class ModalFilter(AbstractJointModalFilter):
     """The linear minimum-mean-square-error filter of a linear plant behind links with memory.
 
     The estimate of zeta includes the modes' probabilities; its covariance is singular, since the modes' indicators
@@ -344,7 +355,7 @@ def pad(a: jax.Array) -> jax.Array:
     return jnp.pad(a, ((0, 1), (0, 1)))
 
 
-M = TypeVar("M", bound=AbstractModalFilter)
+M = TypeVar("M", bound=AbstractJointModalFilter)
 
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:

@@ -15,7 +15,7 @@ from heliograph.factors.gaussian import Gaussian, of_columns
 from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.modal import (
-    AbstractModalFilter,
+    AbstractJointModalFilter,
     Output,
     built_of_modes,
     claim_of_modes,
@@ -70,7 +70,7 @@ class UncertainBelief(NamedTuple):
         return self.gaussian.covariance
 
 
-class UncertainModalFilter(AbstractModalFilter):
+class UncertainModalFilter(AbstractJointModalFilter):
     """A linear filter whose covariance bounds its error's for every chain within the radius of the nominal one.
 
     Source: the filter of Costa (1994) with Young's inequality for the uncertain part of the chain.

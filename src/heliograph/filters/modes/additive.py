@@ -1,0 +1,249 @@
+"""Best linear filter behind links with memory that add up: it estimates one function of each link's mode.
+
+The mean gain of a sum of links given their modes is a sum of functions of one link's mode each,
+E[H | modes] = Hbar + sum_a D_a phi_a, with phi_a = 1{mode of a link = j} - P(j) for all its modes j but the first,
+D_a = H_j - H_first and Hbar = E[H]. The phi_a follow a linear recursion of their own, link by link,
+E[phi_j+ | modes] = sum_i (Pi_ij - Pi_first,j) phi_i, so that a Kalman filter of zeta = (x~, x~ phi_1, x~ phi_2, ...) is
+the best linear filter of x: 1 + sum_i (m_i - 1) parts, where the joint modes of the links are prod_i m_i.
+
+With Gamma = E[phi phi'] of (1, phi_1, ...), which independent links make block-diagonal, all covariances are sums of
+products Gamma x E[x~ x~'], x~ = (x - c, 1) with c = E[x] before data.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import block_diag
+
+from heliograph.factors.columns import Columns, join_columns, rounding_of, side_by_side, triangular
+from heliograph.factors.gaussian import Gaussian, given, of_columns
+from heliograph.filters.base import Step, corrects, make_sizes, predicts
+from heliograph.filters.gaussian.signal import factor_spread
+from heliograph.filters.modes.modal import (
+    AbstractModalFilter,
+    ObservationModel,
+    Output,
+    claim_of_modes,
+    covariance_of_mode,
+    kron,
+    measure_about,
+    observation_models,
+    observe_modes,
+    pad,
+    place_beside,
+    predict_about,
+    predict_by_mode,
+)
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Innovation
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import outer
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.superposed import terms_without_common_memory
+
+Terms = tuple[ObservationModel | OverTime, ...]  # of a sum, each with modes of its own
+Laws = tuple[jax.Array, ...]  # of the modes of each term
+
+
+class AdditiveBelief(NamedTuple):
+    """Estimate of zeta, factors of its error's covariance, and before any data E[x~ x~'] and the laws of the modes.
+
+    centre c = E[x] before data. `moved` is true from the first prediction on.
+
+    Shapes: with N = (1 + functions) (n + 1): mean, variances (N,), lower (N (N - 1) / 2,), second (n + 1, n + 1),
+    centre (n,).
+    """
+
+    mean: Float[jax.Array, " N"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " N"]
+    second: Float[jax.Array, "n1 n1"]
+    laws: Laws
+    centre: Float[jax.Array, " n"]
+    moved: Bool[jax.Array, ""]
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """zeta given the data."""
+        return Gaussian(*self[:3])
+
+    @property
+    def covariance(self) -> Any:
+        """Covariance of the error of zeta."""
+        return self.gaussian.covariance
+
+
+class AdditiveModalFilter(AbstractModalFilter):
+    """The linear minimum-mean-square-error filter of a linear plant behind a sum of links with memory.
+
+    It is the `ModalFilter` of all links' joint modes, of which a sum needs but one function for each mode of a link
+    beside the first. The innovation covariance is exact; the innovation is not Gaussian, so its likelihood is nominal.
+
+    Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994),
+    of functions of the modes.
+    """
+
+    terms: Terms
+    initial: tuple[Array, ...]
+
+    @in_float64
+    def init(self) -> AdditiveBelief:
+        """Return the prior, independent of the modes: Cov(zeta) = Gamma x E[x~ x~'], less E[x~] E[x~]' of x~ itself."""
+        start = at(self.plant, 0)
+        spread, laws = pad(jnp.asarray(start.initial_covariance)), tuple(jnp.asarray(law) for law in self.initial)
+        second = spread.at[-1, -1].set(1.0)
+        parts = [spread, *(jnp.kron(_variance(law), second) for law in laws if len(law) > 1)]
+        centre = jnp.asarray(start.initial_mean)
+        mean = self._whole(jnp.append(centre, 1.0))
+        return AdditiveBelief(*given(mean, block_diag(*parts)), second, laws, centre, jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
+        """Move x~ by the plant and each mode by its chain; at the first prediction the modes have their initial law."""
+        move, noise, centre = predict_about(at(self.plant, k), u, state.centre)
+        rows = self._rows(state, k)
+        # F zeta about the moving centre.
+        centred = state.mean - self._known(state.centre)
+        mean = predict_by_mode(centred[:, None], move, _between(rows).T)[:, 0] + self._known(centre)
+        root, fresh = self._moves(state, u, k)
+        after = of_columns(mean, join_columns(Columns(root, state.variances), fresh))
+        second = move @ state.second @ move.T + noise
+        return AdditiveBelief(*after, second, _next(state.laws, rows), centre, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: AdditiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdditiveBelief, Innovation]:
+        """Correct with the components of z that arrived.
+
+        Cov(z - E[z | zeta]) = T(C~ E[x~ x~'] C~' + R~) + sum_ab Gamma_ab D_a R D_b' + Cov n, T the mean spread of the
+        gains given the modes, D_0 = Hbar.
+        """
+        output = self._output(state, k)
+        after, innovation = observe_modes(state.gaussian, state.mean - self._known(state.centre), output, z)
+        return state._replace(mean=after.mean, lower=after.lower, variances=after.variances), innovation
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of zeta before the step given its prediction."""
+        slopes, fresh = self._moves(step.before, step.u, step.k)
+        moved, projection = (slopes, triangular(fresh)), self._projection()
+        return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
+
+    def _projection(self) -> Float[np.ndarray, "n N"]:
+        """Matrix (n, N) that maps zeta to x."""
+        return np.eye(len(self.states), (len(self.states) + 1) * self._parts)
+
+    @property
+    def _parts(self) -> int:
+        """1 + sum_i (m_i - 1)."""
+        return 1 + sum(len(law) - 1 for law in self.initial)
+
+    def _whole(self, first: jax.Array) -> jax.Array:
+        """Zeta of zeros behind its first part."""
+        return jnp.pad(first, (0, (self._parts - 1) * len(first)))
+
+    def _known(self, centre: jax.Array) -> jax.Array:
+        """Return what c is of E zeta."""
+        return self._whole(jnp.append(centre, 0.0))
+
+    def _rows(self, state: AdditiveBelief, k: Step) -> Laws:
+        """Transition matrix of the chain of each term."""
+        chains = [jnp.asarray(term.transition) for term in at(self.terms, k)]
+        return tuple(jnp.where(state.moved, chain, jnp.eye(len(chain))) for chain in chains)
+
+    def _moves(self, state: AdditiveBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
+        """Return F L of zeta = E zeta + L xi, and the columns of Cov(zeta+ - F zeta).
+
+        They are those of C x A~ E[x~ x~'] A~' + Gamma+ x Q~, with C = sum_i P(i) Cov(1{next} | i) of each chain.
+        """
+        move, rows = predict_about(at(self.plant, k), u, state.centre)[0], self._rows(state, k)
+        random = [
+            jnp.einsum("i,ijl->jl", law, covariance_of_mode(chain)[:, 1:, 1:])
+            for law, chain in zip(state.laws, rows, strict=True)
+        ]
+        jumps, carried = _beside(np.zeros((1, 0)), random), factor_spread(move @ state.second @ move.T)
+        by_jumps = Columns(kron(jumps.matrix, carried.matrix), outer(jumps.weights, carried.weights).reshape(-1))
+        fresh = join_columns(by_jumps, self.moved_noise(u, k, _gamma(_next(state.laws, rows))))
+        return predict_by_mode(state.gaussian.root, move, _between(rows).T), fresh
+
+    def _output(self, state: AdditiveBelief, k: Step) -> Output:
+        """Return what is measured of zeta, less the mean output."""
+        terms: tuple[ObservationModel, ...] = at(self.terms, k)
+        sensor = at(self.sensor, k)
+        measure, noise = measure_about(sensor, state.centre)
+        gains = _gains(terms, state.laws)
+        matrix = gains @ measure
+        common = matrix[0, :, -1]
+        sent, gamma = measure @ state.second @ measure.T + noise, _gamma(state.laws)
+        # D_a R D_b' of the sensor's noise, and the links' own noise and spread, over their modes.
+        heard = jnp.einsum("ac,amp->cmp", gamma.matrix, gains)
+        loud = jnp.asarray(heard[:, :, :-1] @ sensor.noise.columns.matrix)
+        weights = jnp.broadcast_to(sensor.noise.columns.weights, (len(loud), loud.shape[-1]))
+        plain = [side_by_side(Columns(loud, weights), gamma.weights)]
+        plain += [side_by_side(term.noise, law) for term, law in zip(terms, state.laws, strict=True)]
+        random = sum(
+            jnp.einsum("j,jmlab,ab->ml", law, jnp.asarray(term.gain_spread), sent)
+            for term, law in zip(terms, state.laws, strict=True)
+        )
+        rounding = rounding_of(jnp.einsum("c,cma,ab,cmb->m", gamma.weights, heard, sent, heard))
+        whole = join_columns(*plain, rounding, factor_spread(jnp.asarray(random)))
+        return Output(place_beside(matrix.at[0, :, -1].set(0.0)), common, whole)
+
+
+def _gains(terms: Sequence[ObservationModel], laws: Laws) -> jax.Array:
+    """Return Hbar and D_a, (1 + functions, m, p + 1)."""
+    means = [jnp.asarray(term.mean) for term in terms]
+    whole = sum(jnp.einsum("j,jmp->mp", law, mean) for law, mean in zip(laws, means, strict=True))
+    return jnp.concatenate([jnp.asarray(whole)[None], *(mean[1:] - mean[:1] for mean in means)])
+
+
+def _next(laws: Laws, rows: Laws) -> Laws:
+    return tuple(law @ chain for law, chain in zip(laws, rows, strict=True))
+
+
+def _between(rows: Laws) -> jax.Array:
+    """Return T of E[phi+ | phi] = T phi: 1 beside Pi_ij - Pi_first,j of each chain."""
+    parts = [(chain[1:, 1:] - chain[:1, 1:]).T for chain in rows if len(chain) > 1]
+    matrix: jax.Array = block_diag(np.eye(1), *parts)
+    return matrix
+
+
+def _variance(law: jax.Array) -> jax.Array:
+    """Covariance of the indicators of all modes but the first."""
+    return jnp.diag(law[1:]) - jnp.outer(law[1:], law[1:])
+
+
+def _gamma(laws: Laws) -> Columns:
+    """Return Gamma = E[phi phi'] of (1, phi_1, ...)."""
+    return _beside(np.eye(1), [_variance(law) for law in laws])
+
+
+def _beside(one: np.ndarray, covariances: Sequence[jax.Array]) -> Columns:
+    """Columns of block-diagonal covariances, behind these of weight 1 of the first function, 1."""
+    factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
+    weights = jnp.concatenate([jnp.ones(one.shape[1]), *(factor.weights for factor in factors)])
+    rows = sum(len(factor.matrix) for factor in factors)
+    whole: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)
+    top = jnp.concatenate([jnp.asarray(one), np.zeros((1, whole.shape[1]))], axis=1)
+    return Columns(jnp.concatenate([top, jnp.pad(whole, ((0, 0), (one.shape[1], 0)))]), weights)
+
+
+def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
+    """Best linear filter behind the sum of these terms, each with all outputs and inputs, which share no memory."""
+    laws, models = zip(*(observation_models(term) for term in terms), strict=True)
+    claim: Claim = "exact" if all(claim_of_modes(term) == "exact" for term in terms) else "nominal"
+    sizes = make_sizes(claim, first(plant), first(terms[0]).outputs)
+    return AdditiveModalFilter(plant=plant, sensor=sensor, terms=models, initial=laws, **sizes)
+
+
+def independent_terms(channel: Channel) -> list[Channel]:
+    """Return the terms of a sum that share no memory; a channel that is no sum, or of one term, is that term."""
+    steps = [terms_without_common_memory(step) for step in unstack(channel)]
+    if len({len(terms) for terms in steps}) > 1 or len(steps[0]) == 1:
+        return [channel]
+    return [over_time(list(parts)) if isinstance(channel, OverTime) else parts[0] for parts in zip(*steps, strict=True)]
