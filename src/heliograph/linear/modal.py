@@ -14,7 +14,7 @@ from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.second_moments import symmetric_product
+from heliograph.random_affine.moments.tensors import symmetric_product
 
 Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  # E[(G, n)] and its spread, by mode
 

@@ -24,7 +24,7 @@ from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
-from heliograph.random_affine.moments.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.tensors import second_moment_tensor
 from heliograph.random_affine.rotation import Rotation
 from heliograph.random_affine.superposed import Superposed
 

@@ -14,7 +14,7 @@ from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_forgets, check_maps
 from heliograph.random_affine.combine import Series, Stack, known
 from heliograph.random_affine.moments.monomials import Moments
-from heliograph.random_affine.moments.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.tensors import second_moment_tensor
 
 
 class Erasure(AbstractWrapper):

@@ -13,7 +13,7 @@ from heliograph.model.relays import SENSOR, RelayNetwork
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.tensors import second_moment_tensor
 from heliograph.relays.design import GainsByFilter
 
 

@@ -9,7 +9,7 @@ import pytest
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise
-from heliograph.random_affine.moments import second_moments
+from heliograph.random_affine.moments import second_moments, tensors
 from heliograph.random_affine.moments.intervals import moment_interval
 from heliograph.random_affine.moments.monomials import monomials
 from heliograph.random_affine.noise import FiniteSupport
@@ -95,9 +95,9 @@ def described(channel):
 def test_the_second_order_description_is_that_of_the_moments(name):
     channel = SUMS[name]()
     nominal, seen = channel.moments(2), described(channel)
-    tensor = second_moments.second_moment_tensor(nominal.matrix, nominal.outputs, nominal.inputs)
+    tensor = tensors.second_moment_tensor(nominal.matrix, nominal.outputs, nominal.inputs)
     mean = nominal.mean[:-1]
-    spread = tensor - second_moments.symmetric_product(mean, mean)
+    spread = tensor - tensors.symmetric_product(mean, mean)
     np.testing.assert_allclose(np.column_stack([seen.mean_gain, seen.offset]), mean, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(seen.nominal.center, spread, rtol=1e-10, atol=1e-12)
 
@@ -107,7 +107,7 @@ def true_bounds(channel, laws, second):
     mean = channel.moments(1).mean[:-1]
     for law in laws:
         moments = law.moments(2)
-        tensor = second_moments.second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+        tensor = tensors.second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
         of_law = moments.mean[:-1]
         raw, cross = np.einsum("ijab,ab->ij", tensor, second), mean @ second @ of_law.T
         signal = second.copy()

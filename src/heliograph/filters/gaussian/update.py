@@ -33,8 +33,8 @@ from heliograph.random_affine.moments.second_moments import (
     describe_second_moments,
     nominal_spread,
     second_order,
-    symmetric_product,
 )
+from heliograph.random_affine.moments.tensors import symmetric_product
 
 
 @readable

@@ -11,7 +11,8 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes
-from heliograph.random_affine.moments.second_moments import divide_spread, symmetric_product, undivided
+from heliograph.random_affine.moments.second_moments import divide_spread, undivided
+from heliograph.random_affine.moments.tensors import symmetric_product
 
 
 class SideInformation(Module):

@@ -19,14 +19,17 @@ from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, c
 from heliograph.random_affine.combine import GainAndNoise, Series, Stack
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.intervals import CORNERS, count_corners, moment_interval
-from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments, product_table
+from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments
+from heliograph.random_affine.moments.tensors import (
+    Matrix,
+    Tensor,
+    drop_constant,
+    second_moment_tensor,
+    symmetric_product,
+)
 from heliograph.random_affine.superposed import Superposed
 
 PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
-
-
-Tensor = Float[jax.Array | np.ndarray, "m m p+1 p+1"]
-Matrix = Float[jax.Array | np.ndarray, "m p"]
 
 
 class QuadraticMap(Module):
@@ -172,7 +175,12 @@ class Bounds(NamedTuple):
 def _bounds(channel: AbstractRandomAffine) -> Bounds:
     corners = count_corners(channel)
     listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
-    if isinstance(channel, Superposed) and (corners == 1 or not listed):
+    if isinstance(channel, Superposed) and corners == 1:
+        mean, tensor = _mean_and_spread(channel)
+        own = _certain(tensor)
+        of_mean = _certain(drop_constant(symmetric_product(mean, mean)))
+        return Bounds(mean, own, _scale(own, 0.0), _plus(_signal(own), of_mean), own)
+    if isinstance(channel, Superposed) and not listed:
         return _bound_sum(channel, [_bounds(affine) for affine in channel.maps])
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
@@ -205,33 +213,12 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
     return _certain(_tensors(nominal, nominal.mean[:-1])[0])
 
 
-def second_moment_tensor(matrix: Matrix, outputs: int, inputs: int) -> Tensor:
-    """E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, symmetric in (i, j) and in (a, b), from E[Sym^2(H)]."""
-    rows = product_table(outputs + 1, 1, 1)[:-1, :-1]
-    columns = product_table(inputs + 1, 1, 1)
-    shares = np.where(np.eye(inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b stands at (a, b) and at (b, a)
-    return matrix[rows[:, :, None, None], columns] / shares
-
-
-def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
-    """(A y)(B y)' as a tensor, made symmetric in the two factors y."""
-    forward: Tensor = library(a, b).einsum("ia,jb->ijab", a, b)
-    return (forward + forward.swapaxes(2, 3)) / 2
-
-
 def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
     """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
     raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
     law_mean = moments.mean[:-1]
     spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
-    return spread, symmetric_product(law_mean - mean, law_mean - mean), _drop_constant(raw)
-
-
-def _drop_constant(tensor: Tensor) -> Tensor:
-    """The tensor without its last row and column, those of the constant 1."""
-    signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
-    signal_part: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
-    return signal_part
+    return spread, symmetric_product(law_mean - mean, law_mean - mean), drop_constant(raw)
 
 
 def _dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
@@ -303,13 +290,27 @@ def _bound_stack(channel: Stack) -> list[QuadraticMap]:
     far, size = xp.concatenate(reach), xp.abs(mean)
     # Off-diagonal blocks: bounds of |D_i Y Y' D_j'| by the product of reaches.
     cross = symmetric_product(far, far)
-    power_cross = _drop_constant(symmetric_product(size, far) + symmetric_product(far, size) + cross)
-    centers = (0.0, 0.0, _drop_constant(symmetric_product(mean, mean)))
+    power_cross = drop_constant(symmetric_product(size, far) + symmetric_product(far, size) + cross)
+    centers = (0.0, 0.0, drop_constant(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
         QuadraticMap(sum(q.center for q in maps) + apart * center, sum(q.radius for q in maps) + apart * radius)
         for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
     ]
+
+
+def _mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
+    """Mean and spread of a map of known law: the spreads of independent maps add up, and of their means no more."""
+    if not isinstance(channel, Superposed):
+        moments = channel.moments(2)
+        mean = moments.mean[:-1]
+        raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+        return mean, raw - symmetric_product(mean, mean)
+    means, spreads = zip(*(_mean_and_spread(affine) for affine in channel.maps), strict=True)
+    whole, size = channel.in_places(dict(enumerate(means)), 1), channel.inputs + 1
+    noise = channel.noise.covariance[..., None, None] * _corner(size)
+    spread: Tensor = channel.in_places(dict(enumerate(spreads)), 2) + noise
+    return whole + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
 
 def _bound_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
@@ -322,7 +323,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
     mean = channel.in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
     noise = _certain(channel.noise.covariance[..., None, None] * _corner(channel.inputs + 1))
-    of_mean = _certain(_drop_constant(symmetric_product(mean, mean)))
+    of_mean = _certain(drop_constant(symmetric_product(mean, mean)))
     own = _plus(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
     sizes = [_size(bounds.shift) for bounds in parts]
     total = sum(sizes)
@@ -340,7 +341,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
 
 
 def _signal(bound: QuadraticMap) -> QuadraticMap:
-    return QuadraticMap(_drop_constant(bound.center), _drop_constant(bound.radius))
+    return QuadraticMap(drop_constant(bound.center), drop_constant(bound.radius))
 
 
 def _size(shift: QuadraticMap) -> Any:
@@ -394,5 +395,5 @@ def _bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean:
     return [
         QuadraticMap(spread, spread_radius),
         QuadraticMap(np.zeros(spread.shape), symmetric_product(reach, reach)),
-        QuadraticMap(power, _drop_constant(raw_radius)),
+        QuadraticMap(power, drop_constant(raw_radius)),
     ]
