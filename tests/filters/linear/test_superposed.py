@@ -173,3 +173,60 @@ def test_what_no_linear_filter_hears_is_said():
     assert not serious
     assert "link2 at 'a'" in said
     assert not words(1.0, 2.0)
+
+
+COIN = FiniteSupport([[1.2], [-0.4]], [0.25, 0.75])
+
+
+def small(arrival=0.8, radius=0.0, late=0):
+    """Two sensors of one state: a gain of two values, perhaps late, and a link that may be lost unseen."""
+    first = hg.hop(hg.Discrete([0.5, 1.5], [0.4, 0.6]), 0.1)
+    first = hg.model.delayed(first, late) if late else first
+    return hg.superposed([first, hg.dropout(hg.hop(hg.Rayleigh(0.7), 0.0), arrival, radius=radius)], 0.05)
+
+
+def test_a_filter_of_degree_three_hears_a_sum_of_links_by_the_links():
+    """Its lifted system is that of the stack, moments of order 6 included."""
+    plant = hg.LinearPlant([[0.8]], COIN, [0.3], [[1.0]])
+    sensor = hg.LinearSensor([[1.0], [0.5]], hg.random_affine.Independent([COIN, hg.Gaussian([[0.1]])]))
+    seen = hg.linear.lifted_system(plant, sensor, small(), 3, 2).steps
+    joint = hg.linear.lifted_system(plant, sensor, small().as_stack, 3, 2).steps
+    for mine, other in zip(seen, joint, strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("arrival", [0.7, 0.9])
+def test_the_claim_behind_a_sum_of_uncertain_links_is_a_bound(arrival):
+    """For both ends of the probability that a link's signal arrives; known laws of it are within 1/4."""
+    made = hg.linear_filter(PLANT, sensors(2), small(radius=0.1))
+    assert made.claim == "upper"
+    error = hg.filters.true_error(made, PLANT, sensors(2), small(arrival), horizon=8)
+    assert np.all(error.true <= error.claimed * (1 + 1e-9))
+
+
+def test_links_of_a_sum_may_be_late():
+    """The claim is the error of what the filter does, and that behind the stack of the same links."""
+    made, stacked = (hg.linear_filter(PLANT, sensors(2), c) for c in (small(late=1), small(late=1).as_stack))
+    assert made.claim == "exact"
+    error, other = (hg.filters.true_error(f, PLANT, sensors(2), small(late=1), horizon=6) for f in (made, stacked))
+    np.testing.assert_allclose(error.true, error.claimed, rtol=1e-9)
+    np.testing.assert_allclose(error.claimed, other.claimed, rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arrival", [1.0, 0.7])
+def test_filters_of_every_kind_claim_the_error_that_they_have_behind_a_sum(arrival):
+    """Mean squared errors of 4,000 runs within five of their own standard deviations of the mean covariance.
+
+    Also where the whole sum is lost, of which the receiver knows; a filter of degree three needs all that is sent.
+    """
+    sensor, channel = sensors(2), small()
+    filters = {"linear": hg.linear_filter, "cubature": hg.cubature_filter, "extended": hg.extended_filter}
+    made = {name: build(PLANT, sensor, channel) for name, build in filters.items()}
+    if arrival == 1:
+        made["degree 3"] = hg.polynomial_filter(PLANT, sensor, channel, horizon=8, degree=3)
+    received = channel if arrival == 1 else hg.erasure(channel, arrival)
+    record = hg.monte_carlo(hg.Network(PLANT, {"a": hg.Node(sensor, received, made)}), horizon=8, runs=4000, key=1)
+    for estimate in record.estimates["a"].values():
+        squares = (record.truth - estimate.mean)[:, -1, 0] ** 2 - np.asarray(estimate.covariance)[:, -1, 0, 0]
+        assert abs(squares.mean()) < 5 * squares.std() / np.sqrt(len(squares))
