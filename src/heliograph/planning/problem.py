@@ -93,14 +93,11 @@ class Certificate(NamedTuple):
         if self.convex:
             return f"optimal within {self.gap:.1e}: the problem is convex, and no {self.unit} is below {self.bound:.6g}"
         starts = "the one start" if self.starts == 1 else f"{self.starts} starts"
+        known = "" if np.isnan(self.stationarity) else f", stationary within {self.stationarity:.1e}"
         if not np.isfinite(self.bound):
-            known = "" if np.isnan(self.stationarity) else f", stationary within {self.stationarity:.1e}"
             return f"best of {starts}{known}; no bound is known"
         better = "better" if self.unit == "error" else "less"
-        return (
-            f"best of {starts}, stationary within {self.stationarity:.1e}; "
-            f"nothing can be {better} than {self.bound:.6g}"
-        )
+        return f"best of {starts}{known}; nothing can be {better} than {self.bound:.6g}"
 
 
 @readable
