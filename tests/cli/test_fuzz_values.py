@@ -17,6 +17,7 @@ WORDS = {  # words with which a command works, or with which it says what is not
     "inspect": ["nothing.mcap"],
     "run": ["net.py", "--measurements", "data.csv", "--out", "o.csv"],
     "fit": ["net.py", "--measurements", "data.csv", "--out", "o"],
+    "backtest": ["net.py", "--measurements", "data.csv", "--horizons", "1", "--out", "b"],
     "serve": ["net.py", "--store", "none"],
     "replay": ["data.csv", "--network", "net.py"],
     "export": ["net.py", "--out", "o"],

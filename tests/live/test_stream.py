@@ -46,7 +46,6 @@ REFUSED = [
     ([[1.0, 2.0]], [0.0], r"measurement: expected 2 numbers, got shape \(1, 2\)"),
     ([1.0, np.inf], [0.0], "measurement: expected numbers, or NaN for what is missing, got"),
     (None, [0.0], "measurement: expected 2 numbers, got None"),
-    ([None, 1.0], [0.0], r"measurement: expected 2 numbers, got \[None, 1.0\]"),
     (["1", "2"], [0.0], r"measurement: expected 2 numbers, got \['1', '2'\]"),
     ([1j, 2.0], [0.0], "measurement: expected 2 numbers, got"),
     ([[1.0], [1.0, 2.0]], [0.0], "measurement: expected 2 numbers, got"),
@@ -70,7 +69,7 @@ def test_what_does_not_fit_changes_nothing(name):
             stream.push(z, u)
         assert "\n" not in str(caught.value)
     assert stream.steps == 0
-    for z in ([0.5, 1.0], [np.nan, 2.0], np.array([1, 2])):  # whole numbers will do
+    for z in ([0.5, 1.0], [np.nan, 2.0], [None, 1.0], np.array([1, 2])):  # None did not arrive; whole numbers will do
         np.testing.assert_array_equal(stream.push(z, [0.3]).mean, other.push(z, 0.3).mean)
 
 

@@ -41,7 +41,7 @@ COMMANDS: dict[Callable[..., object], str] = {
     replay: "data.csv --network my_network.py --speed 10 --loss 0.1 | heliograph serve my_network.py --store none",
     export: "my_network.py --filter relay_aware --out step.c",
     demo: "--out demo",
-    example: "fusion --out fusion",
+    example: "late-data --out late-data",
     reproduce: "quadratic-bias --out quadratic-bias",
     sweep: "campaign.toml --out results",
     explore: "results --out page",

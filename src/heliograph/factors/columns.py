@@ -155,10 +155,10 @@ def eliminate_by_rank(covariance: jax.Array) -> Columns:
     """Return the same of a covariance that is given, of which a pivot below RANK of its own variance is none.
 
     So a singular one has no variance where it has none, as by `root_of`, and what is drawn from it has none either. In
-    single precision, below n eps of it.
+    single precision, below n eps of it. Its derivative stays: that of a variance at 0 says what a little more would do.
     """
     least = max(RANK, len(covariance) * unit_of(covariance))
-    return _eliminate(covariance, lambda pivot, whole: _or_else(pivot, least * whole, jnp.zeros_like(pivot)))
+    return _eliminate(covariance, lambda pivot, whole: _or_else(pivot, least * whole, pivot - lax.stop_gradient(pivot)))
 
 
 Pivot = Callable[[jax.Array, jax.Array], jax.Array]  # d_j from what elimination leaves of a variance, and all of it

@@ -129,6 +129,7 @@ def log_density(
     return carry[2]
 
 
+@readable
 class Weighed(NamedTuple):
     """Innovations by component: value, variance, and weight in the update, (..., m) each; NaN where none arrived."""
 

@@ -18,6 +18,7 @@ from heliograph.numerics.linalg import (
     squared_distance,
     squared_distances,
 )
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float, PyTree
 
 LIMIT = 1e6
@@ -54,6 +55,7 @@ def greatest_distance(dtype: np.dtype) -> float:
     return min(LIMIT**2, 1 / float(np.finfo(dtype).eps))
 
 
+@readable
 class Judgement(NamedTuple):
     """Judgement of one step of a filter.
 

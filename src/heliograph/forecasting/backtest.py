@@ -33,6 +33,7 @@ Rows = TypeAliasType("Rows", Float[ArrayLike, "steps ..."] | None)
 Coverage = TypeAliasType("Coverage", tuple[Mean, ...])  # of each level
 
 
+@readable
 class Score(NamedTuple):
     """How forecasts of one number at one horizon did, each mean with a standard error that knows their overlap.
 

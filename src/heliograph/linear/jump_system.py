@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.module import readable
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, Int
 
@@ -34,6 +35,7 @@ def propagate(maps: Float[Array, "..."], moments: Float[Array, "..."], added: Ar
     return maps @ moments @ maps.swapaxes(-1, -2) + added
 
 
+@readable
 class JumpSystem(NamedTuple):
     """Steps of a jump system, X_j+ = F_j (sum_i T_ij X_i) F_j' + S_j with X_j = E[zeta zeta' 1{mode j}].
 

@@ -17,6 +17,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import InputError, instance
+from heliograph.numerics.module import readable
 from heliograph.numerics.traced import DOUBLE
 from heliograph.numerics.types import Float
 from heliograph.random_affine.modes import forgetful
@@ -36,6 +37,7 @@ NODES_LIMIT = 12  # nodes of which each is judged alone
 SEED = 0  # of the state at which a nonlinear plant is judged
 
 
+@readable
 class Doubt(NamedTuple):
     """A line about a network; `serious` where an estimate may not be what it is for, else something to know.
 

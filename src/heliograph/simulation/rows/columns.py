@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from heliograph.model.estimate import Claim
+from heliograph.numerics.module import readable
 from heliograph.numerics.trees.flat import Flat
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
@@ -38,6 +39,7 @@ class TestedAt(NamedTuple):
     arrived: int
 
 
+@readable
 class FilterColumns(NamedTuple):
     """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
 

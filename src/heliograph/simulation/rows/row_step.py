@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.engine.choice import chosen
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, understood
-from heliograph.numerics.module import Module
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.flat import Flat, flat_like, row_of
 from heliograph.numerics.trees.program_text import text_of
 from heliograph.numerics.trees.static import Static, cast
@@ -72,6 +72,7 @@ class Layout(NamedTuple):
         return self.state.tree(known), rest[: self.received], u, k
 
 
+@readable
 class RowStep:
     """A network's step as a pure function of rows, (state, received, inputs, step number) to (state, outputs).
 
