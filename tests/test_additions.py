@@ -38,9 +38,9 @@ FILTER = {
 
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, columns_of, joined
+from heliograph.factors.columns import Columns, columns_of, join_columns
 from heliograph.factors.gaussian import given, move, of_columns
-from heliograph.filters.base import AbstractSizedFilter, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, corrects, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.float64 import in_float64
@@ -69,8 +69,8 @@ class FixedGainFilter(AbstractSizedFilter):
         gain, expected = jnp.where(jnp.isnan(z), 0.0, self.gain), c @ state.mean
         mean = state.mean + gain @ jnp.where(jnp.isnan(z), 0.0, z - expected)
         kept = Columns(state.root - gain @ c @ state.root, state.variances)
-        total = joined(Columns(c @ state.root, state.variances), noise).covariance
-        after = of_columns(mean, joined(kept, noise.through(gain)))
+        total = join_columns(Columns(c @ state.root, state.variances), noise).covariance
+        after = of_columns(mean, join_columns(kept, noise.through(gain)))
         return after, gaussian_innovation(z, expected, total)
 
     def estimate(self, state):
@@ -79,7 +79,7 @@ class FixedGainFilter(AbstractSizedFilter):
 
 def fixed_gain_filter(plant, sensor, gain):
     """Filter with a gain that is given."""
-    return FixedGainFilter(plant=plant, sensor=sensor, gain=gain, **sized("exact", plant, len(sensor.outputs)))
+    return FixedGainFilter(plant=plant, sensor=sensor, gain=gain, **make_sizes("exact", plant, len(sensor.outputs)))
 '''),
     "filters/__init__.pyi": ("", "\nfrom .NAME import fixed_gain_filter as fixed_gain_filter\n"),
 }  # fmt: skip
