@@ -119,20 +119,3 @@ def test_no_claim_is_below_what_rounding_leaves(kind, shape):
         beyond(record, size)
         if smooth is not None:
             beyond(record.smoothed, size)
-
-
-@pytest.mark.parametrize("rank", [1, 2])
-def test_what_is_drawn_from_a_singular_prior_lies_where_a_filter_starts(rank):
-    """As many outputs as unknown numbers tell the state: to its rounding, and no digit of the prior's is lost.
-
-    A pivot of the prior that rounding leaves, 1e-16 of its variance, is none: it would be 1e-8 of a deviation.
-    """
-    random = np.random.default_rng(0)
-    a, h = random.normal(size=(3, 3)), random.normal(size=(rank, 3))
-    plant = hg.LinearPlant(a / 2, 0.0, np.zeros(3), of_rank(random, 3, rank))
-    sensor = hg.LinearSensor(h, np.zeros((rank, rank)))
-    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(rank), {"k": hg.kalman_filter(plant, sensor)})})
-    record = hg.monte_carlo(network, 5, RUNS, 0)
-    claimed = np.sqrt(np.diagonal(record.estimates["a"]["k"].covariance, axis1=-2, axis2=-1))
-    assert np.max(claimed) < 1e3 * EPS  # outputs in a general direction
-    assert np.max(np.abs(record.errors("a", "k"))) < 1e3 * EPS

@@ -8,7 +8,7 @@ A known zero of a matrix stays a known zero through a matrix product, not throug
 NaN: so products of rows and columns are written as matrix products here.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, NamedTuple
@@ -148,29 +148,12 @@ def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
     A pivot is known to eps of its own variance, of which rounding may leave less than nothing: it is at least `least`
     times it.
     """
-    return _eliminate(covariance, lambda pivot, whole: _or_else(pivot, least * whole, least * whole))
-
-
-def eliminate_by_rank(covariance: jax.Array) -> Columns:
-    """Return the same of a covariance that is given, of which a pivot below RANK of its own variance is none.
-
-    So a singular one has no variance where it has none, as by `root_of`, and what is drawn from it has none either. In
-    single precision, below n eps of it. Its derivative stays: that of a variance at 0 says what a little more would do.
-    """
-    least = max(RANK, len(covariance) * unit_of(covariance))
-    return _eliminate(covariance, lambda pivot, whole: _or_else(pivot, least * whole, pivot - lax.stop_gradient(pivot)))
-
-
-Pivot = Callable[[jax.Array, jax.Array], jax.Array]  # d_j from what elimination leaves of a variance, and all of it
-
-
-def _eliminate(covariance: jax.Array, pivot: Pivot) -> Columns:
     if len(covariance) > WRITTEN:
-        return _long_eliminate(covariance, pivot)
+        return _long_eliminated(covariance, least)
     n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
-        variances.append(pivot(column[j], covariance[j, j]))
+        variances.append(_bound_below(column[j], least * covariance[j, j]))
         share = _below(j, outer(column, lax.reshape(reciprocal(variances[j]), (1,))))
         rest = symmetric(rest - outer(share, column))
         lower.append(share)
@@ -217,11 +200,11 @@ def factor_constant(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def columns_of(covariance: Array) -> Columns:
-    """Columns of a covariance that is given: as many as its rank where its numbers are known, else n by elimination."""
+    """Columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
     if isinstance(covariance, np.ndarray):
         root = root_of(covariance)
         return Columns(root, np.ones(root.shape[1]))
-    return eliminate_by_rank(jnp.asarray(covariance))
+    return eliminate(jnp.asarray(covariance))
 
 
 def columns_of_each(covariances: np.ndarray) -> Columns:
@@ -260,9 +243,9 @@ def unit_of(numbers: Array) -> float:
     return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(_precision.get()).eps))
 
 
-def _or_else(pivot: jax.Array, floor: jax.Array, other: jax.Array) -> jax.Array:
-    """Return the pivot, or another below a floor; not by a maximum, which halves the derivative where both are zero."""
-    return jnp.where(pivot >= floor, pivot, other)
+def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
+    """Return the larger of both; not by a maximum, which halves the derivative where both are zero."""
+    return jnp.where(pivot >= floor, pivot, floor)
 
 
 def _below(j: int, column: jax.Array) -> jax.Array:
@@ -296,13 +279,13 @@ def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
     return Columns(lower, variances)
 
 
-def _long_eliminate(covariance: jax.Array, pivot: Pivot) -> Columns:
+def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
     """Compute `eliminate` as a loop over the columns."""
     n, whole = len(covariance), jnp.diagonal(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rest, lower, variances = carry
-        d = pivot(rest[j, j], whole[j])
+        d = _bound_below(rest[j, j], least * whole[j])
         share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal(d), 0.0)
         return rest - jnp.outer(share, rest[j]), *_with_column(j, lower, share, variances, d)
 

@@ -19,7 +19,6 @@ from heliograph.factors.columns import (
     below_diagonal,
     decorrelate,
     eliminate,
-    eliminate_by_rank,
     factor_constant,
     inverse,
     is_positive,
@@ -89,11 +88,11 @@ def of_matrix(mean: jax.Array, covariance: jax.Array) -> Gaussian:
 
 
 def given(mean: Array, covariance: Array) -> Gaussian:
-    """Make a Gaussian of a covariance matrix, the border to all that has one; of what is drawn from it too, by rank."""
+    """Make a Gaussian of a covariance matrix, the border to all that has one; each variance to n eps of itself."""
     if isinstance(covariance, np.ndarray):
         factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_constant(covariance))
         return Gaussian(*factors)
-    columns = eliminate_by_rank(jnp.asarray(covariance))
+    columns = eliminate(jnp.asarray(covariance), len(covariance) * unit_of(covariance))
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 

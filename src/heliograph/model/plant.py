@@ -10,12 +10,11 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
-from heliograph.factors.columns import columns_of, square_root
-from heliograph.factors.gaussian import given
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continue_angles, nearest, wrap_angles
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, show_error
 from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import as_real, is_traced, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
@@ -122,17 +121,14 @@ class AbstractPlant(Module):
             return self.noise.sample(key)
         if isinstance(self.noise, JointNoise):
             return self.noise.sample(key, u)
-        columns = columns_of(self.noise_covariance(u))
-        draw = jax.random.normal(key, columns.weights.shape, dtype=float)
-        return jnp.asarray(columns.matrix @ (square_root(jnp.asarray(columns.weights)) * draw))
+        return cholesky(self.noise_covariance(u)) @ jax.random.normal(key, self.initial_mean.shape, dtype=float)
 
     def sample_initial(self, key: jax.Array) -> jax.Array:
-        """Draw x_0, by the root from which filters start."""
+        """Draw x_0."""
         if self.deviation is not None:
             return jnp.asarray(self.initial_mean) - self.deviation.mean + self.deviation.sample(key)
         draw = jax.random.normal(key, self.initial_mean.shape, dtype=float)
-        law = given(self.initial_mean, self.initial_covariance)
-        return jnp.asarray(law.mean + law.root @ (square_root(jnp.asarray(law.variances)) * draw))
+        return jnp.asarray(self.initial_mean) + cholesky(jnp.asarray(self.initial_covariance)) @ draw
 
 
 class JointNoise(Module):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.factors.columns import Columns, columns_of, square_root
+from heliograph.factors.columns import Columns, columns_of, eliminate, square_root
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
@@ -75,7 +75,7 @@ class Gaussian(AbstractNoise):
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
-            self.factor, self.weights = columns_of(self.covariance)
+            self.factor, self.weights = eliminate(jnp.asarray(self.covariance))
             return
         self.factor = _root(self.covariance)
         self.weights = np.ones(n)
