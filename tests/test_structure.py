@@ -23,6 +23,7 @@ ORDER = [
     ["random_affine"],
     ["model"],
     [
+        "filters.vector",
         "filters.base",
         "filters.plausibility",
         "filters.rows",

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn, ParamSpec, Protocol, Typ
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
@@ -14,6 +13,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.rows import Filtered, filtered
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
+from heliograph.filters.vector import check_vector
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
@@ -21,7 +21,6 @@ from heliograph.model.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.traced import is_traced
@@ -352,7 +351,7 @@ def check_measurement(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " re
 
     Empty for a filter that uses no measurements.
     """
-    values = _numbers("measurement", z, filter.received or None)
+    values = check_vector("measurement", z, filter.received or None)
     if isinstance(values, np.ndarray) and np.isinf(values).any():
         raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(values).tolist())
     return values if filter.received else values[:0]
@@ -360,7 +359,7 @@ def check_measurement(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " re
 
 def check_input(filter: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
     """Return u as an input of the filter's length."""
-    values = _numbers(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
+    values = check_vector(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
     if isinstance(values, np.ndarray) and not np.isfinite(values).all():
         raise fail("inputs", "finite numbers", np.asarray(values).tolist())
     if isinstance(values, np.ndarray):
@@ -384,24 +383,3 @@ def step_number(filter: AbstractFilter, k: Step) -> Step:
     if filter.horizon is not None and values >= filter.horizon:
         raise fail("step", f"one of the {filter.horizon} that the filter covers, counted from 0", k)
     return values
-
-
-def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " length"]:
-    """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one."""
-    expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
-    try:
-        numbers: Array = np.asarray(fill_masked(value))
-    except jax.errors.TracerArrayConversionError:
-        numbers = jnp.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):  # rows of different lengths, a set of arrays, a key
-        raise fail(name, expected, show_value(value)) from None
-    # Concrete values: real numbers only, in double precision.
-    if isinstance(numbers, np.ndarray):
-        if numbers.dtype.kind not in "fiub":
-            raise fail(name, expected, show_value(value))
-        numbers = numbers.astype(np.float64)
-    # A scalar stands for a vector of length one.
-    numbers = numbers[None] if numbers.ndim == 0 and length in (1, None) else numbers
-    if numbers.ndim != 1 or length not in (len(numbers), None):
-        raise fail(name, expected, f"shape {numbers.shape}" if numbers.size else "none")
-    return numbers

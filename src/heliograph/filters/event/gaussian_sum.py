@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +13,7 @@ from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian, append_rows, given, leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import cut_to_ball
+from heliograph.filters.event.belief import EventBelief
 from heliograph.filters.event.moments import LinkMoments, arriving, augment, condition_parts, pin, predict_jointly
 from heliograph.filters.event.parts import (
     FLOOR,
@@ -23,7 +23,6 @@ from heliograph.filters.event.parts import (
     join,
     log_total,
     reduce_parts,
-    safe_log,
     together,
 )
 from heliograph.filters.gaussian.belief import smoother_step_by_transform, start_of
@@ -40,42 +39,6 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 COUNTED = 16  # lost transmissions that are counted; more are as many
-
-
-class EventBelief(NamedTuple):
-    """The sum: Gaussians of (x, r), r the sender's reference, and labels (mode, steps since sent, number lost).
-
-    Shapes, with N = n + m: weight (H,), mean, variances (H, N), lower (H, N (N - 1) / 2), label (H, S, M, A, C) with
-    S = 1 where y is sent as a whole, else m; `begun` (S,) once there is a reference, `moved` once the chain was used.
-    """
-
-    weight: jax.Array
-    mean: jax.Array
-    lower: jax.Array
-    variances: jax.Array
-    label: jax.Array
-    begun: jax.Array
-    moved: jax.Array
-
-    @property
-    def components(self) -> tuple[jax.Array, Gaussian]:
-        """The mixture: weights (H,), and the Gaussians of (x, r)."""
-        return self.weight, Gaussian(self.mean, self.lower, self.variances)
-
-    @property
-    def covariance(self) -> Any:
-        """Covariances of (x, r)."""
-        return self.components[1].covariance
-
-    @property
-    def parts(self) -> GaussianSum:
-        """The sum, with the logarithms of its weights."""
-        return GaussianSum(safe_log(self.weight), self.components[1], self.label)
-
-    @staticmethod
-    def of(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
-        """The state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
-        return EventBelief(jnp.exp(parts.log_weight), *parts.gaussian, parts.label, begun, moved)
 
 
 class EventFilter(AbstractSizedFilter):
