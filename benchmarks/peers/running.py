@@ -20,10 +20,11 @@ class Running:
     """A program in its own process, which has written its estimates and waits to be asked for times."""
 
     def __init__(self, file: str, python: Path, data: Path, source: Path | None = None):
-        """`source` is the src folder of another release, whose own program of this name is run."""
+        """`source` is the src folder of another release, whose own program of this name is run, on its own studies."""
         self.file, written = file, data.with_name(f"{file}{'' if source is None else '_old'}.npy")
         program = HERE / f"{file}.py" if source is None else program_of(source, file)
-        environment = os.environ | ({} if source is None else {"PYTHONPATH": str(source)})
+        folders = () if source is None else (str(source), str(source.resolve().parent / "studies"))
+        environment = os.environ | ({"PYTHONPATH": os.pathsep.join(folders)} if folders else {})
         self.process = subprocess.Popen(
             [str(python), str(program), str(data), str(written)],
             stdin=subprocess.PIPE,
