@@ -63,7 +63,7 @@ def rounded_more(item: hg.Network, index: int) -> Any:
         return (*features()[:2], False)
 
     def forget() -> None:
-        for programs in (runs._made, choice._made):
+        for programs in (runs._find_program, choice._compile_structure):
             programs.cache_clear()
 
     forget()

@@ -42,6 +42,11 @@ def measure(runs: int, precision: str) -> dict[str, Any]:
             estimate = time.perf_counter() - begun + left
 
     with hg.show_progress() as shown:
+
+        def tell(done: int, total: int) -> None:
+            shown(done, total)
+            progressed(done, total)
+
         record = hg.monte_carlo(
             strong(),
             STRONG.horizon,
@@ -50,7 +55,7 @@ def measure(runs: int, precision: str) -> dict[str, Any]:
             hg.Statistics(),
             chunk=8192,
             precision="float32" if precision == "float32" else "float64",
-            progress=lambda done, total: (shown(done, total), progressed(done, total))[0],
+            progress=tell,
         )
     rmse = {node: record[node][FUSED if node == "fused" else FILTER].rmse() for node in record}
     return {

@@ -22,7 +22,7 @@ LIMIT = 333  # 3,000 events a second
 
 def readme_network() -> hg.Network:
     """Two filters at one node, the one that knows its relay and the one that trusts the mean gain."""
-    aware = readme_filter()
+    aware: Any = readme_filter()
     relay = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), noise=0.02), hg.hop(1.0, noise=0.01, amplification=1.2)])
     channel = hg.parallel([relay, hg.perfect()])
     mean = hg.mean_gain_filter(aware.plant, aware.sensor, channel)

@@ -155,6 +155,7 @@ def chain(numbers: Numbers) -> Case:
     return Case(hg.linear_filter(plant, sensor, link), plant, sensor, world)
 
 
+FADING = hg.hop(hg.random_affine.Rician(0.8, 0.3), 0.1)
 FILTERS: dict[str, Callable[[Any, Any], tuple[Any, Any]]] = {
     "kalman_filter": lambda plant, sensor: (hg.kalman_filter(plant, sensor), hg.perfect()),
     "linear_filter": lambda plant, sensor: (hg.linear_filter(plant, sensor, FADING), FADING),
@@ -162,7 +163,6 @@ FILTERS: dict[str, Callable[[Any, Any], tuple[Any, Any]]] = {
         hg.polynomial_filter(plant, sensor, FADING, HORIZON, degree=1).inner, FADING,
     ),
 }  # fmt: skip
-FADING = hg.hop(hg.random_affine.Rician(0.8, 0.3), 0.1)
 
 
 def bounded(name: str) -> Callable[[Numbers], Case]:

@@ -87,8 +87,8 @@ def world_of(read: Reader) -> World:
     weights = read.probabilities(len(unit))
     turned = np.linalg.qr(read.real(*unit.shape) + 1e-3 * unit)[0] / np.sqrt(weights)
     values = np.column_stack([np.ones(2 * len(unit)), np.concatenate([turned.T, -turned.T])])
-    happens = (np.einsum("kij,cj->cki", np.array(rows), values) for rows in (states, measured))
-    return World(plant, sensors, links, *happens, np.tile(weights / 2, 2))
+    state, received = (np.einsum("kij,cj->cki", np.array(rows), values) for rows in (states, measured))
+    return World(plant, sensors, links, state, received, np.tile(weights / 2, 2))
 
 
 def ratio_in(world: World, network: Any, name: str, reports: Any = None) -> Ratio:

@@ -1,7 +1,13 @@
-"""The committed benchmark results have the documented shape and follow from their own numbers; no timing here."""
+"""The committed results have the documented shape and follow from their numbers; the programs call what there is.
+
+No timing here.
+"""
 
 import importlib
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -100,3 +106,29 @@ def test_the_drawn_problems_fit_their_models(bench: ModuleType) -> None:
     # E z = mu C f(x_0) up to the curvature of f (below 1e-3); 4,000 draws of spread 1.05 have a standard error of
     # 0.017, of which 0.08 is nearly five.
     assert p["z"][:, 0].mean(axis=0) == pytest.approx(p["gain"] * p["C"] @ moved, abs=0.08)
+
+
+LAX = (
+    "union-attr",
+    "arg-type",
+    "assignment",
+    "misc",
+    "method-assign",
+    "return-value",
+)  # types alone, not names and calls
+
+
+@pytest.mark.slow
+def test_every_benchmark_calls_what_there_is(tmp_path: Path) -> None:
+    # Nothing else runs these programs, and a renamed function would be found by whoever wants to measure.
+    options = ["--config-file=", "--ignore-missing-imports", "--no-strict-optional", f"--cache-dir={tmp_path}"]
+    options += [f"--disable-error-code={code}" for code in LAX]
+    completed = subprocess.run(
+        [sys.executable, "-m", "mypy", *options, *(f"benchmarks/{path.name}" for path in sorted(FOLDER.glob("*.py")))],
+        cwd=FOLDER.parent,
+        env=os.environ | {"MYPYPATH": os.pathsep.join(map(str, (FOLDER, FOLDER / "peers", FOLDER.parent / "src")))},
+        capture_output=True,
+        text=True,
+    )
+    assert not [line for line in completed.stdout.splitlines() if line.startswith("benchmarks/")], completed.stdout
+    assert "checked" in completed.stdout
