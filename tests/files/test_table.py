@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import heliograph.files.table
 from heliograph.disk.whole_file import check_output, check_output_folder, naming
 from heliograph.files.table import read_table, write_table
 
@@ -39,6 +40,18 @@ def test_numbers_survive_a_file_bit_by_bit(tmp_path, name):
     assert list(read) == list(COLUMNS)
     for column, values in COLUMNS.items():
         np.testing.assert_array_equal(read[column], values)
+
+
+def test_decimals_in_csv_are_those_of_python(tmp_path):
+    c = np.random.default_rng(0)
+    ends = [0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1e-5, 1e-4, 1e16, np.nextafter(1e-5, 0), np.nextafter(1e16, 0)]
+    any_bits = c.integers(0, 2**64, 20_000, dtype=np.uint64).view(float)
+    values = np.concatenate([ends, any_bits, c.standard_normal(20_000) * 10.0 ** c.integers(-12, 18, 20_000)])
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = values.astype(np.float32)
+    write_table({"a": values, "b": single}, tmp_path / "table.csv")
+    _, *lines = (tmp_path / "table.csv").read_text().splitlines()
+    assert lines == [f"{a!r},{b!r}" for a, b in zip(values.tolist(), single.tolist(), strict=True)]
 
 
 def test_csv_as_people_write_it(tmp_path):
@@ -127,16 +140,15 @@ def test_interrupted_writing_leaves_what_was_there(tmp_path, monkeypatch, name, 
 
 
 def test_error_between_rows_leaves_nothing(tmp_path, monkeypatch):
-    class Breaking:
-        def __init__(self, column):
-            self.column = column
+    format_cells = heliograph.files.table._format_cells
 
-        def tolist(self):
-            yield from self.column.tolist()[:-1]
+    def breaks_at_the_end(column):
+        if column[-1] == 99_999:
             assert [path.stat().st_size > 0 for path in tmp_path.iterdir()] == [True]  # rows are in a partial file
             raise RuntimeError("between rows")
+        return format_cells(column)
 
-    monkeypatch.setattr("heliograph.files.table._plain", Breaking)
+    monkeypatch.setattr("heliograph.files.table._format_cells", breaks_at_the_end)
     with pytest.raises(RuntimeError, match="between rows"):
         write_table({"time": np.arange(100_000.0)}, tmp_path / "out.csv")
     assert not list(tmp_path.iterdir())

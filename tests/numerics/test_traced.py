@@ -3,8 +3,9 @@
 import jax
 import numpy as np
 import pytest
+import scipy.linalg
 
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import block_diagonal, is_traced
 
 
 @pytest.mark.parametrize("hold", [lambda x: x, lambda x: [1.0, x], lambda x: {"a": (np.ones(2), x)}])
@@ -24,3 +25,11 @@ def test_a_traced_number_is_found_where_it_stands(hold):
 )
 def test_what_is_known_is_not_traced(value):
     assert not is_traced(value)
+
+
+def test_blocks_along_the_diagonal_are_those_of_scipy_known_and_traced():
+    c = np.random.default_rng(0)
+    blocks = [c.standard_normal(shape) for shape in ((2, 3), (1, 1), (0, 2), (3, 1))]
+    expected = scipy.linalg.block_diag(*blocks)
+    np.testing.assert_array_equal(block_diagonal(blocks), expected)
+    np.testing.assert_array_equal(jax.jit(lambda *traced: block_diagonal(traced))(*blocks), expected.astype(np.float32))

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
+import msgspec
 import numpy as np
 
 from heliograph.disk.quoting import quote_for_cell, unquote_cell
@@ -22,6 +23,9 @@ from heliograph.numerics.types import Shaped
 TIME = "time"
 PACKED = ".gz"
 EXACT = 2**53  # up to here doubles hold every whole number
+WITH_EXPONENT = 1e-5, 1e-4  # sizes of numbers that Python writes with an exponent, and JSON without
+LARGE = 1e16  # size from which on Python writes a sign before the exponent
+BLOCK = 4096  # rows whose cells are in memory as texts at a time
 
 
 def columns_of(table: object, name: str = "table", only: Container[str] | None = None) -> dict[str, np.ndarray]:
@@ -354,9 +358,28 @@ def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
         _check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
         csv.writer(file).writerow(map(quote_for_cell, columns))
-        # Numbers and dates need no quotes, and are joined in two thirds of the time of a writer of cells.
-        cells = (map(str, _plain(column).tolist()) for column in columns.values())
-        file.writelines(f"{','.join(row)}\r\n" for row in zip(*cells, strict=True))
+        # Numbers and dates need no quotes.
+        for start in range(0, len(next(iter(columns.values()))), BLOCK):
+            cells = [_format_cells(column[start : start + BLOCK]) for column in columns.values()]
+            file.writelines(f"{','.join(row)}\r\n" for row in zip(*cells, strict=True))
+
+
+def _format_cells(column: np.ndarray) -> list[str]:
+    """Write each value as Python does, a float with all digits that it takes to read it back.
+
+    JSON has the same digits, and is written in a tenth of the time; what it says otherwise is written by Python.
+    """
+    if column.dtype.kind != "f":
+        return list(map(str, _plain(column).tolist()))
+    values = column.tolist()
+    text = msgspec.json.encode(values).decode().replace("]", ",")
+    for digit in "6789":  # of an exponent Python writes two digits
+        text = text.replace(f"e-{digit},", f"e-0{digit},")
+    texts, size = text[1:-1].split(","), np.abs(column.astype(np.float64))
+    otherwise = (size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1]) | ~(size < LARGE)
+    for row in np.flatnonzero(otherwise).tolist():
+        texts[row] = repr(values[row])
+    return texts
 
 
 def read_back_name(name: str) -> str:

@@ -22,7 +22,6 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "bokeh": "explore",
     "dask": "cluster",
     "distributed": "cluster",
-    "msgspec": "live",
     "pydantic": "live",
     "pydantic_core": "live",
     "sqlalchemy": "live",

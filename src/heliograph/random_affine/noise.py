@@ -13,7 +13,7 @@ from heliograph.factors.columns import Columns, columns_of, eliminate, square_ro
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stack_parts
+from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.law import draw_index
 from heliograph.random_affine.moments.monomials import Exponents, exponents
@@ -173,7 +173,7 @@ class Independent(AbstractNoise):
                 raise fail("independent noises", "laws of a noise vector", show_value(component))
         means, blocks = [component.mean for component in self.parts], [component.covariance for component in self.parts]
         self.mean = library(means).concatenate(means)
-        self.covariance = scipy_for(blocks).linalg.block_diag(*blocks)
+        self.covariance = block_diagonal(blocks)
 
     @property
     def columns(self) -> Columns:
@@ -181,7 +181,7 @@ class Independent(AbstractNoise):
         parts = [component.columns for component in self.parts]
         matrices = [part.matrix for part in parts]
         weights = library(parts).concatenate([part.weights for part in parts])
-        return Columns(scipy_for(parts).linalg.block_diag(*matrices), weights)
+        return Columns(block_diagonal(matrices), weights)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.numerics import check
 from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
-from heliograph.numerics.traced import is_traced, library, plain, scipy_for
+from heliograph.numerics.traced import block_diagonal, is_traced, library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.law import draw_index
 from heliograph.random_affine.moments.monomials import Exponents
@@ -232,8 +232,8 @@ def nominal(noise: AbstractNoise) -> Nominal:
     match noise:
         case Independent():
             items = [nominal(law) for law in noise.parts]
-            xp, block = library(items), scipy_for(items).linalg.block_diag
-            return Nominal(xp.concatenate([law.mean for law in items]), block(*[law.covariance for law in items]))
+            mean = library(items).concatenate([law.mean for law in items])
+            return Nominal(mean, block_diagonal([law.covariance for law in items]))
         case Contaminated():
             return Nominal(noise.means[0] - noise.mean, noise.covariances[0])
         case StudentT():
