@@ -30,9 +30,12 @@ def mix_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n
     return sums.reshape(*axes, -1, n, n)
 
 
-def propagate(maps: Float[Array, "..."], moments: Float[Array, "..."], added: Array | float) -> Any:
-    """Return F X F' + S, of each mode."""
-    return maps @ moments @ maps.swapaxes(-1, -2) + added
+def propagate(maps: Any, moments: Float[Array, "..."], added: Array | float) -> Any:
+    """Propagate second moments over a linear step, X+ = F X F' + S, of each mode, of a symmetric X.
+
+    F X F' = F (F X)', so that F is only ever multiplied from the left: it may be sparse, or structured with an `@`.
+    """
+    return maps @ (maps @ moments).swapaxes(-1, -2) + added
 
 
 @readable

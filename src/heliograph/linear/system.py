@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.linear.jump_system import propagate
 from heliograph.model.estimate import STRENGTH, Claim
 from heliograph.model.premise import NOTHING, Kept
 from heliograph.numerics import check
@@ -140,7 +141,7 @@ def state_moments(system: LinearSystem) -> StateMoments:
     for k in range(system.horizon):
         s = system.step(k)
         mean = s.transition @ mean + s.drift
-        spread = s.transition @ spread @ s.transition.T + s.process
+        spread = propagate(s.transition, spread, s.process)
         means.append(mean)
         spreads.append(spread)
     return StateMoments(np.array(means), np.array(spreads))

@@ -3,8 +3,6 @@
 Pi = E (x, 1)(x, 1)' is that of the state, mean included, not of an estimate's error: Pi+ = A Pi A' + Q.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -106,17 +104,17 @@ def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
     start = first(plant)
     if not isinstance(start, LinearPlant):
         raise fail("plant", "a LinearPlant", type(start).__name__)
-    mean: Any = start.initial_mean
-    spread: Any = start.initial_covariance
     u = np.zeros((horizon, len(start.inputs))) if inputs is None else np.asarray(inputs)
-    seconds = []
+    # (x, 1)+ = [A, b; 0, 1] (x, 1) + (w, 0): one mode at every step.
+    maps, added = [], []
     for k in range(horizon):
         now = at(plant, k)
         noise_mean, noise = _noise(now, u[k])
-        mean = now.matrix @ mean + now.input_matrix @ u[k] + noise_mean
-        spread = now.matrix @ spread @ now.matrix.T + noise
-        seconds.append(_second_moment(mean, spread))
-    return seconds
+        maps.append(_extend(now.matrix, now.input_matrix @ u[k] + noise_mean))
+        added.append(library(noise).pad(noise, ((0, 1), (0, 1))))
+    xp = library(maps, added)
+    system = JumpSystem(np.ones((horizon, 1, 1)), xp.stack(maps)[:, None], xp.stack(added)[:, None])
+    return [one for (one,) in system.after(_second_moment(start.initial_mean, start.initial_covariance)[None])]
 
 
 def _noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
@@ -131,9 +129,15 @@ def measurement_moment(sensor: AnySensor, second: Float[Array, "n1 n1"], step: i
     """Second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
     now = at(sensor, step)
     c, offset, noise = now.matrix, now.noise.mean, now.noise.covariance
-    xp = library(c, offset, noise, second)
-    rows = xp.block([[c, offset[:, None]], [np.zeros((1, c.shape[1])), np.ones((1, 1))]])
-    return rows @ second @ rows.T + xp.pad(noise, ((0, 1), (0, 1)))  # type: ignore[no-any-return]
+    rows = _extend(c, offset)
+    return rows @ second @ rows.T + library(noise).pad(noise, ((0, 1), (0, 1)))  # type: ignore[no-any-return]
+
+
+def _extend(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
+    """Matrix of (x, 1) -> (M x + shift, 1)."""
+    last = np.eye(1, matrix.shape[1] + 1, matrix.shape[1])
+    xp = library(matrix, shift)
+    return xp.concatenate([xp.concatenate([matrix, shift[:, None]], axis=1), last])  # type: ignore[no-any-return]
 
 
 def _second_moment(mean: Float[Array, "n"], covariance: Float[Array, "n n"]) -> Float[Array, "n1 n1"]:

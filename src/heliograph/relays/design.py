@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.linear.jump_system import propagate
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
@@ -15,6 +16,7 @@ from heliograph.model.premise import Premise, believing
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import (
@@ -22,7 +24,7 @@ from heliograph.relays.second_moments import (
     correct,
     initial_moments,
     linear_maps,
-    propagate,
+    propagate_slots,
     step_moments,
 )
 
@@ -73,7 +75,7 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     return as_design(network, _propagate(steps, start_moments(network), joined))
 
 
-_propagate = compile_in_float64(propagate)
+_propagate = compile_in_float64(propagate_slots)
 
 
 def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
@@ -305,8 +307,8 @@ def relay_side(p: Steps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"
     moved = close @ full
     noise = jax.scipy.linalg.block_diag(p.process, p.sensor_noise)
     _, sent = step_moments(p, moments)
-    random = jnp.einsum("ijab,ab->ij", p.spread, sent.second)
-    white = moved[:, d:] @ noise @ moved[:, d:].T + close[:, known:] @ random @ close[:, known:].T
+    random = contract(p.spread, sent.second)
+    white = propagate(moved[:, d:], noise, propagate(close[:, known:], random, 0.0))
     return RelaySide(moved[:known, :known], moved[known:, :known], white)
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import make_entry_matrix, solve_fixed_point
+from heliograph.linear.jump_system import make_entry_matrix, propagate, solve_fixed_point
 from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import fail, instance, repeat_per_step
@@ -27,7 +27,7 @@ from heliograph.relays.design import (
     split_gains,
     start_moments,
 )
-from heliograph.relays.second_moments import Propagated, gain_mask, propagate
+from heliograph.relays.second_moments import Propagated, gain_mask, propagate_slots
 
 CONVERGED = 1e-13  # relative change of the moments over a period
 PERIODS = 100_000
@@ -123,7 +123,7 @@ def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[
 def steady(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Propagated:
     """Moments over a period that ends as it begins; differentiable in the gains. Meaningful if `is_covariance`."""
     d = gains.shape[1] + steps.transition.shape[-1]
-    return propagate(steps, affine_fixed_point(lambda m: propagate(steps, m, gains).moments[-1], d), gains)
+    return propagate_slots(steps, affine_fixed_point(lambda m: propagate_slots(steps, m, gains).moments[-1], d), gains)
 
 
 def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
@@ -145,12 +145,12 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
 
     def predict(spread: jax.Array, at_slot: RelaySide) -> jax.Array:
         both = jnp.concatenate([at_slot.transition, at_slot.output])
-        return both @ spread @ both.T + at_slot.noise
+        return jnp.asarray(propagate(both, spread, at_slot.noise))
 
     def corrected(z: jax.Array, gain: jax.Array) -> jax.Array:
         """Joseph's form: affine in the covariance of the state and of what is received."""
         close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
-        return close @ z @ close.T
+        return jnp.asarray(propagate(close, z, 0.0))
 
     # Riccati recursion of the receiver, held constant under differentiation.
     def best(spread: jax.Array, at_slot: RelaySide) -> tuple[jax.Array, jax.Array]:
@@ -185,7 +185,7 @@ _steady_behind = compile_in_float64(steady_behind)
 def _operator(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
     """Linear part of one period of the second moments."""
     d = gains.shape[1] + steps.transition.shape[-1]
-    _, linear = jax.linearize(lambda m: propagate(steps, m, gains).moments[-1], jnp.zeros((d, d)))
+    _, linear = jax.linearize(lambda m: propagate_slots(steps, m, gains).moments[-1], jnp.zeros((d, d)))
     return jnp.asarray(make_entry_matrix(jax.vmap(linear), (d, d)))
 
 
@@ -193,8 +193,8 @@ def _operator(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Arra
 def _solve_local_steady(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
     """Repeat the period until its moments change by less than CONVERGED."""
 
-    moments, change = _solve_steady(lambda m: propagate(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
-    return propagate(steps, moments), change
+    moments, change = _solve_steady(lambda m: propagate_slots(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
+    return propagate_slots(steps, moments), change
 
 
 def _solve_steady(

@@ -26,7 +26,7 @@ from heliograph.relays.second_moments import (
     correct,
     gain_mask,
     normal_matrix,
-    propagate,
+    propagate_slots,
     pull_back,
     step_moments,
 )
@@ -136,7 +136,7 @@ def _inside(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Fl
 @compile_in_float64
 def _judge(problem: Limited, gains: Float[Array, "time Fn R"]) -> tuple[Float[Array, ""], Float[Array, "time"]]:
     """The cost of given gains, and the part of each limit that they leave free."""
-    moments = propagate(problem.steps, problem.start, gains).moments[1:]
+    moments = propagate_slots(problem.steps, problem.start, gains).moments[1:]
     form, limit = problem.power
     return jnp.sum(problem.cost * moments), 1 - jnp.sum(form * moments, axis=(1, 2)) / limit
 
@@ -181,7 +181,7 @@ def _units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -
     The gradient with respect to moments, cost and barrier, is pulled back step by step.
     """
     steps, start, cost, (form, limit) = problem
-    moments = jnp.asarray(propagate(steps, start, gains).moments)
+    moments = jnp.asarray(propagate_slots(steps, start, gains).moments)
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
     slope = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
 
@@ -308,6 +308,6 @@ def _sweeps(
         return Search(gains, best, jnp.where(better, value, search.cost)), None
 
     first = jnp.asarray(local_gains)
-    value = jnp.sum(cost * propagate(steps, start, first).moments[1:])
+    value = jnp.sum(cost * propagate_slots(steps, start, first).moments[1:])
     search, _ = jax.lax.scan(sweep, Search(first, first, value), jnp.asarray(count))
     return search.best

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.linear.jump_system import propagate
 from heliograph.model.relays import Steps
-from heliograph.numerics.linalg import psd_solve, symmetrize
+from heliograph.numerics.linalg import contract, psd_solve, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 
 
@@ -68,10 +69,10 @@ def step_moments(p: Steps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Arra
     """
     maps, mean = linear_maps(p), sent_mean(p)
     sources = jax.scipy.linalg.block_diag(moments, p.process, p.sensor_noise)
-    second = jnp.outer(mean, mean).at[:-1, :-1].add(maps.sent @ sources @ maps.sent.T)
+    second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate(maps.sent, sources, 0.0))
     known = jnp.concatenate([maps.moved, maps.innovation])
     d = maps.moved.shape[0]
-    z = (known @ sources @ known.T).at[d:, d:].add(jnp.einsum("ijab,ab->ij", p.spread, second))
+    z = propagate(known, sources, 0.0).at[d:, d:].add(contract(p.spread, second))
     m = p.sensing.shape[0]
     power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * p.talks
     return z, Sent(second, power)
@@ -82,7 +83,7 @@ def correct(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Arr
     rows, received = gain.shape
     d = z.shape[0] - received
     full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, received)), -gain])], axis=1)
-    return symmetrize(full @ z @ full.T)
+    return symmetrize(propagate(full, z, 0.0))
 
 
 def gain_mask(p: Steps) -> Bool[np.ndarray, "Fn R"]:
@@ -136,7 +137,9 @@ class Propagated(NamedTuple):
     power: Float[Array, "time senders"]
 
 
-def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None) -> Propagated:
+def propagate_slots(
+    steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None
+) -> Propagated:
     """Propagate the covariance of eta from `start`, under given gains, or with each filter's own best next error.
 
     Entries of given gains on rows that receive nothing are not used.

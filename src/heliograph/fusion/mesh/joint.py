@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 
 from heliograph.fusion.mesh.gains import Gains
+from heliograph.linear.jump_system import propagate
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Bool, Float, Int
 
@@ -46,21 +47,13 @@ def spread(
     )
 
 
-def congruence(m: Any, joint: Float[Array, "N N"]) -> Float[Array, "N N"]:
-    """M J M' of a symmetric J."""
-    half = (m @ joint).T
-    carried: Float[Array, "N N"] = m @ (half if is_traced(half) else np.ascontiguousarray(half))
-    return carried
-
-
 def joint_after(
     joint: Float[Array, "N N"], m: Any, f: Float[Array, "node n n"], noise: Float[Array, "n n"], ws: Any, w: Any
 ) -> Float[Array, "N N"]:
     """J+ from M, F, Q, and the matrices of W_i S_j and of W_i over the measurements that node i has."""
-    wide, measured = f.reshape(len(joint), -1), ws @ w.T
-    after = congruence(m, joint)
-    after += wide @ noise @ wide.T
-    after += measured if is_traced(measured) else measured.toarray()
+    measured = ws @ w.T
+    added = propagate(f.reshape(len(joint), -1), noise, measured if is_traced(measured) else measured.toarray())
+    after = propagate(m, joint, added)
     joined: Float[Array, "N N"] = (after + after.T) / 2
     return joined
 

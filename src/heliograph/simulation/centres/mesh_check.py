@@ -7,10 +7,11 @@ import numpy as np
 import scipy
 
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
-from heliograph.fusion.mesh.joint import congruence, spread
+from heliograph.fusion.mesh.joint import spread
 from heliograph.fusion.mesh.rules import DiffusionWeights, FrozenWeights
 from heliograph.fusion.quantizer import UniformQuantizer
 from heliograph.fusion.rules import Fusion
+from heliograph.linear.jump_system import propagate
 from heliograph.linear.recursion import information_step
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
@@ -324,8 +325,8 @@ def _growth(
         cross = blocks[places[:, None], :, senders, :]
         top = np.concatenate([np.broadcast_to(blocks[places, :, places, :][:, None], cross.shape), cross], axis=3)
         below = np.concatenate([cross.swapaxes(2, 3), blocks[senders, :, senders, :]], axis=3)
-        more = both @ np.concatenate([top, below], axis=2) @ both.swapaxes(2, 3)
-        joint = np.asarray(congruence(m, joint))
+        more = propagate(both, np.concatenate([top, below], axis=2), 0.0)
+        joint = np.asarray(propagate(m, joint, 0.0))
         joint.reshape(nodes, n, nodes, n)[places, :, places, :] += (variance * more).sum(axis=1)
         # Their size, of which the next step is a multiple.
         logarithms.append(np.log(np.trace(joint)))

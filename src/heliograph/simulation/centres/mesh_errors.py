@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.fusion.mesh.joint import blocks_of, congruence, joint_after, spread, transitions, used
+from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
+from heliograph.linear.jump_system import propagate
 from heliograph.linear.recursion import information_step
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, instance, is_whole
@@ -141,7 +142,7 @@ def errors_over_time(
         blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if follows else None
         with jax.enable_x64(True):
             parts = to_numpy(_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
-        joint = propagate(mesh, joint, parts, arrived)
+        joint = _propagate_joint(mesh, joint, parts, arrived)
         covariance, moments = parts.gains.covariance, parts.plant
         error = np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy()
         yield joint, error, error if follows else covariance
@@ -156,14 +157,14 @@ def _parts(
     return mesh.parts(covariance, blocks, moments, there, arrived, u, k)
 
 
-def propagate(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np.ndarray) -> np.ndarray:
+def _propagate_joint(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np.ndarray) -> np.ndarray:
     """Joint covariance (N, N) after a step."""
     gains, present, senders = parts.gains, mesh.edges.present, mesh.senders
     # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).
     for number, weights in enumerate(parts.exchanges):
         held = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
         held[:, 0] = np.eye(held.shape[-1]) - held[:, 1:].sum(axis=1)
-        joint = np.asarray(congruence(spread(held, senders, present), joint))
+        joint = np.asarray(propagate(spread(held, senders, present), joint, 0.0))
     m = spread(transitions(gains, parts.motion.matrix), senders, present)
     # Measurements of neighbours, or of all whose measurement a node has after all rounds.
     there = arrived[:, 0] & present
@@ -218,7 +219,7 @@ def best_possible(
     covariance = np.array(start.covariance)
     for model, total in zip(steps, reversed(information), strict=True):
         a = np.asarray(model.motion.matrix)
-        covariance = information_step(a @ covariance @ a.T + model.motion.noise, total)
+        covariance = information_step(propagate(a, covariance, model.motion.noise), total)
     return covariance
 
 

@@ -20,6 +20,7 @@ from heliograph.fusion.mesh.gains import Gains
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.linear.jump_system import propagate
 from heliograph.model.channel import Channel
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
@@ -132,7 +133,7 @@ def _mean(
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
     noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
-    same = mean(flat @ inside @ flat.swapaxes(1, 2) + f @ q @ f.swapaxes(1, 2) + noise)
+    same = mean(propagate(flat, inside, propagate(f, q, noise)))
     whole = after.reshape(count, n, count, n)
     items = np.arange(count)
     whole[items, :, items, :] = same
