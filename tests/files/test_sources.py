@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.fields import at, decode_json, matches, nanoseconds
-from heliograph.files.sources import Sources
+from heliograph.files.sources import Sources, Unread
 
 json_field = hg.files.json_field
 PLANT = hg.Plant(
@@ -21,9 +21,16 @@ STEPS = hg.LinearPlant([[1.0]], [[0.1]], [0.0], [[1.0]], states=["x"])
 COUNTING = hg.Network(STEPS, {"garden": hg.Node(hg.LinearSensor([[1.0]], 0.5), hg.perfect(), {})})
 
 
-def read(source, message, network=NETWORK):
-    (reading,) = Sources({"t": source}, network).read("t", message, "t")
+def only(readings):
+    """Return the only reading; raise why it could not be read."""
+    (reading,) = readings
+    if isinstance(reading, Unread):
+        raise reading.error
     return reading
+
+
+def read(source, message, network=NETWORK):
+    return only(Sources({"t": source}, network).read("t", message, "t"))
 
 
 def test_a_field_becomes_its_output_in_its_unit():
@@ -186,7 +193,7 @@ def test_plant_and_node_come_from_a_topic_or_a_field():
     (reading,) = sources.read("house/south/t", {"t": 3.0, "device": 5}, "m")
     assert (reading.plant, reading.node, reading.values[1]) == ("5", "south", 3.0)
     with pytest.raises(ValueError, match="m, node: expected one of north, south, got '3'"):
-        sources.read("ranging/tag7", {"r": 2.0, "anchor_id": 3}, "m")
+        only(sources.read("ranging/tag7", {"r": 2.0, "anchor_id": 3}, "m"))
 
 
 def test_a_wildcard_that_would_merge_sensors_is_refused():
@@ -222,7 +229,7 @@ def test_a_message_with_a_count_and_without_a_value_measured_nothing():
     sources.read("t", {"at": 1, "n": 1, "v": 2}, "m")
     assert "expected a field 'w', got no 'w' in at, n, v" in sources.never()
     with pytest.raises(ValueError, match="expected a field 'v'"):
-        Sources({"t": json_field("v", "garden", "in", sequence="n")}, NETWORK).read("t", {"at": 1}, "m")
+        read(json_field("v", "garden", "in", sequence="n"), {"at": 1})
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.4, 0.0, 2.5])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from heliograph.numerics.check import InputError
-from heliograph.serving.message import Message, NumberedMessage, read_message, read_messages
+from heliograph.serving.message import Message, NumberedMessage, UnreadMessage, read_message, read_messages
 
 FIELDS = {"node": '"a"', "sequence": "1", "time": "1"}
 VALUES = (
@@ -37,7 +37,10 @@ def test_a_line_is_read_or_refused_as_pydantic_does(field):
             for first in (b'{"node": "a", "sequence": 1, "time": 1}', b'{"node": "a", "sequence": 1, "time": "x"}'):
                 _, read = read_messages([first, payload])
                 expected = by_pydantic(payload)
-                assert isinstance(read, str) == isinstance(expected, str)
+                assert isinstance(read, str | UnreadMessage) == isinstance(expected, str)
+                if isinstance(read, UnreadMessage):
+                    assert (read.why, read.read.node, read.read.sequence) == (expected, "a", 1)
+                    continue
                 if isinstance(read, str):
                     assert read == expected
                     continue

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from heliograph.files.sources import Reading
 from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.plant import GAP
 from heliograph.numerics.check import fail
@@ -16,7 +17,6 @@ from heliograph.simulation.node import Node
 
 SECOND = 10**9  # nanoseconds
 YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
-NO_COUNTS = np.zeros(0, dtype=np.int64)
 CENTURY = 946_684_800 * SECOND  # 2000-01-01
 
 USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
@@ -30,7 +30,8 @@ class Columns:
         size: numbers of each event.
         numbers: whether times are floats.
         period: after how many messages the count begins at 0 again; 0 if it does not.
-        unset: of the messages whose stamps were not set: moments near which they came, and their counts.
+        unread: of the messages that came and are no events, since they could not be read or their stamps were not set:
+            moments near which they came, and their counts.
     """
 
     size: int
@@ -40,7 +41,7 @@ class Columns:
     arrival: "array[Any]" = field(init=False)
     sequence: "array[int]" = field(default_factory=lambda: array("q"))
     values: "array[float]" = field(default_factory=lambda: array("d"))
-    unset: tuple[np.ndarray, np.ndarray] = field(init=False, default=(NO_COUNTS, NO_COUNTS))
+    unread: list[tuple[float, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.time, self.arrival = (array("d" if self.numbers else "q") for _ in range(2))
@@ -59,15 +60,24 @@ class Columns:
         """Return the values, a row for each event."""
         return np.array(self.values).reshape(len(self.time), self.size)
 
+    def note_unread(self, reading: Reading, arrival: float | None) -> None:
+        """Note a message that came with its count and could not be read, at its time or arrival, else at the newest."""
+        moments = (reading.time, arrival, self.time[-1] if self.time else None)
+        near = next((moment for moment in moments if moment is not None), None)
+        if near is not None and reading.sequence is not None:
+            self.unread.append((near, reading.sequence))
+            self.period = reading.period
+
     def count_lost(self) -> int | None:
         """Count the gaps in the node's count, in the order of its times; None without a count.
 
-        A message whose stamp was not set is none that was lost.
+        A message that came and could not be read, or whose stamp was not set, is none that was lost.
         """
         time, _, sequence = self.arrays()
         if not len(time) or sequence.min() < 0:
             return None
-        moments, counts = self.unset
+        moments = np.array([moment for moment, _ in self.unread], dtype=time.dtype)
+        counts = np.array([count for _, count in self.unread], dtype=np.int64)
         return count_gaps(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
 
     def without_unset(self, name: str) -> tuple[str, str, int]:
@@ -92,7 +102,8 @@ class Columns:
         # They came when those did that were set just before them, or first.
         set_before = np.maximum.accumulate(np.where(unset, -1, np.arange(len(time))))
         near_them = time[np.where(set_before < 0, np.argmin(unset), set_before)]
-        self.unset = (arrival if late.any() else near_them)[unset], sequence[unset]
+        moments = (arrival if late.any() else near_them)[unset]
+        self.unread += zip(moments.tolist(), sequence[unset].tolist(), strict=True)
         self.keep(~unset)
         return "", str(fail(name, f"a time that was set, near {near}", got)), count
 

@@ -136,6 +136,10 @@ class EventTable:
         columns.values.frombytes(values.tobytes())
         columns.period = period
 
+    def note_unread(self, reading: Reading, arrival: float | None) -> None:
+        """Note a message of a node that came with its count and could not be read."""
+        self._columns(reading.plant)[reading.node].note_unread(reading, arrival)
+
     def refuse(self, error: InputError, strict: bool) -> None:
         """Count a message that cannot be read, with the reason.
 
@@ -145,8 +149,7 @@ class EventTable:
         if strict:
             raise error
         self.refused += 1
-        if len(self.reasons) < 3:
-            self.reasons.append(str(error))
+        self.reasons += [str(error)] if len(self.reasons) < 3 else []
 
     def finish(self, source: str) -> None:
         """End the reading of a source: leave out stamps that were not set; say what was left out.

@@ -15,7 +15,7 @@ from heliograph.files.message_files import (
     table_has_topics,
 )
 from heliograph.files.own_messages import OwnMessages, holds_events, is_own
-from heliograph.files.sources import Sources
+from heliograph.files.sources import Sources, Unread
 from heliograph.files.table import kind_of
 from heliograph.numerics.check import InputError, check_progress, fail, file_path, flag, instance
 from heliograph.simulation.network import Network
@@ -125,6 +125,11 @@ def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable
         content = payload_of(message) if sources.of(topic) else None
         came = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
         for reading in sources.read(topic, content, message.where):
+            if isinstance(reading, Unread):
+                events.refuse(reading.error, strict)
+                if reading.counted is not None:
+                    events.note_unread(reading.counted, came)
+                continue
             arrival = reading.time if came is None else came
             if arrival is None:
                 what = "a time field (time=...), or a field or column 'arrival'"

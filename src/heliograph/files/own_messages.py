@@ -20,6 +20,7 @@ from heliograph.simulation.network import Network
 
 EXACT = 2**53  # up to here doubles hold every whole number
 NODE, SEQUENCE, TIME, ARRIVAL, VALUES, PLANT = "node", "sequence", "time", "arrival", "values", "plant"
+NOTHING = np.zeros(0)
 OWN = (NODE, SEQUENCE, TIME, ARRIVAL, VALUES, INPUTS, PLANT)
 
 
@@ -99,7 +100,6 @@ class OwnMessages:
         node = row[NODE]
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
-        values = _read_values(row, self.components[node], where, node in self._numbered)
         sequence = _whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
         time, dated = self._moment(row[TIME], f"{where}, column {TIME!r}")
         arrival = time
@@ -108,6 +108,11 @@ class OwnMessages:
         plant = "" if row.get(PLANT) is None else name_of(row[PLANT], f"{where}, column {PLANT!r}")
         if self._table is None:
             self._table = EventTable(self.network, numbers=not dated)
+        try:
+            values = _read_values(row, self.components[node], where, node in self._numbered)
+        except InputError:
+            self._table.note_unread(Reading(plant, node, sequence, time, NOTHING), arrival)
+            raise
         if isinstance(row.get(INPUTS), list) and node != INPUTS:
             given = _read_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
             self._table.add(Reading(plant, INPUTS, sequence, time, given), arrival)

@@ -19,21 +19,28 @@ class SeveralSenders:
     def __init__(self) -> None:
         self._counts: dict[tuple[str, str, str, str], Counter[object]] = defaultdict(Counter)
         self._names: dict[str, bool] = {}
+        self._noted, self._said = 0, set[tuple[str, str]]()
 
     def note(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
         """Note a message that was read as one of a node of a plant; fields that are `asked` for say what they mean."""
+        self._noted += 1
         for name, value in message.items() if isinstance(message, Mapping) else ():
             if isinstance(value, str | int) and name not in asked and self._is_name(name):
                 counts = self._counts[topic, plant, node, name]
                 if len(counts) <= MANY:
                     counts[value] += 1
 
+    def news(self) -> list[str]:
+        """Return what `lines` does after 1, 2, 4, 8, ... messages, and nothing in between."""
+        return self.lines() if self._noted & (self._noted - 1) == 0 else []
+
     def lines(self) -> list[str]:
-        """Say which fields have several values that come again, a line for each field of a topic."""
+        """Say which fields have several values that come again, a line for each field of a topic; each is said once."""
         found: dict[tuple[str, str], list[object]] = {}
         for (topic, _, _, name), counts in self._counts.items():
-            if 2 <= len(counts) <= MANY and counts.total() >= 2 * len(counts):
+            if (topic, name) not in self._said and 2 <= len(counts) <= MANY and counts.total() >= 2 * len(counts):
                 found.setdefault((topic, name), list(counts))
+        self._said |= found.keys()
         lines = []
         for (topic, name), values in found.items():
             more = "" if len(values) <= LISTED else ", ..."

@@ -13,7 +13,7 @@ from heliograph.files.json_field import Field, Source, Yaw
 from heliograph.files.senders import SeveralSenders
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
@@ -40,6 +40,18 @@ class Reading(NamedTuple):
     time: int | None
     values: Float[np.ndarray, " size"]
     period: int = 0
+
+
+class Unread(NamedTuple):
+    """Why a source could not read a message.
+
+    Attributes:
+        error: the reason.
+        counted: plant, node, count and time of the message where these were read; else None.
+    """
+
+    error: InputError
+    counted: Reading | None
 
 
 class Mapped(NamedTuple):
@@ -162,20 +174,26 @@ class Sources:
         """
         return self.words.hear(topic, payload, where)
 
-    def read(self, topic: str, message: object, where: str) -> list[Reading]:
+    def read(self, topic: str, message: object, where: str) -> list[Reading | Unread]:
         """Read the message of a topic, one reading for each source; none, and counted, if the topic is unknown.
+
+        A source for which a field is not there, or is no number, time or count, says so; the others are read.
 
         Args:
             topic: the topic of the message.
             message: decoded JSON, a message of a bag, or a dictionary of a row.
             where: place of the message, for errors.
-
-        Raises:
-            ValueError: a field that is not there, or is no number, time or count; one line that names it.
         """
-        sources = self.of(topic)
+        sources, results = self.of(topic), list[Reading | Unread]()
         self.unknown[topic] += not sources
-        return [reading for mapped in sources if (reading := self._reading(mapped, topic, message, where)) is not None]
+        for mapped in sources:
+            try:
+                reading = self._read(mapped, topic, message, where)
+            except InputError as error:
+                results.append(Unread(error, self._read_count(mapped, topic, message, where)))
+            else:
+                results += [] if reading is None else [reading]
+        return results
 
     def original(self, reading: Reading, arrival: int | None) -> Reading:
         """Give a copy of the message before of its node the time of that; any other reading is returned as it is.
@@ -202,7 +220,12 @@ class Sources:
         """Return what was said of a field that no message of its topic had; "" if there is none."""
         return next((said for key, said in self.absent.items() if key not in self.found), "")
 
-    def _reading(self, mapped: Mapped, topic: str, message: object, where: str) -> Reading | None:
+    def _read(self, mapped: Mapped, topic: str, message: object, where: str) -> Reading | None:
+        """Read a message by one of its sources; None of one that a condition leaves out, or that is of another process.
+
+        Raises:
+            ValueError: a field that is not there, or is no number, time or count; one line that names it.
+        """
         source, pattern, places = mapped
         # A condition leaves a message out.
         for field, allowed in source.where.items():
@@ -212,13 +235,11 @@ class Sources:
         if any(self.words.offline(condition, topic) for condition in source.available):
             self.offline[topic] += 1
             return None
-        # Node, plant and count name a measurement.
-        node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
+        plant, node = _read_names(mapped, topic, message, where)
         if node in self.others:
             return None
         if node not in places:
             raise fail(f"{where}, node", f"one of {', '.join(places)}", _near(node, places))
-        plant = "" if source.plant is None else source.plant.of(topic, message, where)
         sequence, missing = self._sequence(source, pattern, message, where)
         # Values; of a message that has its count they may be absent.
         values = np.full(len(self.names[node]), np.nan)
@@ -231,14 +252,25 @@ class Sources:
                 if sequence is None or missing:
                     raise
                 self.absent.setdefault((pattern, str(path)), str(error))
-        # A time names its measurement; without one the count is left to the receiver.
-        time = None
-        if source.time is not None:
-            stamp, name = source.time, f"{where}, field {source.time.path!r}"
-            time = nanoseconds(at(message, stamp.path, where), source.time_unit, name, source.quoted)
-            time += round(stamp.offset * SECOND)
         period = 0 if source.sequence is None else source.sequence.period
-        return Reading(plant, node, sequence, time, values, period)
+        return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
+
+    def _read_count(self, mapped: Mapped, topic: str, message: object, where: str) -> Reading | None:
+        """Read plant, node, count and time of a message that is unreadable otherwise; None where these are too."""
+        try:
+            plant, node = _read_names(mapped, topic, message, where)
+            sequence, missing = self._sequence(mapped.source, mapped.pattern, message, where)
+        except InputError:
+            return None
+        if sequence is None or missing or node not in mapped.places:
+            return None
+        try:
+            time = _read_time(mapped.source, message, where)
+        except InputError:
+            time = None
+        nothing = np.full(len(self.names[node]), np.nan)
+        period = 0 if mapped.source.sequence is None else mapped.source.sequence.period
+        return Reading(plant, node, sequence, time, nothing, period)
 
     def _sequence(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
         """Return the count of a message, None where there are none, and whether it is absent, and so 0."""
@@ -307,6 +339,22 @@ class Sources:
             if output not in known:
                 raise fail(f"{name}, output", f"one of {', '.join(known)}", _near(output, known))
         return np.array([known.index(output) for output in outputs])
+
+
+def _read_names(mapped: Mapped, topic: str, message: object, where: str) -> tuple[str, str]:
+    """Return the plant of a message, "" for a single one, and its node."""
+    source = mapped.source
+    node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
+    return "" if source.plant is None else source.plant.of(topic, message, where), node
+
+
+def _read_time(source: Source, message: object, where: str) -> int | None:
+    """Return the time that names a measurement, in nanoseconds since 1970 or steps; None if the source has none."""
+    if source.time is None:
+        return None
+    stamp, name = source.time, f"{where}, field {source.time.path!r}"
+    time = nanoseconds(at(message, stamp.path, where), source.time_unit, name, source.quoted)
+    return time + round(stamp.offset * SECOND)
 
 
 def _more(count: int) -> str:

@@ -167,11 +167,10 @@ def write_table(columns: Mapping[str, Shaped[np.ndarray, "..."]], path: str | Pa
 
 def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError unless all columns are arrays of one axis and one length."""
-    named = table("columns of a table", columns, "arrays")
-    for name, column in named.items():
+    for name, column in table("columns of a table", columns, "arrays").items():
         if not isinstance(column, np.ndarray) or column.ndim != 1 or column.dtype.kind not in "fiubM":
             raise fail(f"column {name!r}", "an array of numbers or dates", show_value(column))
-    lengths = {name: len(column) for name, column in named.items()}
+    lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) != 1:
         raise fail("columns of a table", "at least one, all of one length", lengths)
 
@@ -358,9 +357,8 @@ def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
         _check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
         csv.writer(file).writerow(map(quote_for_cell, columns))
-        # Numbers and dates need no quotes.
         for start in range(0, len(next(iter(columns.values()))), BLOCK):
-            cells = [_format_cells(column[start : start + BLOCK]) for column in columns.values()]
+            cells = [_format_cells(column[start : start + BLOCK]) for column in columns.values()]  # they need no quotes
             file.writelines(f"{','.join(row)}\r\n" for row in zip(*cells, strict=True))
 
 
@@ -371,12 +369,12 @@ def _format_cells(column: np.ndarray) -> list[str]:
     """
     if column.dtype.kind != "f":
         return list(map(str, _plain(column).tolist()))
-    values = column.tolist()
+    values, size = column.tolist(), np.abs(column.astype(np.float64))
     text = msgspec.json.encode(values).decode().replace("]", ",")
     for digit in "6789":  # of an exponent Python writes two digits
         text = text.replace(f"e-{digit},", f"e-0{digit},")
-    texts, size = text[1:-1].split(","), np.abs(column.astype(np.float64))
     otherwise = (size >= WITH_EXPONENT[0]) & (size < WITH_EXPONENT[1]) | ~(size < LARGE)
+    texts = text[1:-1].split(",")
     for row in np.flatnonzero(otherwise).tolist():
         texts[row] = repr(values[row])
     return texts

@@ -49,6 +49,14 @@ class LinkCounts:
         `period`: after how many messages the count begins at 0 again; 0 if it does not.
         """
         setattr(self, verdict, getattr(self, verdict) + 1)
+        self._go_on(verdict, sequence, time, period)
+
+    def count_unread(self, sequence: int, time: float, period: int = 0) -> None:
+        """Count a message of which only count and time could be read: it has no verdict, and fills a gap."""
+        self._go_on(None, sequence, time, period)
+
+    def _go_on(self, verdict: Verdict | None, sequence: int, time: float, period: int) -> None:
+        """Go on with the running count, in which gaps are lost messages."""
         sequence = self._unwrap_count(sequence, time, period)
         if verdict == "used":
             self.latest = max(self.latest, time)
@@ -57,7 +65,7 @@ class LinkCounts:
                 return
         if verdict in ("duplicate", "conflict"):
             return
-        if verdict in ("future", "implausible"):  # its time may be wrong: it says nothing of the order
+        if verdict in ("future", "implausible", None):  # its time may be wrong: it says nothing of the order
             time = self.at
         # First message, or the node was restarted: count from here.
         if self.newest < 0 or (sequence < self.newest and time > self.at):

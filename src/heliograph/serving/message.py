@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from datetime import datetime
 from shlex import quote
-from typing import Annotated, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
 import msgspec
 from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapter, ValidationError, WithJsonSchema
@@ -33,6 +33,7 @@ EXPECTED = {
     "values": "a list of finite numbers, not in quotes; null for what did not arrive",
     "inputs": "a list of finite numbers, not in quotes; null for what stays as it was",
 }
+NAMED = "plant", "node", "sequence", "time"  # what names a message
 LONGEST = 1 << 20  # bytes of a message; what is longer is refused unread
 
 
@@ -77,18 +78,26 @@ class NumberedMessage(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     arrival: float | None = None
 
 
+class UnreadMessage(NamedTuple):
+    """A message of which node, count and time were read, and something else was not; and why."""
+
+    read: Message
+    why: str
+
+
 AnyMessage: TypeAlias = Message | NumberedMessage
-Payload: TypeAlias = bytes | Message | str  # a line of JSON; a message read already; why it could not be read
+Read: TypeAlias = AnyMessage | UnreadMessage | str  # a message, as far as it could be read; only why it could not
+Payload: TypeAlias = bytes | Message | UnreadMessage | str  # a line of JSON; what was read already
 _READER, _FAST = TypeAdapter(Message), msgspec.json.Decoder(NumberedMessage)
 
 
-def read_messages(payloads: Sequence[Payload]) -> list[AnyMessage | str]:
-    """Parse a batch; of what cannot be read, return the reason.
+def read_messages(payloads: Sequence[Payload]) -> list[Read]:
+    """Parse a batch; of what cannot be read, return the reason, with its node, count and time if it has these.
 
     Args:
         payloads: the messages; if the time of the first is a date, msgspec is not tried.
     """
-    results = list[AnyMessage | str]()
+    results = list[Read]()
     quick = not payloads or not isinstance(payloads[0], bytes) or re.search(rb'"time":\s*"', payloads[0]) is None
     for payload in payloads:
         if not isinstance(payload, bytes):
@@ -103,12 +112,18 @@ def read_messages(payloads: Sequence[Payload]) -> list[AnyMessage | str]:
     return results
 
 
-def _read(payload: bytes) -> Message | str:
-    """Parse a message, or return in words why it cannot be read."""
+def _read(payload: bytes) -> Message | UnreadMessage | str:
+    """Parse a message, or return in words why it cannot be read, with what names it if it has that."""
     try:
         return read_message(payload)
     except InputError as error:
-        return str(error)
+        why = str(error)
+    try:
+        content = json.loads(payload[:LONGEST])
+        named = Message.model_validate_json(json.dumps({name: content[name] for name in NAMED if name in content}))
+    except (ValueError, TypeError, RecursionError):  # no JSON object, or one that names nothing
+        return why
+    return UnreadMessage(named, why)
 
 
 def read_message(payload: bytes) -> Message:

@@ -22,11 +22,11 @@ from heliograph.numerics.collector import no_collector
 from heliograph.serving.ahead import Ahead, Spans
 from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
-from heliograph.serving.message import AnyMessage, Message, Payload, read_messages
+from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.output import Output
 from heliograph.serving.silence import Silence, dead_by_plant
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
-from heliograph.serving.using import Using
+from heliograph.serving.using import Using, plant_of
 
 LARGE, MILLION = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
 ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store
@@ -153,7 +153,7 @@ class Service:
     def _take(self, payloads: Sequence[Payload]) -> list[Output]:
         begun = perf_counter()
         messages = read_messages(payloads)
-        names = {message.plant for message in messages if not isinstance(message, str)}
+        names = {name for message in messages if (name := plant_of(message)) is not None}
         self._load(names)
         # If another process has committed one of the plants, read it again and repeat.
         while True:
@@ -202,9 +202,7 @@ class Service:
         self.fleet.forget(finalised)
         return self._commit({}, entries, 0)
 
-    def _take_messages(
-        self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]
-    ) -> tuple[list[Output], float]:
+    def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
         entries, malformed, known = list[Entry](), 0, 0
         outcomes = self._using.use(messages, self._damage, datetime.now(UTC))
@@ -217,13 +215,13 @@ class Service:
         for i in [i for i, (_, verdict, _, notes) in enumerate(outcomes) if notes or verdict != "used"]:
             message, payload, (_, verdict, why, notes) = messages[i], payloads[i], outcomes[i]
             # Of a damaged plant, or not read.
-            if not isinstance(message, str) and message.plant in self._damage:
-                entries.append(_refusal(message, "damaged", self._damage[message.plant]))
+            if (damage := self._damage.get(plant_of(message) or "")) and not isinstance(message, str):
+                entries.append(_refusal(message, "damaged", damage))
                 continue
-            if isinstance(message, str) or verdict is None:
+            if isinstance(message, str | UnreadMessage) or verdict is None:
                 malformed += 1
-                said = why if isinstance(payload, str) else f"{why}: {show_value(payload)}"
-                entries.append(_write_refusal(None, {}, "malformed", said))
+                said = why if isinstance(payload, str | UnreadMessage) else f"{why}: {show_value(payload)}"
+                entries.append(_refusal(message, "malformed", said))
                 continue
             # Used but for some of it, known already, or refused with the reason.
             if verdict != "used":
@@ -333,10 +331,14 @@ class Service:
         return at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()
 
 
-def _refusal(message: AnyMessage, why: str, detail: str) -> Entry:
-    moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
-    parts = {"node": message.node, "sequence": message.sequence, "time": moment}
-    return _write_refusal(message.plant, parts, why, detail)
+def _refusal(message: Read, why: str, detail: str) -> Entry:
+    """Return the refusal of a message, with what names it as far as it was read."""
+    if isinstance(message, str):
+        return _write_refusal(None, {}, why, detail)
+    read = message.read if isinstance(message, UnreadMessage) else message
+    moment = read.time.isoformat() if isinstance(read.time, datetime) else read.time
+    parts = {"node": read.node, "sequence": read.sequence, "time": moment}
+    return _write_refusal(read.plant, parts, why, detail)
 
 
 def _write_refusal(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:

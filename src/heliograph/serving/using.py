@@ -14,7 +14,7 @@ from heliograph.live.judging import Candidate, Judges
 from heliograph.live.leap import ARRIVAL, Leap, beginning, find_leap
 from heliograph.live.plant import LinkCounts, PlantState, Withdrawn
 from heliograph.numerics.check import InputError
-from heliograph.serving.message import AnyMessage, seconds
+from heliograph.serving.message import AnyMessage, Read, UnreadMessage, seconds
 
 # Of a message: its plant (None if it began none), a verdict (None if it could not be read), the reason, and notes on
 # parts that were left out of a used message.
@@ -41,7 +41,7 @@ class Using:
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
         self.replaced: list[tuple[PlantState, list[Withdrawn]]] = []  # these as they were, with their events
 
-    def use(self, messages: Sequence[AnyMessage | str], damaged: Container[str], wall: datetime) -> list[Outcome]:
+    def use(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[Outcome]:
         """Give messages to their plants, but for damaged ones, and step these; return the outcome of each message.
 
         `wall` is the time by this machine's clock. Afterwards the plants are as if the messages refused as implausible
@@ -52,9 +52,8 @@ class Using:
         # One plant after another, so that its memory is near; the messages of a plant in their order.
         by_plant: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
-            name = "" if isinstance(message, str) else message.plant
-            if name not in damaged or isinstance(message, str):
-                by_plant.setdefault(name, []).append(i)
+            if (name := plant_of(message)) is None or name not in damaged:
+                by_plant.setdefault(name or "", []).append(i)
         left = [i for numbers in by_plant.values() for i in numbers]
         # Each round refuses at least one message, restores its plant, and gives the plant its other messages again.
         while left:
@@ -62,9 +61,15 @@ class Using:
             for i in left:
                 try:
                     message = messages[i]
-                    outcomes[i] = (None, None, message, ()) if isinstance(message, str) else self._use(i, message, wall)
-                except InputError as error:
-                    outcomes[i] = None, None, str(error), ()
+                    if isinstance(message, str):
+                        outcomes[i] = None, None, message, ()
+                    elif isinstance(message, UnreadMessage):
+                        outcomes[i] = self._count_unread(message.read), None, message.why, ()
+                    else:
+                        outcomes[i] = self._use(i, message, wall)
+                except InputError as error:  # of another kind than its plant expects
+                    assert not isinstance(message, str | UnreadMessage)
+                    outcomes[i] = self._count_unread(message), None, str(error), ()
             self.fleet.step({plant.name: plant for _, plant, _, _ in self._taken}.values())
             implausible = self._judges.implausible(self._taken)
             # Plants that an implausible message has spoilt go back.
@@ -75,13 +80,13 @@ class Using:
                 spoilt.add(plant.name)
             for name in spoilt:
                 self._undo(name)
-            left = [i for i in left if not isinstance(message := messages[i], str) and message.plant in spoilt]
+            left = [i for i in left if plant_of(messages[i]) in spoilt]
         self._taken = []
         return outcomes
 
-    def _implausible_inputs(self, messages: Sequence[AnyMessage | str]) -> dict[tuple[int, bool], str]:
+    def _implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
         """Return the inputs that lead to no valid prediction from the state before the batch."""
-        given = [(i, m, values) for i, m in enumerate(messages) if not isinstance(m, str)
+        given = [(i, m, values) for i, m in enumerate(messages) if not isinstance(m, str | UnreadMessage)
                  and (values := m.values if m.node == INPUTS else m.inputs)
                  and len(values) == self.fleet.lanes.given]  # fmt: skip
         plants = [self.plants.get(message.plant) for _, message, _ in given]
@@ -135,6 +140,19 @@ class Using:
         if beyond and verdict == "used":
             notes.append(f"{beyond}; the rest is used")
         return plant, verdict, why, notes
+
+    def _count_unread(self, message: AnyMessage) -> PlantState | None:
+        """Count a message that came and cannot be used as none that was lost; return its plant, if that says so."""
+        plant, node = self.plants.get(message.plant), message.node
+        if plant is None or (node != INPUTS and node not in self.fleet.network.names):
+            return None
+        try:
+            at = self._number(message.time, plant.origin, plant.name)
+        except InputError:  # a time of another kind
+            return None
+        link = self._remember(plant, at).link(node)
+        link.count_unread(message.sequence, at, self.fleet.periods.get(node, 0))
+        return plant
 
     def _remember(self, plant: PlantState, begun: float) -> PlantState:
         """Return the plant, and store once in a batch what it was before; a new one joins the others."""
@@ -212,3 +230,10 @@ class Using:
         if self.fleet.lanes.dt is None:
             return None if self.fleet.options.step is None else message.time
         return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
+
+
+def plant_of(message: Read) -> str | None:
+    """Return the name of the plant of a message; None of one that names none."""
+    if isinstance(message, str):
+        return None
+    return message.read.plant if isinstance(message, UnreadMessage) else message.plant

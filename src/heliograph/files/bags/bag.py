@@ -14,7 +14,7 @@ import numpy as np
 from heliograph.files.bags.layout import Decoder, RawMessage
 from heliograph.files.bags.mcap_chunks import messages_of
 from heliograph.files.event_table import EventTable
-from heliograph.files.sources import Sources
+from heliograph.files.sources import Sources, Unread
 from heliograph.numerics.check import InputError, fail, show_error
 
 if TYPE_CHECKING:
@@ -203,13 +203,14 @@ def _add(
             where = f"{path}, {topic}, logged at {moment(logged)}"
             table.refuse(fail(where, f"a message of {kind}", _reason(error)), strict)
             continue
-        try:
-            readings = sources.read(topic, content, topic)
-        except InputError as error:
-            table.refuse(InputError(f"{path}, message {number}, logged at {moment(logged)}, {error}"), strict)
-            continue
-        for reading in readings:
-            table.add(reading, logged)
+        for reading in sources.read(topic, content, topic):
+            if isinstance(reading, Unread):
+                where = f"{path}, message {number}, logged at {moment(logged)}"
+                table.refuse(InputError(f"{where}, {reading.error}"), strict)
+                if reading.counted is not None:
+                    table.note_unread(reading.counted, logged)
+            else:
+                table.add(reading, logged)
 
 
 def fields_of(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:

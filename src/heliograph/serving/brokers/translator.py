@@ -7,9 +7,10 @@ from datetime import UTC, datetime, timedelta
 from heliograph.files.event_columns import YEAR
 from heliograph.files.fields import decode_json, parse_arrival
 from heliograph.files.message_files import log_line, of_log
-from heliograph.files.sources import Reading, Sources
+from heliograph.files.sources import Reading, Sources, Unread
 from heliograph.numerics.check import InputError, fail, show_value
-from heliograph.serving.message import LONGEST, Message
+from heliograph.serving.brokers.transport import LOG
+from heliograph.serving.message import LONGEST, Message, UnreadMessage
 from heliograph.simulation.network import Network
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -45,7 +46,9 @@ class Translator:
         # Values of the newest times of each plant and node without a count.
         self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
 
-    def read(self, topic: str, payload: bytes, arrival: datetime, stored: bool = False) -> list[Message | str]:
+    def read(
+        self, topic: str, payload: bytes, arrival: datetime, stored: bool = False
+    ) -> list[Message | UnreadMessage | str]:
         """Return the messages in a payload of a topic, or the reason why it cannot be read; nothing of unknown topics.
 
         Args:
@@ -56,7 +59,7 @@ class Translator:
         """
         return self._read(topic, payload, arrival, stored, again=True)
 
-    def line(self, payload: bytes) -> list[bytes | Message | str]:
+    def line(self, payload: bytes) -> list[bytes | Message | UnreadMessage | str]:
         """Return a line of a pipe as it is, or the messages in it if it has a topic and a payload.
 
         So MQTT clients print, `mosquitto_sub -F %j`, `-F "%I %t %p"` or `-v` for example. What a line says of its
@@ -90,7 +93,7 @@ class Translator:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
             lines.append(f"topics that are not among the sources: {named}{more}")
-        lines += self.sources.notes
+        lines += [*self.sources.notes, *self.sources.senders.lines()]
         if said := self.sources.never():
             lines.append(f"a field that no message had: {said}")
         if self._stored:
@@ -99,23 +102,40 @@ class Translator:
 
     def _read(
         self, topic: str, payload: bytes, arrival: datetime | None, stored: bool, again: bool
-    ) -> list[Message | str]:
+    ) -> list[Message | UnreadMessage | str]:
         """Read a payload; `again`: a message may be sent again."""
-        results: list[Message | str] = []
+        results: list[Message | UnreadMessage | str] = []
         try:
             if self.sources.hear(topic, payload, topic):
                 return []
             if not self.sources.of(topic):  # whatever it is
                 self.sources.unknown[topic] += 1
                 return []
-            for reading in self.sources.read(topic, _decode(payload, topic), topic):
+            content = _decode(payload, topic)
+            for reading in self.sources.read(topic, content, topic):
+                if isinstance(reading, Unread):
+                    results.append(self._unread(topic, reading, arrival, again))
+                    continue
                 if stored and reading.time is None:
                     self._stored += 1
                     continue
                 results.append(self._message(topic, reading, arrival, again))
+                self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.asked(topic))
+                for said in self.sources.senders.news():
+                    LOG.warning("%s", said)
         except InputError as error:
             results.append(str(error))
         return results
+
+    def _unread(self, topic: str, unread: Unread, known: datetime | None, again: bool) -> UnreadMessage | str:
+        """Return why a message could not be read, with its node, count and time where these were."""
+        why = str(unread.error)
+        if unread.counted is None:
+            return why
+        try:
+            return UnreadMessage(self._message(topic, unread.counted, known, again), why)
+        except InputError:
+            return why
 
     def _message(self, topic: str, reading: Reading, known: datetime | None, again: bool) -> Message:
         if len(reading.plant) > NAME or "\0" in reading.plant:
