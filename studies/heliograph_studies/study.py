@@ -8,11 +8,11 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import heliograph
+from heliograph.numerics.extras import check_installed
 from heliograph.report.page import KeyFigures, Page, Section, Table
 from heliograph.report.progress import Advance, progress
 from heliograph.report.results import Results, write_results
@@ -81,8 +81,7 @@ class Study(Generic[Setting, Outcome]):
             ModuleNotFoundError: an extra is not installed.
         """
         chosen = self.setting() if setting is None else setting
-        for name in self.needs:
-            import_module(name)
+        check_installed(self.needs)
         key = self._key(chosen)  # names files that are missing
         if out is None:
             with progress(self.stages) as advance:

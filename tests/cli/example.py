@@ -41,7 +41,8 @@ def run_arguments(network="net.py", measurements="data.csv", out="out.csv") -> l
     return ["run", network, "--measurements", measurements, "--out", out]
 
 
-def refused(folder, capsys, arguments, *fragments) -> None:
+def refused(folder, capsys, arguments, *fragments) -> str:
+    """Return the line in which a command refuses its arguments, which changes no file."""
     before = contents(folder)
     assert cli.main(arguments) == 2
     said = capsys.readouterr()
@@ -50,6 +51,7 @@ def refused(folder, capsys, arguments, *fragments) -> None:
     for fragment in fragments:
         assert fragment in said.err
     assert contents(folder) == before
+    return said.err
 
 
 def stub_study(monkeypatch, run) -> None:

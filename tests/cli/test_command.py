@@ -48,6 +48,27 @@ def test_a_missing_extra_is_named(folder, capsys, monkeypatch):
     assert cli.main(run_arguments()) == 0  # CSV does without
 
 
+@pytest.mark.parametrize(
+    ("arguments", "missing", "extras"),
+    [
+        (["demo", "--out", "d"], ["jinja2", "matplotlib", "gtsam", "pyarrow"], "recordings,report,tables"),
+        (["example", "late-data", "--out", "d"], ["matplotlib", "gtsam"], "recordings,report"),
+        (
+            ["reproduce", "h-infinity-fusion", "--out", "d"],
+            ["matplotlib", "clarabel", "h5netcdf"],
+            "lmi,report,results",
+        ),
+        ([*run_arguments(out="out.parquet"), "--report", "d"], ["pyarrow", "jinja2"], "report,tables"),
+        ([*run_arguments(out="out.mcap"), "--report", "d"], ["rosbags", "matplotlib"], "bags,report"),
+    ],
+)
+def test_all_that_is_missing_is_named_at_once_with_one_command(folder, capsys, monkeypatch, arguments, missing, extras):
+    for name in missing:
+        monkeypatch.setitem(sys.modules, name, None)
+    said = refused(folder, capsys, arguments, "got no such packages", f'[{extras}]"')
+    assert set(missing) == set(said.removeprefix("heliograph: ").partition(":")[0].split(", "))
+
+
 def test_a_long_message_stays_on_one_line(folder, capsys, monkeypatch):
     def wrong(*_):
         raise InputError("thing: expected\n  one, got\n  two")

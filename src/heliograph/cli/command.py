@@ -23,7 +23,7 @@ from heliograph.cli.serve import serve
 from heliograph.cli.stopping import INTERRUPTED, SIGNALLED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import explore, sweep
-from heliograph.numerics.extras import EXTRAS, how_to_install
+from heliograph.numerics.extras import EXTRAS, MissingPackagesError, how_to_install
 from heliograph.simulation.runs.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
@@ -87,6 +87,8 @@ def _command(arguments: Sequence[str] | None) -> int:
     except OSError as error:
         what = error.filename or ("standard output" if error.errno in FULL or _output_is_lost() else None)
         return _refuse(f"{what}: {error.strerror or error}" if what else str(error))
+    except MissingPackagesError as error:
+        return _refuse(str(error))
     except ModuleNotFoundError as error:
         # A missing package of an extra: say how to install it.
         extra = EXTRAS.get((error.name or "").partition(".")[0])

@@ -2,7 +2,6 @@
 
 import sys
 import warnings
-from importlib import import_module
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,6 +29,9 @@ if TYPE_CHECKING:
 
     Write = Callable[[Record, Path], None]
     Horizons = int | list[float | np.timedelta64 | np.datetime64]
+
+
+BAGS = {".mcap", ".db3", ".bag"}
 
 
 def run(
@@ -287,20 +289,23 @@ def _claim(estimate: "Estimate") -> str:
 
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
-    """Check before the work starts that files can be written."""
+    """Check before the work starts that files can be read and written, and that what that takes is installed."""
     from heliograph.disk.whole_file import FORMATS, check_output
     from heliograph.numerics.check import fail
+    from heliograph.numerics.extras import check_installed
+    from heliograph.report.results import NEEDS
 
+    kinds = {path.suffix.lower() for path in (measurements, out) if path is not None}
+    needs = [*(["rosbags"] if kinds & BAGS else []), *(["pyarrow"] if ".parquet" in kinds else [])]
+    check_installed([*needs, *(NEEDS if report is not None else ())])
     if out is not None:
         check_output(out, (*FORMATS, ".mcap"))
         if out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
         from heliograph.disk.whole_file import check_replaceable
-        from heliograph.report.results import NEEDS, SUMMARY
+        from heliograph.report.results import SUMMARY
 
-        for name in NEEDS:
-            import_module(name)
         check_replaceable(report, SUMMARY)
 
 

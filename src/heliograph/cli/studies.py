@@ -99,6 +99,8 @@ def run(
         ValueError: an unknown study or setting, a value of the wrong kind, a folder that cannot be written.
     """
     from heliograph.numerics.check import fail
+    from heliograph.numerics.extras import check_installed
+    from heliograph.report.results import NEEDS
 
     known = studies_of(kind)
     for name in names:
@@ -106,6 +108,7 @@ def run(
             expected = ", ".join(known) + (" or all" if kind == "publication" else "")
             page = f", a page now: docs/{PAGES[name]}" if kind == "example" and name in PAGES else ""
             raise fail("method" if kind == "publication" else kind, f"one of {expected}", f"{name!r}{page}")
+    check_installed([name for study in names for name in (*NEEDS, *read_needs(known[study].module))])
     target = folder("reproduce" if kind == "publication" else kind, out, names[0] if within is None else within)
     studies = {name: load(known[name]) for name in names}
     settings = {name: set_of(name, study, values, kind) for name, study in studies.items()}  # all before any work
@@ -192,8 +195,22 @@ def print_list(kind: str) -> None:
 
 def first_line(module: str) -> str:
     """Return the first line of a module's docstring, without running the module."""
+    return (ast.get_docstring(parse(module)) or "").partition("\n")[0]
+
+
+def read_needs(module: str) -> Sequence[str]:
+    """Return the packages of extras that a study's module lists as `NEEDS`, without running it: it may need them."""
+    for statement in parse(module).body:
+        match statement:
+            case ast.Assign(targets=[ast.Name(id="NEEDS")], value=value):
+                needs: Sequence[str] = ast.literal_eval(value)
+                return needs
+    return ()
+
+
+def parse(module: str) -> ast.Module:
+    """Return the source of a module as a tree, without running it; an empty one where there is no source."""
     spec = find_spec(module)
     if spec is None or spec.origin is None:
-        return ""
-    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
-    return text.partition("\n")[0]
+        return ast.Module([], [])
+    return ast.parse(Path(spec.origin).read_text(encoding="utf-8"))

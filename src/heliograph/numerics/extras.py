@@ -1,6 +1,8 @@
 """Packages that the core does without, and the command that brings them."""
 
 import sys
+from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 
 import heliograph
@@ -41,3 +43,19 @@ def how_to_install(extra: str) -> str:
     clone = Path(heliograph.__file__).parents[2]
     package = clone if (clone / "pyproject.toml").is_file() else "heliograph"
     return f'{sys.executable} -m pip install "{package}[{extra}]"'
+
+
+class MissingPackagesError(ModuleNotFoundError):
+    """Packages of extras that are not installed: one line with all of them, and one command that brings them."""
+
+
+def check_installed(packages: Iterable[str]) -> None:
+    """Raise MissingPackagesError where some of these packages of extras are not installed."""
+    missing = [name for name in dict.fromkeys(packages) if find_spec(name) is None]
+    if missing:
+        extras = ",".join(sorted({EXTRAS[name] for name in missing if name in EXTRAS}))
+        others = " ".join(name for name in missing if name not in EXTRAS)  # of studies of other packages
+        command = how_to_install(extras) if extras else f"{sys.executable} -m pip install"
+        what = "package" if len(missing) == 1 else "packages"
+        text = f"{', '.join(missing)}: expected to be installed, got no such {what}: {command} {others}"
+        raise MissingPackagesError(text.rstrip(), name=missing[0])

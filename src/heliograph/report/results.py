@@ -3,11 +3,11 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from heliograph.disk.whole_file import check_replaceable, whole_folder
+from heliograph.numerics.extras import check_installed
 from heliograph.report.progress import Advance, progress
 
 if TYPE_CHECKING:  # a missing extra is reported by `write_results`, in one line
@@ -64,8 +64,7 @@ def write_results(
         ValueError: a folder that cannot be written, or that holds something else.
         ModuleNotFoundError: an extra is not installed.
     """
-    for name in (*NEEDS, *needs):
-        import_module(name)
+    check_installed([*NEEDS, *needs])
     check_replaceable(target, SUMMARY)
     with progress(stages + 1) as advance, whole_folder(target) as folder:
         outcome = compute(advance)

@@ -23,6 +23,7 @@ from heliograph_studies.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR as
 from heliograph_studies.cubature_fusion.setting import Setting as Setting
 from heliograph_studies.curves import Curve, Panel, curves_over_time, label_right
 
+NEEDS = ("xarray", "h5netcdf")
 METHOD, TWIN = "cubature_printed_fixed", "extended_printed_fixed"  # the paper's filter, and what it compares with
 BETTER = ("cubature_polytope", "cubature_zero_mean", "ci_equal")  # than the paper's bound
 TRIALS = 150  # random cases of Theorem 1
@@ -243,6 +244,6 @@ publication = Study(
     "parameters",
     statements=statements,
     data=compute.write_record,
-    needs=("xarray", "h5netcdf"),
+    needs=NEEDS,
 )
 run = publication.run

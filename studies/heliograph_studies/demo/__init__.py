@@ -13,6 +13,7 @@ from heliograph_studies.demo.learned import position_nees
 from heliograph_studies.demo.robot import CALIBRATED as CALIBRATED
 from heliograph_studies.demo.robot import WINDOW as WINDOW
 
+NEEDS = ("gtsam", "pyarrow")
 COLOURS = dict(zip(NAMES, (BLUE, PURPLE, VERMILION, GREEN, MUTED), strict=True))
 LABELS = {name: name.replace("_", " ").replace("relay aware", "relay-aware") for name in NAMES}
 SHOWN = ("relay_aware", "mean_gain", "perfect_channel")
@@ -51,7 +52,7 @@ example = Study(
     figures,
     words,
     data=compute.data,
-    needs=["pyarrow"],
+    needs=NEEDS,
     files=Setting.files,
 )
 run = example.run

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.extras import how_to_install
+from heliograph.numerics.extras import check_installed
 
 MOVING = 0.01  # m in one odometry row of 0.1 or 0.2 s: the robot has started
 LONGEST = 1.0  # s without a range after which the rows of the odometry are kept: a chord stands for a second at most
@@ -66,11 +66,9 @@ def find_recording(name: str = "plaza2") -> Path:
     """
     if name not in FILES:
         raise fail("recording", f"one of {', '.join(FILES)}", show_value(name))
+    check_installed(["gtsam"])
     spec = find_spec("gtsam")
-    if spec is None or spec.origin is None:
-        raise ModuleNotFoundError(
-            f"gtsam: expected to be installed, got no such package: {how_to_install('recordings')}", name="gtsam"
-        )
+    assert spec is not None and spec.origin is not None
     path = Path(spec.origin).parent / "Data" / FILES[name]
     if not path.is_file():
         raise fail(f"recording {name}", f"the file Data/{FILES[name]} in the gtsam package", "a gtsam without it")

@@ -24,6 +24,7 @@ from heliograph_studies.h_infinity_fusion.example import (
 from heliograph_studies.h_infinity_fusion.setting import NODES, STATES
 from heliograph_studies.h_infinity_fusion.setting import Setting as Setting
 
+NEEDS = ("clarabel", "cvxpy", "xarray", "h5netcdf")
 NODE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
 LINKS = ("sensor to relay", "relay to filter", "sensor to filter")
 COLOURS = {
@@ -235,6 +236,6 @@ publication = Study(
     "networks: an H-infinity quantized framework",
     statements=statements,
     data=compute.write_record,
-    needs=("clarabel", "cvxpy", "xarray", "h5netcdf"),
+    needs=NEEDS,
 )
 run = publication.run

@@ -14,6 +14,7 @@ from heliograph_studies.late_data.moving import BEGIN as BEGIN
 from heliograph_studies.late_data.plaza import DRIVE
 from heliograph_studies.late_data.replay import WINDOW as WINDOW
 
+NEEDS = ("gtsam",)
 ROWS = {  # method: how it is called, and its colour
     "used_as_current": ("taken as current", VERMILION),
     "late_dropped": ("late dropped", AMBER),
@@ -51,5 +52,5 @@ def errors_over_time(through: Through, stretch: slice) -> Figure:
     return curves_over_time(through.time[stretch], [Panel("position error (m)", curves)], "time (s)")
 
 
-example = Study("late-data", Setting, compute.compute, 3, figures, files=plaza2)
+example = Study("late-data", Setting, compute.compute, 3, figures, needs=NEEDS, files=plaza2)
 run = example.run

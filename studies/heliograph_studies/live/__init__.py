@@ -8,7 +8,7 @@ from typing import Any
 from heliograph_studies import Study, check_fields
 from heliograph_studies.demo.recording import plaza2
 
-NEEDS = ("nats", "paho", "prometheus_client", "pydantic", "sqlalchemy", "starlette", "uvicorn")
+NEEDS = ("gtsam", "nats", "paho", "prometheus_client", "pydantic", "sqlalchemy", "starlette", "uvicorn")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
 from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.loop import serve_until
-from heliograph.serving.message import Message
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.running import connected
 from heliograph.serving.service import Service
@@ -43,7 +43,7 @@ class Counted:
         """As the service says."""
         return self.service.unpublished()
 
-    def take(self, payloads: Sequence[bytes | Message | str]) -> list[Output]:
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """As the service does."""
         self.begun = self.begun or perf_counter()
         outputs = self.service.take(payloads)

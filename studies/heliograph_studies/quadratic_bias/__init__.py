@@ -15,6 +15,7 @@ from heliograph_studies.quadratic_bias.compute import CLAIMED, NODE, TRUE, Outco
 from heliograph_studies.quadratic_bias.setting import TABLE_1, Noises
 from heliograph_studies.quadratic_bias.setting import Setting as Setting
 
+NEEDS = ("xarray", "h5netcdf")
 COLOURS = {
     "linear": VERMILION, CLAIMED: MUTED, TRUE: AMBER, "quadratic": BLUE, "memory": AMBER, "cubic": PURPLE,
     "quartic": MUTED, "mixture": GREEN,
@@ -86,6 +87,6 @@ publication = Study(
     publication="Quadratic filtering with dynamical bias under amplify-and-forward relays",
     statements=statements,
     data=compute.write_record,
-    needs=("xarray", "h5netcdf"),
+    needs=NEEDS,
 )
 run = publication.run
