@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 import jaxtyping
@@ -25,6 +26,7 @@ IN_A_HURRY = (
 jaxtyping.jaxtyped = where_shaped  # what the import hook decorates the checked packages with
 
 MOST, GROWTH = 1.6e9, 0.2e9  # bytes of a process before it lets go after a file, and since it last did
+PROGRAMS = 300  # in one context of the compiler
 WITHIN = 1.8e9  # before it lets go between two tests of a file, which share programs
 
 
@@ -87,9 +89,31 @@ def pytest_collection_finish():
 
         sys.modules["jax"].config.update("jax_enable_compilation_cache", False)
         reset_cache()  # whether there is one is asked once, and what is collected may have asked
+        keep_contexts()
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
+
+
+def keep_contexts():
+    """Let JAX write some hundred programs in one context of its compiler, not each in a context of its own.
+
+    Making one is a fifth of what compiling an operation costs. What a context was told it holds for good, constants
+    too, so that one is let go in time; and each thread has its own.
+    """
+    from jax._src.interpreters import mlir
+
+    if not hasattr(mlir, "make_ir_context"):  # another release of JAX
+        return
+    make, kept = mlir.make_ir_context, threading.local()
+
+    def take():
+        if getattr(kept, "programs", PROGRAMS) == PROGRAMS:
+            kept.context, kept.programs = make(), 0
+        kept.programs += 1
+        return kept.context
+
+    mlir.make_ir_context = take
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -17,6 +17,9 @@ from heliograph.factors.columns import (
     unit_lower,
 )
 
+# One program for each size, not one for each of its hundred operations.
+triangular, eliminate = jax.jit(triangular), jax.jit(eliminate)
+
 EXACT = {"rtol": 1e-12, "atol": 1e-12}  # sums of some twenty products of numbers of order 1
 
 

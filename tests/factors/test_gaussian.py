@@ -27,6 +27,10 @@ from heliograph.factors.gaussian import (
 )
 from tests.factors.exact import after, congruence, exactly, total
 
+# One program for each size, not one for each of its hundred operations.
+backwards, move, observe, revise = (jax.jit(f) for f in (backwards, move, observe, revise))
+smooth, transform, append_rows = (jax.jit(f) for f in (smooth, transform, append_rows))
+
 EXACT = {"rtol": 1e-11, "atol": 1e-12}  # some twenty products of numbers of order 1, and a solution
 SIZES = [(1, 1), (3, 2), (5, 3), (18, 4)]
 
@@ -198,12 +202,12 @@ def test_derivatives_pass_a_known_state_and_a_noise_free_output():
     q = 0.7
 
     def variance(start, noise):
-        x = Gaussian(jnp.zeros(1), jnp.zeros(0), start[None])
+        x = Gaussian(jnp.zeros(1), jnp.zeros(0), jnp.asarray(start)[None])
         x = move(x, jnp.eye(1), jnp.zeros(1), Columns(jnp.eye(1), jnp.full(1, q)))
         return observe(x, x.root, jnp.zeros(1), Columns(jnp.eye(1), noise[None]))[0].variances[0]
 
-    of_noise = jax.grad(variance, 1)(jnp.asarray(0.0), jnp.asarray(0.0))
-    of_start = jax.grad(variance, 0)(jnp.asarray(0.0), jnp.asarray(0.3))
+    slopes = jax.jit(jax.grad(variance, (0, 1)))
+    of_noise, of_start = slopes(0.0, 0.0)[1], slopes(0.0, 0.3)[0]
     assert of_noise == pytest.approx(1.0) and of_start == pytest.approx((0.3 / (q + 0.3)) ** 2)
 
 
@@ -215,7 +219,7 @@ def test_of_correlated_noises_at_zero_the_scale_has_a_derivative():
     def variance(r):
         return jnp.trace(observe(x, x.root, jnp.zeros(2), correlated.times(r))[0].covariance)
 
-    slope, near = float(jax.grad(variance)(0.0)), float(variance(1e-7) - variance(0.0)) / 1e-7
+    slope, near = float(jax.jit(jax.grad(variance))(0.0)), float(variance(1e-7) - variance(0.0)) / 1e-7
     assert slope == pytest.approx(near, rel=1e-5)
 
 
