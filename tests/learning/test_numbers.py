@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+import heliograph as hg
 from heliograph.learning.intervals import bartlett, block_sums, cosines, find_told_by_few, of_model, white
 from heliograph.learning.likelihood.maximise import maximise
-from heliograph.learning.parameters import Parameter, Parameters
 from heliograph.learning.unidentified import find_confounded, product_text, rank_of, sum_text
-from heliograph.numerics.check import POSITIVE, REAL
 
 RNG = np.random.default_rng(0)
 
@@ -64,9 +63,16 @@ def test_long_run_covariances_of_an_autoregression():
     assert cosines(scores).freedom == pytest.approx(3 * int(0.4 * steps ** (2 / 3)))
 
 
-def parameters(*domains):
-    names = "abcdefg"
-    return Parameters(tuple(Parameter(names[i], np.array(1.0), d) for i, d in enumerate(domains)))
+def parameters(*kinds):
+    """Free numbers of these kinds that start at 1/2, with nothing that depends on them."""
+
+    def build():
+        for name, kind in zip("abcdefg", kinds, strict=False):
+            hg.free(0.5, name, kind)
+        plant, sensor = hg.state_space([[0.9]], [[1.0]], 1.0, 1.0, [0.0], 1.0)
+        return hg.Network(plant, {"node": hg.Node(sensor, hg.perfect(), {})})
+
+    return hg.learning.describe(build).parameters
 
 
 def informed(known, parameters, points):
@@ -80,36 +86,36 @@ def informed(known, parameters, points):
     return ranks
 
 
-def groups_of(known, *domains):
-    local = parameters(*domains)
-    points = [np.random.default_rng(i).uniform(0.3, 1.0, len(domains)) for i in range(3)]
+def groups_of(known, *kinds):
+    local = parameters(*kinds)
+    points = [np.random.default_rng(i).uniform(0.3, 1.0, len(kinds)) for i in range(3)]
     with np.errstate(all="ignore"):
         return find_confounded(local, points, informed(known, local, points))
 
 
 def test_a_product_is_found_and_put_in_words():
-    (group,) = groups_of(lambda v: np.array([v[0] * v[1], v[2]]), REAL, POSITIVE, POSITIVE)
+    (group,) = groups_of(lambda v: np.array([v[0] * v[1], v[2]]), "real", "positive", "positive")
     assert group.places == (0, 1) and group.fix == 1
     assert product_text(["a", "b"], group.exponents[0]) == "a * b"
 
 
 def test_a_power_and_a_sum():
-    (group,) = groups_of(lambda v: np.array([v[0] ** 2 * v[1]]), REAL, POSITIVE)
+    (group,) = groups_of(lambda v: np.array([v[0] ** 2 * v[1]]), "real", "positive")
     assert product_text(["a", "b"], group.exponents[0]) == "a^2 * b"
-    (group,) = groups_of(lambda v: np.array([0.5 * v[0] + v[1]]), POSITIVE, POSITIVE)
+    (group,) = groups_of(lambda v: np.array([0.5 * v[0] + v[1]]), "positive", "positive")
     assert not len(group.exponents)
     assert sum_text(["a", "b"], group.weights[0]) == "a + 2 b"
 
 
 def test_two_ridges_apart_one_that_is_neither_and_nothing_at_all():
-    first, second = groups_of(lambda v: np.array([v[0] * v[1], v[2] / v[3]]), *(POSITIVE,) * 4)
+    first, second = groups_of(lambda v: np.array([v[0] * v[1], v[2] / v[3]]), *("positive",) * 4)
     assert (first.places, second.places) == ((0, 1), (2, 3))
     assert product_text(["c", "d"], second.exponents[0]) == "c / d"
-    (group,) = groups_of(lambda v: np.array([v[0] * v[1] + v[2]]), *(POSITIVE,) * 3)
+    (group,) = groups_of(lambda v: np.array([v[0] * v[1] + v[2]]), *("positive",) * 3)
     assert group.fix == 2 and not len(group.exponents) and not len(group.weights)
-    (group,) = groups_of(lambda v: np.array([v[0], 0 * v[1]]), *(POSITIVE,) * 2)
+    (group,) = groups_of(lambda v: np.array([v[0], 0 * v[1]]), *("positive",) * 2)
     assert group.places == (1,) and group.fix == 1
-    assert groups_of(lambda v: v, *(POSITIVE,) * 3) == []
+    assert groups_of(lambda v: v, *("positive",) * 3) == []
 
 
 def test_a_step_is_told_of_by_few_rows_and_a_mean_by_all():

@@ -1,16 +1,15 @@
 """What is free knows what it is from where it stands; its numbers go to the line and back."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.learning.likelihood.transforms import link, map_from_line, map_to_line, slope, unlink
-from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.numerics.check import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain
+
+LINE = (-np.inf, np.inf)
+REAL, POSITIVE, PROBABILITY = ("interval", *LINE), ("interval", 0.0, np.inf), ("interval", 0.0, 1.0)
+SIMPLEX, COVARIANCE = ("simplex", *LINE), ("covariance", *LINE)
 
 
 def network(channel, plant_noise=0.1, sensor_noise=0.1):
@@ -29,12 +28,12 @@ def test_where_a_number_stands_says_what_it_is():
         return network(hg.gilbert_elliott(good, bad, hg.free(0.1), 0.2), hg.free(0.1), hg.free(0.2))
 
     assert result(build) == {
-        "Nakagami shape": Domain(low=0.5),
+        "Nakagami shape": ("interval", 0.5, np.inf),
         "Nakagami power": POSITIVE,
         "hop noise": POSITIVE,
         "hop power": POSITIVE,
         "Rician line of sight": POSITIVE,
-        "Rician scale": Domain(low=np.finfo(float).tiny),
+        "Rician scale": ("interval", np.finfo(float).tiny, np.inf),
         "arrival probability": PROBABILITY,
         "fail": PROBABILITY,
         "process noise": POSITIVE,
@@ -86,34 +85,42 @@ def test_outside_of_a_fit_a_free_number_is_its_start():
     np.testing.assert_array_equal(hg.free([0.2, 0.8], kind="simplex"), [0.2, 0.8])
 
 
-@pytest.mark.parametrize("domain", [REAL, POSITIVE, PROBABILITY, Domain(low=0.5), Domain(high=2.0)])
+def marked(start, kind):
+    """The one free number of a network, which is used nowhere or is the shape of a law, at least 1/2."""
+
+    def build():
+        law = hg.random_affine.Nakagami(hg.free(start) if kind == "shape" else 1.0, 1.0)
+        if kind != "shape":
+            hg.free(start, "it", kind)
+        return network(hg.hop(law, 0.1))
+
+    return hg.learning.describe(build).parameters
+
+
+@pytest.mark.parametrize("kind", ["real", "positive", "probability", "shape"])
 @settings(max_examples=20, deadline=None)
 @given(x=st.floats(-5.0, 5.0))
-def test_the_line_and_back(domain, x):
-    value = unlink(domain, x)
-    assert link(domain, value) == pytest.approx(x, abs=1e-10)
-    step = 1e-6
-    turned = (unlink(domain, x + step) - unlink(domain, x - step)) / (2 * step)
-    assert slope(domain, value) * turned == pytest.approx(1.0, rel=1e-7)  # rounding over the step
+def test_the_line_and_back(kind, x):
+    number, at, step = marked(0.7, kind), np.array([x]), 1e-6
+    (value,) = number.entries_at(at)
+    assert marked(value, kind).start == pytest.approx(x, abs=1e-10)
+    turned = (number.entries_at(at + step) - number.entries_at(at - step)) / (2 * step)
+    assert turned / number.jacobian(at)[0] == pytest.approx(1.0, rel=1e-7)  # rounding over the step
 
 
 @pytest.mark.parametrize(
-    ("domain", "value"),
+    ("kind", "value", "size"),
     [
-        (SIMPLEX, np.array([[0.1, 0.2, 0.7], [0.3, 0.3, 0.4]])),
-        (COVARIANCE, np.array([[2.0, 0.3], [0.3, 0.1]])),
-        (PROBABILITY, np.array([0.2, 0.9])),
+        ("simplex", np.array([[0.1, 0.2, 0.7], [0.3, 0.3, 0.4]]), 4),
+        ("covariance", np.array([[2.0, 0.3], [0.3, 0.1]]), 3),
+        ("probability", np.array([0.2, 0.9]), 2),
     ],
 )
-def test_vectors_and_matrices_go_to_the_line_and_back(domain, value):
-    item = Parameter("it", value, domain)
-    x = map_to_line("it", domain, value)
-    assert len(x) == item.size
-    with jax.enable_x64(True):
-        np.testing.assert_allclose(map_from_line(domain, value.shape, jnp.asarray(x)), value, rtol=1e-14)
-    known = Parameters((item,)).known(x)
-    np.testing.assert_allclose(known["it"], value, rtol=1e-14)
-    assert len(Parameters((item,)).entries) == len(item.entries)
+def test_vectors_and_matrices_go_to_the_line_and_back(kind, value, size):
+    number = marked(value, kind)
+    assert number.size == len(number.start) == size
+    np.testing.assert_allclose(number.known(number.start)["it"], value, rtol=1e-14)
+    assert len(number.entries) == len(number.entries_at(number.start)) == (3 if kind == "covariance" else value.size)
 
 
 def test_what_cannot_be_marked_is_refused_in_one_line():
