@@ -13,9 +13,10 @@ from heliograph.files.table import TIME, columns_of, read_back_name, write_table
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.inputs import time_step_fault
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import backwards, backwards_text, fail, flag, instance
+from heliograph.numerics.check import fail, flag, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.module import readable
+from heliograph.numerics.times import backwards, backwards_text
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record

@@ -12,7 +12,8 @@ import numpy as np
 from heliograph.engine.choice import compute_once
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
-from heliograph.model.origin import KeptOrigin, Origin, last_input
+from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_spacing
+from heliograph.model.row_times import common_dates, judge_dates
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.masked import fill_masked
@@ -120,9 +121,12 @@ def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
         warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)
+    clock = common_dates(_tables(z, u))
+    last, spacing = (float(len(rows_z) - 1), np.nan) if clock is None else (clock[-1], usual_spacing(clock))
+    origin = Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), last, spacing)
     return Filtered(
         mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
-        innovation.weight, Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), float(len(rows_z) - 1)),
+        innovation.weight, origin,
     )  # fmt: skip
 
 
@@ -140,7 +144,11 @@ _by_xla = quickly_compiled(_results)
 def data_of(
     filter: Steps, measurements: ArrayLike, inputs: ArrayLike | None
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
-    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed."""
+    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed.
+
+    Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
+    """
+    judge_dates(filter.inputs, _tables(measurements, inputs))
     z = rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
     given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
@@ -149,6 +157,10 @@ def data_of(
     if filter.horizon is not None and len(z) > filter.horizon:
         raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", len(z))
     return z, u
+
+
+def _tables(measurements: object, inputs: object) -> dict[str, object]:
+    return {"measurements": measurements, "inputs": inputs}
 
 
 def rows(

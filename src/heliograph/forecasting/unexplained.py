@@ -131,11 +131,12 @@ def residuals(
     Source: Ljung and Box (1978), of gaps Stoffer and Toloi (1992); Jarque and Bera (1980); Durbin and Koopman, Time
         Series Analysis by State Space Methods, Section 2.12.
     """
-    predicted, count = predict_rows(filter, z, u), check_count("lags", lags)
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    rows, inputs = data_of(filter, z, u)
+    predicted, count = predict_rows(filter, rows, inputs), check_count("lags", lags)
     law = predicted.received
     if law is None or law.claim == "none":
         raise fail("residuals", "a filter that claims a covariance of what arrives", type(filter).__name__)
-    rows = data_of(filter, z, u)[0]
     angles = (filter.angles_used() or FilterAngles((), ())).received
     values = (nearest(np.asarray(rows), law.mean, angles) - law.mean) / law.deviation
     columns = [values[:, i] for i in range(values.shape[1])]

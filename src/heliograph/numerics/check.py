@@ -274,40 +274,6 @@ def check_horizon(value: object, covered: int | None = None) -> int:
     return horizon
 
 
-def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    """Return `count` times that do not go backwards: numbers, or dates (datetime64), then to the nanosecond.
-
-    Whole numbers that doubles cannot tell apart stay what they are.
-    """
-    if getattr(getattr(value, "dtype", None), "kind", "") == "M":
-        clock: np.ndarray = np.asarray(fill_masked(value)).astype("datetime64[ns]")
-        if clock.shape != (count,) or np.isnat(clock).any():
-            raise fail(
-                name, f"{count} dates", f"shape {clock.shape}, {np.count_nonzero(np.isnat(clock))} of them missing"
-            )
-    else:
-        clock = array(name, value, (count,))
-        whole = np.asarray(value)
-        if whole.dtype.kind in "iu" and np.abs(clock).max(initial=0) >= 2**53:  # doubles cannot tell these apart
-            clock = whole
-    row = backwards(clock)
-    if row is not None:
-        raise fail(name, "times that do not go backwards", f"{backwards_text(clock, row)} in row {row + 1}")
-    return clock
-
-
-def backwards(clock: np.ndarray) -> int | None:
-    """Return the first row whose time is before that of the row above, None if there is none."""
-    falls = np.flatnonzero(clock[1:] < clock[:-1])
-    return int(falls[0]) + 1 if falls.size else None
-
-
-def backwards_text(clock: np.ndarray, row: int) -> str:
-    """Return the two times of that row and the row above in words."""
-    now, before = (str(t) if clock.dtype.kind == "M" else f"{t:.10g}" for t in (clock[row], clock[row - 1]))
-    return f"{now} after {before}"
-
-
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
     """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
     report_covariance(name, value)

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +13,10 @@ from heliograph.engine.choice import compute_once
 from heliograph.model.estimate import Estimate
 from heliograph.model.origin import Origin, last_input, usual_spacing
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import array, check_times, fail, instance, rank, table
-from heliograph.numerics.dates import unequal_steps
+from heliograph.model.row_times import common_dates, warn_of_unequal_steps
+from heliograph.numerics.check import array, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
+from heliograph.numerics.times import check_times
 from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
@@ -40,7 +40,6 @@ from heliograph.smoothing.modes import AbstractSmoothing
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 
 
-ONE_STEP = "a plant without the input dt takes each for one; insert the rows that are missing, or give it dt"
 ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
 
 Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
@@ -67,7 +66,9 @@ def run(
         measurements: for each node an array (steps, received), NaN where a component did not arrive. Those of relays
             may be left out, and with them their filters.
         inputs: (steps, inputs), the input that led to each row; by default a plant without inputs is assumed.
-        time: (steps,), stored in the record; 0, 1, ... by default.
+        time: (steps,), numbers or dates (datetime64, datetimes, texts of ISO 8601, periods of pandas), stored in the
+            record; by default the dates by which the rows of the measurements are known (the index of pandas, the
+            coordinate of xarray), else 0, 1, ... Where steps differ and the plant has no input dt, there is a warning.
         truth: true states (steps, n) where they are known, NaN where they are not; no filter sees them. None by
             default.
         smooth: smoothing as in `monte_carlo`; None by default.
@@ -80,8 +81,8 @@ def run(
         The record, with the truth that was given: `record.rmse(node, filter)`, `record.nees(node, filter)`.
 
     Raises:
-        ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
-            filter or fusion that cannot be smoothed.
+        ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, dates
+            of rows that differ between nodes, a filter or fusion that cannot be smoothed.
     """
     check_process()
     instance("network", network, Network, "a Network")
@@ -97,9 +98,8 @@ def run(
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
-    clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
-    if TIME_STEP not in network.inputs and (said := unequal_steps(_dates_of(some) if time is None else clock)):
-        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=2)
+    clock = _clock_of(measured, {"inputs": inputs, "truth": truth}, time, steps)
+    warn_of_unequal_steps(network.inputs, clock)
     for name, node in network.nodes.items():
         z[name] = _drop_beyond_limits(name, node, z[name])
         _warn_of_forbidden(name, node, z[name])
@@ -136,11 +136,14 @@ def _origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> O
     return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last)
 
 
-def _dates_of(rows: object) -> np.ndarray:
-    """Dates by which the rows of a table or column are known; none where it has none."""
-    index: Any = getattr(rows, "index", None)
-    dated = getattr(getattr(index, "dtype", None), "kind", "") == "M"
-    return np.asarray(index.to_numpy(dtype="datetime64[ns]") if dated else [], "datetime64[ns]")
+def _clock_of(
+    measured: Mapping[str, ArrayLike], others: Mapping[str, object], time: ArrayLike | None, steps: int
+) -> np.ndarray:
+    """Return the times of the rows: those given, else the dates by which the tables know them, else 0, 1, ..."""
+    if time is not None:
+        return check_times("time", time, steps)
+    dated = common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
+    return np.arange(steps, dtype=np.float64) if dated is None else dated
 
 
 def _drop_beyond_limits(

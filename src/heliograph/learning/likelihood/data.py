@@ -7,6 +7,7 @@ import numpy as np
 
 from heliograph.filters.rows import rows
 from heliograph.model.inputs import check_inputs
+from heliograph.model.row_times import judge_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.types import Float
@@ -96,6 +97,13 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
         held = {network.names[0]: held}
     if set(held) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
+    # times of its rows: those that it holds, or the dates by which tables know them
+    clock = getattr(recording, "time", None)
+    if isinstance(clock, np.ndarray):
+        warn_of_unequal_steps(network.inputs, clock)
+    else:
+        tables = {f"measurements of {name!r}": z for name, z in held.items()} | {"inputs": known}
+        judge_dates(network.inputs, tables)
     # each run: the nodes' columns side by side, and the inputs
     runs = _runs([np.asarray(fill_masked(held[name])) for name in network.names])
     results = []

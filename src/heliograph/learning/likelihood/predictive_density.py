@@ -14,6 +14,7 @@ from heliograph.filters.modes.mixture import Component, atoms_of
 from heliograph.filters.rows import rows
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.row_times import judge_dates
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import check_count, fail, instance
@@ -151,6 +152,7 @@ def predictive(
     check_forgets("channel of a predictive likelihood", channel)
     received = condition_on_arrival(channel)
     filter = cubature_filter(plant, sensor, received)
+    judge_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
     z = rows("measurements", measurements, None, filter.received, missing=True)
     u = rows("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False)
     y, spread, near = expect_signals(filter, z, u)

@@ -1,0 +1,70 @@
+"""Times of the rows that a model steps over: whether they are in order, the same everywhere, and of equal steps."""
+
+import inspect
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import fail
+from heliograph.numerics.dates import unequal_steps
+from heliograph.numerics.times import row_dates
+
+ONE_STEP = "a plant without the input dt takes each for one; insert the rows that are missing, or give it dt"
+
+
+def common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
+    """Return the dates by which the rows of tables are known (datetime64[ns], UTC); None where those of none are.
+
+    Args:
+        tables: measurements and inputs by what they are called in errors.
+
+    Raises:
+        ValueError: dates that are missing, that go backwards, or that differ from those of another table.
+    """
+    first, clock = "", None
+    for name, rows in tables.items():
+        dated = row_dates(name, rows)
+        if dated is None:
+            continue
+        if clock is None:
+            first, clock = name, dated
+        elif len(dated) == len(clock) and (dated != clock).any():  # other lengths are refused as such
+            row = int(np.argmax(dated != clock))
+            raise fail(f"dates of {name}", f"those of {first}", f"{dated[row]} in row {row + 1}, not {clock[row]}")
+    return clock
+
+
+def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> None:
+    """Warn where steps between times differ and the plant, without the input dt, takes each row for one step.
+
+    Args:
+        inputs: names of the plant's inputs.
+        clock: times of the rows, numbers or dates; None where they are not known.
+    """
+    if clock is not None and TIME_STEP not in inputs and (said := unequal_steps(clock)):
+        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=_depth_of_caller())
+
+
+def judge_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:
+    """Return the dates by which the rows of tables are known, and warn where their steps differ unsaid.
+
+    Args:
+        inputs: names of the plant's inputs.
+        tables: measurements and inputs by what they are called in errors.
+
+    Raises:
+        ValueError: dates that are missing, that go backwards, or that differ from those of another table.
+    """
+    clock = common_dates(tables)
+    warn_of_unequal_steps(inputs, clock)
+    return clock
+
+
+def _depth_of_caller() -> int:
+    """Return how many frames above the function that calls it the user's are: the first outside this package."""
+    package, depth, frame = __name__.split(".")[0], 0, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
+        frame, depth = frame.f_back, depth + 1
+    return depth

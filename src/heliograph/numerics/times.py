@@ -1,0 +1,137 @@
+"""Times of rows of data: those that are given, and the dates by which the rows of a table are known."""
+
+from collections.abc import Iterable
+from typing import Any, cast
+
+import numpy as np
+
+from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.dates import YEARS, dates, looks_like_date
+from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import ArrayLike
+
+NANOSECONDS = np.dtype("datetime64[ns]")
+
+
+def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    """Return `count` times that do not go backwards: numbers, or dates (datetime64, UTC), then to the nanosecond.
+
+    Dates may be texts of ISO 8601, datetimes, or periods of pandas, which stand for their first moment. Whole numbers
+    that doubles cannot tell apart stay what they are.
+
+    Args:
+        name: of the times, for errors.
+        value: numbers or dates (count,).
+        count: number of rows.
+
+    Raises:
+        ValueError: neither numbers nor dates, some that are missing, another count, times that go backwards.
+    """
+    clock = read_dates(name, value)
+    if clock is None:
+        if not is_traced(value) and np.asarray(value).dtype.kind in "mSU":
+            raise fail(name, "numbers, or dates (datetime64, datetimes, texts of ISO 8601)", show_value(value))
+        clock = array(name, value, (count,))
+        whole = np.asarray(value)
+        if whole.dtype.kind in "iu" and np.abs(clock).max(initial=0) >= 2**53:  # doubles cannot tell these apart
+            clock = whole
+    elif clock.shape != (count,) or np.isnat(clock).any():
+        missing = np.count_nonzero(np.isnat(clock))
+        raise fail(name, f"{count} dates", f"shape {clock.shape}, {missing} of them missing")
+    row = backwards(clock)
+    if row is not None:
+        raise fail(name, "times that do not go backwards", f"{backwards_text(clock, row)} in row {row + 1}")
+    return clock
+
+
+def read_dates(name: str, value: object) -> np.ndarray | None:
+    """Return dates as datetime64[ns] in UTC, NaT where they are missing; None of what holds no date.
+
+    Args:
+        name: of the dates, for errors.
+        value: datetime64 of any unit, or texts, datetimes or periods of pandas in a list or an array of any kind.
+
+    Raises:
+        ValueError: something among dates that is none, or one that nanoseconds since 1970 cannot say in 64 bits.
+    """
+    if is_traced(value):
+        return None
+    if getattr(getattr(value, "dtype", None), "kind", "") == "M":
+        given = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
+        whole = np.asarray(given)
+        return _in_nanoseconds(name, whole if whole.dtype.kind == "M" else np.asarray(given, NANOSECONDS))
+    parts = _elements(value)
+    if not any(_is_date(part) for part in parts):
+        return None
+    moments = [part.to_timestamp() if hasattr(part, "to_timestamp") else part for part in parts]
+    return dates([str(_in_nanoseconds(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name)
+
+
+def _elements(value: object) -> list[Any]:
+    """Return what a list, or an array that is not of numbers, holds along its one axis; nothing of anything else."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "O")
+    if isinstance(value, str | bytes | dict) or kind in "fiubcm" or getattr(value, "ndim", 1) != 1:
+        return []
+    try:
+        return list(cast(Iterable[Any], value))
+    except TypeError:
+        return []
+
+
+def _is_date(part: object) -> bool:
+    return isinstance(part, str | np.datetime64) or hasattr(part, "isoformat") or hasattr(part, "to_timestamp")
+
+
+def _in_nanoseconds(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
+    """Return datetime64 of any unit in nanoseconds, which NumPy lets overflow.
+
+    Raises:
+        ValueError: a year that they cannot say.
+    """
+    years = 1970 + np.asarray(moments).astype("datetime64[Y]").astype(np.int64)
+    beyond = ~np.isnat(moments) & ((years < YEARS[0]) | (years > YEARS[-1]))
+    if beyond.any():
+        raise fail(name, f"dates from {YEARS[0]} to {YEARS[-1]}", str(np.asarray(moments)[beyond][0]))
+    return np.asarray(np.asarray(moments).astype(NANOSECONDS))
+
+
+def row_dates(name: str, rows: object) -> np.ndarray | None:
+    """Return the dates by which the rows of a table, a column or a labelled array are known; None where by none.
+
+    Args:
+        name: of the rows, for errors.
+        rows: with an index (pandas) or a coordinate of its first dimension (xarray); anything else has none.
+
+    Raises:
+        ValueError: dates that are missing or go backwards.
+    """
+    labels = getattr(rows, "index", None)
+    if hasattr(rows, "dims") and hasattr(rows, "coords"):
+        dims: Any = rows.dims
+        labels = rows.coords.get(dims[0]) if dims else None
+    if labels is None or callable(labels):  # a list has a function of that name
+        return None
+    shown = np.asarray(labels)
+    if shown.dtype.kind != "M" and not (shown.ndim == 1 and len(shown) and all(_is_moment(part) for part in shown)):
+        return None
+    return check_times(f"dates of {name}", labels, len(shown))
+
+
+def _is_moment(part: object) -> bool:
+    """Return whether a label is a date: of a class of dates, or a text that reads as one."""
+    if isinstance(part, str):
+        return looks_like_date(part)
+    return _is_date(part)
+
+
+def backwards(clock: np.ndarray) -> int | None:
+    """Return the first row whose time is before that of the row above, None if there is none."""
+    falls = np.flatnonzero(clock[1:] < clock[:-1])
+    return int(falls[0]) + 1 if falls.size else None
+
+
+def backwards_text(clock: np.ndarray, row: int) -> str:
+    """Return the two times of that row and the row above in words."""
+    now, before = (str(t) if clock.dtype.kind == "M" else f"{t:.10g}" for t in (clock[row], clock[row - 1]))
+    return f"{now} after {before}"
