@@ -69,3 +69,25 @@ def test_every_pattern_of_losses_has_its_own_covariance(net):
         inverse = np.linalg.pinv(joint + ones @ ones.T, rcond=1e-11)
         weights = np.linalg.solve(ones.T @ inverse @ ones, ones.T @ inverse)
         np.testing.assert_allclose(result["matrix"].covariance[-1], weights @ joint @ weights.T, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_precise_nodes_that_lose_measurements_keep_their_covariance():
+    """Noise of 1e-9 of the state's variance: most of what a report says is known from those before it.
+
+    Whether a covariance is none, or claims what rounding says, shows in the runs: the mean NEES of 2,560 estimates of
+    three states is 3, with a standard error of .05 at most.
+    """
+    draw = np.random.default_rng(3)
+    matrix, root = draw.normal(size=(2, 3, 3))
+    plant, channel = hg.LinearPlant(matrix / 2, root @ root.T, np.zeros(3), np.eye(3)), hg.perfect(2)
+    nodes = {}
+    for name in ("a", "b"):
+        sensor = hg.LinearSensor(draw.normal(size=(2, 3)), 1e-9 * np.eye(2))
+        local = {"local": hg.linear_filter(plant, sensor, channel)}
+        nodes[name] = hg.Node(sensor, hg.erasure(channel, 0.6), local)
+    network = hg.Network(plant, nodes, {"all_reports": hg.Fusion("local", hg.fusion.AllReports())})
+    statistics = hg.monte_carlo(network, 10, 256, 1, keep=hg.Statistics())
+    assert statistics.failures() == []
+    result = statistics["fused"]["all_reports"]
+    assert np.sum(result.nees) / (10 * result.runs) == pytest.approx(3, abs=0.15)

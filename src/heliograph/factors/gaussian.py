@@ -218,6 +218,23 @@ def observe(
     return after, Innovations(_stack_numbers(values), _stack_numbers(totals), whole)
 
 
+def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
+    """Kalman's gain (n, m) of z = E z + slopes xi + v, of the factors N diag(r) N' of Cov v, N unit lower.
+
+    With V the unit triangle by which a component's innovation, given those before it, enters those to come, these
+    innovations are V^-1 N^-1 (z - E z), and the gain is that of them times V^-1 N^-1.
+    """
+    n, rows = len(x.mean), decorrelate(noise.matrix, slopes)
+    weights = jnp.asarray(noise.weights)
+
+    def measure_part(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        return _measure_scalar(root, d, root[n + i], weights[i])[:3]
+
+    *_, gains = _measure_parts(measure_part, len(rows), jnp.concatenate([x.root, rows]), x.variances)
+    entering = unit_lower(below_diagonal(gains[n:]))
+    return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
+
+
 def _measure_scalar(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:

@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import Columns, columns_of, eliminate, join_columns, rounding_of, square_root, unit_of
+from heliograph.factors.gaussian import Gaussian, gain_of, leading, move, of_columns
 from heliograph.filters.gaussian.signal import homogeneous
-from heliograph.fusion.cross_covariance import Errors, observation_noise
+from heliograph.fusion.cross_covariance import Errors
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fused, Means
-from heliograph.fusion.weights import RANK
-from heliograph.numerics.lapack import pseudo_solve
-from heliograph.numerics.linalg import rounding, symmetric
-from heliograph.numerics.types import Float
+from heliograph.numerics.linalg import symmetric
+from heliograph.numerics.types import Array, Bool, Float
 
 
 class Past(NamedTuple):
@@ -33,12 +33,11 @@ class Past(NamedTuple):
 class ReportsBelief(NamedTuple):
     """Estimate of the centre, of zeta = (x, e_1, ..., e_nodes, reports sent one step ago, two steps ago, ...).
 
-    mean (N,) and covariance (N, N), N = (1 + nodes + nodes delays) n; `spill` bounds the square of the part of the
-    error that comes from quantizers: the error of the mean is one of this covariance plus one within that bound.
+    `gaussian` has N = (1 + nodes + nodes delays) n components; `spill` bounds the square of the part of the error that
+    comes from quantizers: the error of the mean is one of this covariance plus one within that bound.
     """
 
-    mean: Float[jax.Array, " N"]
-    covariance: Float[jax.Array, "N N"]
+    gaussian: Gaussian
     past: Past
     spill: Float[jax.Array, "N N"] | None
 
@@ -82,16 +81,19 @@ def faithful(nodes: int, n: int) -> ReportModel:
 
 
 def begin(errors: Errors, delays: int, received: int, quantized: bool) -> ReportsBelief:
-    """Return the state before the first report, for so many `delays` and `received` numbers per report."""
+    """Return the state before the first report, for so many `delays` and `received` numbers per report.
+
+    Every error is that of x_0 then, up to a constant; nothing has been sent.
+    """
     nodes, n = errors.bias.shape
-    size = nodes * n
-    cross, joint = errors.with_state.reshape(size, n), errors.joint.reshape(size, size)
-    later = (0, size * delays)
-    covariance = jnp.pad(jnp.block([[errors.covariance, cross.T], [cross, joint]]), (later, later))
-    mean = jnp.pad(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), later)
+    unsent = (0, nodes * n * delays)
+    start = columns_of(errors.covariance)
+    root = jnp.pad(jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1)), (unsent, (0, 0)))
+    mean = jnp.pad(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), unsent)
     shapes = (received, n), (received,), (received, received), (n,)
     past = Past(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
-    return ReportsBelief(mean, covariance, past, jnp.zeros_like(covariance) if quantized else None)
+    spill = jnp.zeros((len(mean), len(mean))) if quantized else None
+    return ReportsBelief(of_columns(mean, Columns(root, start.weights)), past, spill)
 
 
 def propagate_errors(state: ReportsBelief, happened: Happened, links: ReportModel) -> ReportsBelief:
@@ -104,23 +106,30 @@ def propagate_errors(state: ReportsBelief, happened: Happened, links: ReportMode
     errors = jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(step.transition).reshape(size, size)
     plant = jnp.pad(jnp.asarray(motion.matrix), ((0, 0), (0, size)))
     transition = jnp.concatenate([plant, jnp.concatenate([step.of_state.reshape(size, n), errors], axis=1)])
-    # Noise: w is common to all, nu enters by each node's gain.
+    # Noise: w is common to all, nu enters by each node's gain; estimates are known to the rounding of x.
     shared = jnp.concatenate([jnp.eye(n), step.of_noise.reshape(size, n)])
-    report_noise = jnp.pad(observation_noise(step.gain, noise).reshape(size, size), ((n, 0), (n, 0)))
+    new = join_columns(
+        columns_of(motion.noise).through(shared),
+        _measurement_noise(step.gain, noise).through(np.eye(n + size, size, -n)),
+        rounding_of(jnp.tile(_square_mean(happened.errors), 1 + nodes)),
+    )
     drift = jnp.concatenate([jnp.asarray(motion.shift), step.drift.reshape(-1)])
-    new = shared @ motion.noise @ shared.T + report_noise
-    later = len(state.mean) - n - size
+    later = len(state.gaussian.mean) - n - size
     # The line of past reports shifts by one step.
     if later:
         stored = _make_shift_matrix(nodes, n, later)
         transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), stored])
-        new, drift = jnp.pad(new, (0, later)), jnp.pad(drift, (0, later))
+        new, drift = new.through(np.eye(n + size + later, n + size)), jnp.pad(drift, (0, later))
     return ReportsBelief(
-        transition @ state.mean + drift,
-        symmetric(transition @ state.covariance @ transition.T + new),
+        move(state.gaussian, transition, drift, new),
         _prepend_present(state.past, happened, links),
         None if state.spill is None else symmetric(transition @ state.spill @ transition.T),
     )
+
+
+def _square_mean(errors: Errors) -> Float[jax.Array, " n"]:
+    """E[x_i^2] before any data."""
+    return jnp.asarray(errors.mean**2 + jnp.diagonal(errors.covariance))
 
 
 class Expected(NamedTuple):
@@ -134,34 +143,44 @@ def receive_reports(state: ReportsBelief, reports: Float[jax.Array, "age node m"
     """Correct with the reports that arrived, by their age in steps; NaN for those that did not arrive now.
 
     With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
-    error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`.
+    error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`. What reports before
+    determine of a report is measured anew with slopes of rounding alone: K takes an eps of its variance for noise, so
+    that K times these slopes is an eps too.
     """
-    # Innovation, zero for reports that did not arrive.
-    values = jnp.ravel(reports)
-    output, offset = _output(state.past, len(state.mean)), jnp.ravel(state.past.offset)
-    noise = _along_diagonal(state.past.noise)
-    present = ~jnp.isnan(values)
-    expected = output @ state.mean + offset
-    unexpected = jnp.where(present, values - expected, 0.0)
-    # S = O P O' + N, with quantizers' errors as white noise of variance D^2 / 3.
-    total = symmetric(output @ state.covariance @ output.T + noise)
-    cross = jnp.where(present[:, None], output @ state.covariance, 0.0)
-    push = _make_quantizer_matrix(state.past, present)
-    wide = push @ (jnp.ravel(state.past.error)[:, None] ** 2 / 3 * push.T)
-    gain = pseudo_solve(_mask_absent(present, total + wide), cross, rounding(0.0, total, RANK)).T
+    x, past, values = state.gaussian, state.past, jnp.ravel(reports)
+    output, offset = _output(past, len(x.mean)), jnp.ravel(past.offset)
+    expected, present, noise = output @ x.mean + offset, ~jnp.isnan(values), _factor_each(past.noise)
+    gain, unexpected = _gain_of_reports(x, output, past, present), jnp.where(present, values - expected, 0.0)
     # Joseph's form, sums of squares; the errors mu themselves enter the bound (Young, Cauchy).
-    keep = jnp.eye(len(state.mean)) - gain @ output
-    covariance = symmetric(keep @ state.covariance @ keep.T + gain @ _mask_absent(present, noise) @ gain.T)
+    keep = jnp.eye(len(x.mean)) - gain @ output
+    kept = join_columns(Columns(keep @ x.root, x.variances), noise.through(gain))
     spill = None
     if state.spill is not None:
-        spill = symmetric(_sum(keep @ state.spill @ keep.T, _within(gain @ push, jnp.ravel(state.past.error))))
-    return ReportsBelief(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
+        push = _within(gain @ _along_diagonal(past.gain), jnp.ravel(past.error))
+        spill = symmetric(_sum(keep @ state.spill @ keep.T, push))
+    law = Expected(expected, join_columns(Columns(output @ x.root, x.variances), noise).covariance)
+    return ReportsBelief(of_columns(x.mean + gain @ unexpected, kept), past, spill), law
+
+
+def _gain_of_reports(
+    x: Gaussian, output: Float[jax.Array, "M N"], past: Past, present: Bool[jax.Array, " M"]
+) -> Float[jax.Array, "N M"]:
+    """Gain of what arrived, with quantizers' errors and rounding as noise of each report."""
+    one, shape = np.eye(past.noise.shape[-1]), past.offset.shape
+    terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
+    quantized = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
+    noise = past.noise + quantized + one * (unit_of(terms) * terms**2)[..., None]
+    # What did not arrive has slopes of zero and a noise of its own.
+    there = present.reshape(shape)
+    noise = jnp.where(there[..., :, None] & there[..., None, :], noise, one)
+    slopes = jnp.where(present[:, None], output @ x.root, 0.0)
+    return jnp.where(present, gain_of(x, slopes, _factor_each(noise)), 0.0)
 
 
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
     """Estimate of x, with the covariance of its error or a bound on it."""
-    covariance = state.covariance[:n, :n]
-    return state.mean[:n], covariance if state.spill is None else _sum(covariance, state.spill[:n, :n])
+    x = leading(state.gaussian, n)
+    return x.mean, x.covariance if state.spill is None else _sum(x.covariance, state.spill[:n, :n])
 
 
 def _prepend_present(past: Past, happened: Happened, links: ReportModel) -> Past:
@@ -199,13 +218,19 @@ def _output(past: Past, length: int) -> Float[jax.Array, "M N"]:
     return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
 
 
-def _mask_absent(present: jax.Array, matrix: jax.Array) -> jax.Array:
-    return jnp.where(present[:, None] & present, matrix, 0.0)
+def _measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Columns:
+    """Columns of K_i S_ij K_j', as many as measurements; S_ij is zero between nodes that share nothing."""
+    nodes, _, m = gain.shape
+    each = noise.ndim == 3
+    received = _factor_each(jnp.asarray(noise)[None]) if each else columns_of(noise.reshape(nodes * m, nodes * m))
+    return received.through(_along_diagonal(gain[None]))
 
 
-def _make_quantizer_matrix(past: Past, present: jax.Array) -> Float[jax.Array, "M S"]:
-    """Matrix by which the quantizers' errors, (age, node, n) flattened, enter the reports that arrived."""
-    return jnp.where(present[:, None], _along_diagonal(past.gain), 0.0)
+def _factor_each(noise: Float[jax.Array, "age node m m"]) -> Columns:
+    """Factors of the covariance of noises that are independent of each other, of all reports together."""
+    ages, nodes, m, _ = noise.shape
+    blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
+    return Columns(_along_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
 
 
 def _along_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:

@@ -93,5 +93,5 @@ def _make_shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> Er
 def _drift(state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:
     """F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
     nodes, n, _ = keep.shape
-    before = state.mean[n:].reshape(nodes, n)
+    before = state.gaussian.mean[n:].reshape(nodes, n)
     return jnp.einsum("iab,ib->ia", keep, moved - linear.predicted - before @ matrix.T)
