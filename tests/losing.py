@@ -4,13 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 
 import heliograph as h
-from heliograph.model.estimate import Claim
 
 
 class Losing(h.filters.AbstractFilter):
     """A filter whose covariance is indefinite from its third step."""
 
-    claim: Claim = eqx.field(static=True, default="nominal")
+    claim: str = eqx.field(static=True, default="nominal")
     states: tuple[str, ...] = eqx.field(static=True, default=("p", "v"))
     inputs: tuple[str, ...] = eqx.field(static=True, default=())
     received: int = eqx.field(static=True, default=1)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
+from heliograph.simulation.results.statistics import ErrorStatistics
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="a source distribution has no benchmarks")
@@ -22,6 +22,9 @@ def soak() -> Any:
         import soak as module
 
         yield module
+
+
+BATCHES = 50  # of runs, whose spread gives standard errors
 
 
 def statistics(ratio: float, claim: str = "exact", runs: int = 5000, seed: int = 0) -> ErrorStatistics:

@@ -12,8 +12,8 @@ from heliograph import cli
 from heliograph.campaign import explore, open_results
 from heliograph.campaign.explore import Detail, details
 from heliograph.campaign.run import run_campaign
-from heliograph.campaign.store import STORE, restore_campaign
-from heliograph.campaign.summary import SUMMARY, Score, read_summary
+from heliograph.campaign.store import restore_campaign
+from heliograph.campaign.summary import Score, read_summary
 from tests.campaign.example import CAMPAIGN, NETWORK, write
 
 pytest.importorskip("bokeh", reason="the extra `explore`")
@@ -27,7 +27,7 @@ def campaign(finished):
 
 @pytest.fixture(scope="module")
 def scores(finished):
-    return read_summary(finished / SUMMARY)
+    return read_summary(finished / "summary.csv")
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +120,8 @@ def test_single_states_add_up_to_the_scores(tmp_path):
     plan = write(tmp_path, CAMPAIGN.replace("[0.5, 0.7, 0.9]", "[0.5]").replace("4", "6", 1), network.replace(
         "LinearSensor([[1.0]]", "LinearSensor([[1.0, 0.0]]"))  # fmt: skip
     run_campaign(plan, tmp_path / "out", workers=0)
-    scores, results = read_summary(tmp_path / "out" / SUMMARY), open_results(tmp_path / "out")
-    result = details(tmp_path / "out" / STORE, plan, [0, 1], [1, 3, 6])
+    scores, results = read_summary(tmp_path / "out" / "summary.csv"), open_results(tmp_path / "out")
+    result = details(tmp_path / "out" / "results.zarr", plan, [0, 1], [1, 3, 6])
     for score in scores:
         whole = [item for item in result if item.setting == score.setting and not item.step]
         assert sum(item.rmse**2 for item in whole) == pytest.approx(score.rmse**2, rel=1e-12)

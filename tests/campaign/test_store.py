@@ -18,9 +18,10 @@ from heliograph.campaign.engines import run_in_processes
 from heliograph.campaign.plan import versions
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.work import Job
-from heliograph.disk.whole_file import LOCK, only_here, try_lock
+from heliograph.disk.whole_file import only_here, try_lock
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write
 
+LOCK = ".lock"
 HOLD = """
 import sys, time
 from pathlib import Path

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.cli.command import main
+from heliograph import cli
 from heliograph.files.fitted import load_fitted
 from heliograph.files.recording import Recording, write_recording
 
@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
     z = hg.monte_carlo(network, horizon=600, runs=1, key=1).measurements["a"][0]
     write_recording(Recording({"a": z}, np.zeros((600, 0)), np.arange(600.0)), network, place / "data.csv")
     command = ["fit", str(place / "cart.py"), "--measurements", str(place / "data.csv"), "--out", str(place / "out")]
-    assert main([*command, "--starts", "2"]) == 0
+    assert cli.main([*command, "--starts", "2"]) == 0
     return place
 
 
@@ -51,7 +51,7 @@ def test_the_numbers_are_found_with_their_intervals(folder):
 def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "moved")
     out = tmp_path / "estimates.csv"
-    code = main(["run", str(tmp_path / "moved" / "out" / "fitted_network.py"), "--measurements",
+    code = cli.main(["run", str(tmp_path / "moved" / "out" / "fitted_network.py"), "--measurements",
                  str(folder / "data.csv"), "--out", str(out)])  # fmt: skip
     assert code == 0 and out.is_file()
 
@@ -107,9 +107,9 @@ def test_a_network_in_which_nothing_is_free_is_informed(folder, tmp_path, capsys
     path = tmp_path / "still.py"
     path.write_text(SOURCE.format(plant=1.0, hop=1.0).replace("hg.free(1.0, ", "(lambda x, y: x)(1.0, "))
     out = str(tmp_path / "out")
-    assert main(["fit", str(path), "--measurements", str(folder / "data.csv"), "--out", out]) == 2
+    assert cli.main(["fit", str(path), "--measurements", str(folder / "data.csv"), "--out", out]) == 2
     assert "expected at least one number marked by hg.free" in capsys.readouterr().err
-    assert main(["fit", str(path), "--measurements", "none.csv", "--out", out, "--held-out", "1"]) == 2
+    assert cli.main(["fit", str(path), "--measurements", "none.csv", "--out", out, "--held-out", "1"]) == 2
     assert "--held-out: expected a number from 0 to 0.9, got 1" in capsys.readouterr().err
 
 
@@ -128,7 +128,7 @@ def test_a_sender_that_decides_is_refused_with_what_learns_it(tmp_path, capsys):
     network = hg.files.load_network(str(true))
     z = hg.monte_carlo(network, horizon=60, runs=1, key=1).measurements["a"][0]
     write_recording(Recording({"a": z}, np.zeros((60, 0)), np.arange(60.0)), network, data)
-    assert main(["fit", str(path), "--measurements", str(data), "--out", str(tmp_path / "out")]) == 2
+    assert cli.main(["fit", str(path), "--measurements", str(data), "--out", str(tmp_path / "out")]) == 2
     line = capsys.readouterr().err.strip()
     assert line.endswith(
         "network to be learned: expected no trigger of a node "
@@ -160,7 +160,7 @@ def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypat
     monkeypatch.setattr(fitting, "fit", lambda *a, progress, **k: real(*a, progress=interrupted(progress), **k))
     out = tmp_path / "out"
     command = ["fit", str(folder / "cart.py"), "--measurements", str(folder / "data.csv"), "--out", str(out)]
-    assert main([*command, "--starts", "2"]) == 0  # the command itself was not interrupted
+    assert cli.main([*command, "--starts", "2"]) == 0  # the command itself was not interrupted
     content = json.loads((out / "fitted.json").read_text())
     assert content["stopped"] and "best so far" in content["sentences"][0]
     assert np.isfinite(list(content["values"].values())).all()
@@ -178,7 +178,7 @@ def test_the_truth_is_learned_from_where_the_table_has_it(folder, tmp_path, caps
         str(tmp_path / "out"),
         "--measurements",
     ]
-    assert main([*command, str(folder / "data.csv")]) == 2
+    assert cli.main([*command, str(folder / "data.csv")]) == 2
     expected = (
         f"heliograph: {folder / 'data.csv'}: expected columns of the true states, truth.STATE, for --truth, got none"
     )
@@ -186,7 +186,7 @@ def test_the_truth_is_learned_from_where_the_table_has_it(folder, tmp_path, caps
     table = (folder / "data.csv").read_text().splitlines()
     rows = [f"{row},{row.split(',')[1]}" for row in table[1:60]]
     (tmp_path / "true.csv").write_text("\n".join([f"{table[0]},truth.x0", *rows]))
-    assert main([*command, str(tmp_path / "true.csv")]) == 0
+    assert cli.main([*command, str(tmp_path / "true.csv")]) == 0
     forms = {row["form"] for row in json.loads((tmp_path / "out" / "fitted.json").read_text())["table"]}
     assert forms == {"truth"}
 
@@ -211,6 +211,6 @@ def test_a_slower_sender_loses_what_was_due_and_did_not_come(tmp_path):
             for k in range(600)]  # fmt: skip
     (tmp_path / "data.csv").write_text("\n".join(["time,fast y,odom y", *rows]))
     arguments = ["--measurements", str(tmp_path / "data.csv"), "--out", str(tmp_path / "out"), "--starts", "1"]
-    assert main(["fit", str(tmp_path / "net.py"), *arguments]) == 0
+    assert cli.main(["fit", str(tmp_path / "net.py"), *arguments]) == 0
     page = (tmp_path / "out" / "report.html").read_text()
     assert f"loss {3 / 148:.3g} " in page and "fast</" not in page[page.index("How measurements are lost") :]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import FORMULA, quote_for_cell, quote_for_figure, unquote_cell, visible
+from heliograph.disk.quoting import quote_for_cell, quote_for_figure, unquote_cell, visible
 
 matplotlib.use("agg")
 
@@ -14,7 +14,7 @@ matplotlib.use("agg")
 @given(st.text())
 def test_a_cell_is_no_formula_and_can_be_read_again(text):
     cell = quote_for_cell(text)
-    assert not cell.startswith(FORMULA) and unquote_cell(cell) == visible(text)
+    assert not cell.startswith(("=", "+", "-", "@", "\t", "\r")) and unquote_cell(cell) == visible(text)
 
 
 @pytest.mark.slow

@@ -12,8 +12,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.disk import whole_file
-from heliograph.export.c_files import COMPILER, FLAGS
-from tests.export.device import Device, needs_compiler
+from tests.export.device import COMPILER, FLAGS, Device, needs_compiler
 from tests.follow import apart, follow_known
 
 README = (Path(__file__).parents[2] / "README.md").read_text()

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import heliograph as hg
-from heliograph.cli import main
+from heliograph import cli
 from heliograph.files.own_messages import holds_events
 from heliograph.live.event import Event
 from heliograph.live.recorded import play
@@ -181,15 +181,15 @@ def test_the_command_takes_events(tmp_path, capsys):
     (tmp_path / "net.py").write_text(NETWORK)
     data, out = written(tmp_path / "events.csv", HEADER, ROWS), tmp_path / "est.csv"
     command = ["run", str(tmp_path / "net.py"), "--measurements", str(data), "--out", str(out)]
-    assert main([*command, "--window", "5", "--lag", "1"]) == 0
+    assert cli.main([*command, "--window", "5", "--lag", "1"]) == 0
     known = capsys.readouterr().out
     assert "4 rows of cart/f" in known and "cart: 4 used, 1 duplicate, 1 late" in known and "inputs: 1 used" in known
     assert len(out.read_text().splitlines()) == 5 and len((tmp_path / "est.lagged.csv").read_text().splitlines()) == 4
-    assert main([*command, "--window", "1", "--lag", "2"]) == 2
+    assert cli.main([*command, "--window", "1", "--lag", "2"]) == 2
     assert "lag: expected a number from 0 to the window, 1, got 2" in capsys.readouterr().err
     rows = written(tmp_path / "rows.csv", ["time", "left", "right", "speed"], [(0, 1, 1, 0), (1, 1, 1, 0)])
     command[3] = str(rows)
-    assert main([*command, "--lag", "1"]) == 2
+    assert cli.main([*command, "--lag", "1"]) == 2
     assert "--lag: expected messages or events, got rows of time in" in capsys.readouterr().err
-    assert main([*command, "--window", "1"]) == 2
+    assert cli.main([*command, "--window", "1"]) == 2
     assert "--window, --ahead, --lag and --plant: expected messages or events" in capsys.readouterr().err

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 import heliograph as hg
-from heliograph.model.estimate import STRENGTH, weakest
+from heliograph.model.estimate import weakest
 from heliograph.testing import check_fusion
 from tests.bounds import covariances, estimates
 from tests.oracles import covariance_intersection as oracle
@@ -77,7 +77,7 @@ def test_estimates_that_claim_no_covariance():
     for rule in (*rules, hg.fusion.FixedIntersection([0.5, 0.5])):
         with pytest.raises(ValueError, match="estimates that claim one, got the claim 'none'"):
             hg.fusion.fuse(rule, mixed)
-    assert [weakest([a, "none"]) for a in STRENGTH] == ["none"] * 4
+    assert [weakest([a, "none"]) for a in ("none", "nominal", "upper", "exact")] == ["none"] * 4
 
 
 @pytest.mark.parametrize(

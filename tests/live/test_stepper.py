@@ -10,7 +10,6 @@ from jax.scipy.special import betainc
 
 import heliograph as hg
 from heliograph.live.stepper import NativeStepper, XlaStepper
-from heliograph.model.estimate import Claim
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1, [1.0, -1.0], 1.0, [[1.0], [0.0]], inputs=["push"])
 SENSOR = hg.LinearSensor(np.eye(2), 0.5)
@@ -21,7 +20,7 @@ ACCURACY = 1e-12  # of the claimed deviation: a hundred roundings of a step of s
 class Exchanging(hg.filters.AbstractFilter):
     """A filter whose state's numbers change places, and which counts its steps."""
 
-    claim: Claim = eqx.field(static=True, default="none")
+    claim: str = eqx.field(static=True, default="none")
     states: tuple[str, ...] = eqx.field(static=True, default=("x",))
     inputs: tuple[str, ...] = eqx.field(static=True, default=())
     received: int = eqx.field(static=True, default=1)

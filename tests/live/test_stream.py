@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.model.estimate import Claim
 from straightline.compiled import aligned
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1, [1.0, -1.0], 1.0, [[1.0], [0.0]], inputs=["push"])
@@ -21,7 +20,7 @@ PACKAGES = ("heliograph", "jax", "equinox")
 class Remembering(hg.filters.AbstractFilter):
     """Its state is the measurement before, and its mean the sum of that one and the present one."""
 
-    claim: Claim = eqx.field(static=True, default="none")
+    claim: str = eqx.field(static=True, default="none")
     states: tuple[str, ...] = eqx.field(static=True, default=tuple(f"x{i}" for i in range(8)))
     inputs: tuple[str, ...] = eqx.field(static=True, default=())
     received: int = eqx.field(static=True, default=8)

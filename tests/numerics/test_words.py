@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.check import TINY, InputError, array, scalar
+from heliograph.numerics.check import InputError, array, scalar
 from heliograph.serving.message import read_message
 
 
@@ -34,7 +34,7 @@ def single(x):
         (lambda: scalar("x", -1.0, 0.0), "x: expected a number of at least 0, got -1"),
         (lambda: scalar("x", 2.0, -np.inf, 1.0), "x: expected a number of at most 1, got 2"),
         (lambda: scalar("x", 2.0, 0.0, 1.0), "x: expected a number from 0 to 1, got 2"),
-        (lambda: scalar("x", 0.0, TINY, 1.0), "x: expected a positive number up to 1, got 0"),
+        (lambda: scalar("x", 0.0, float(np.finfo(float).tiny), 1.0), "x: expected a positive number up to 1, got 0"),
     ],
 )
 def test_a_line_says_what_to_write(make, line):

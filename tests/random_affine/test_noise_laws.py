@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.random_affine.moments.moment_noise import MOMENT_ERROR
 from heliograph.testing import check_random_affine
 from heliograph_studies.quadratic_bias.setting import TABLE_1
 
@@ -91,7 +90,7 @@ def test_a_sample_too_small_for_the_order_is_said_and_the_number_named_is_enough
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         hg.random_affine.recorded_noise(g.normal(size=500), 2)
-        enough = int(1.5 * (96 / 9) / MOMENT_ERROR**2)  # Gaussian: Var(n^4) / (E n^4)^2 = 96 / 9
+        enough = int(1.5 * (96 / 9) / 0.1**2)  # to a tenth; Gaussian: Var(n^4) / (E n^4)^2 = 96 / 9
         hg.random_affine.recorded_noise(g.normal(size=enough), 4)
 
 

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from heliograph.report.figures import BLUE, VERMILION, png, svg
+from heliograph.report.figures import png, svg
 from heliograph_studies.curves import Curve, consistency_over_time, errors_with_bands, label_right, paths
 
+BLUE, VERMILION = "#0072b2", "#d55e00"
 TIME = np.linspace(0.1, 10.0, 50)
 PATH = np.column_stack([np.cos(TIME), np.sin(TIME)])
 

@@ -1,7 +1,9 @@
 import numpy as np
 
-from heliograph.report.figures import BLUE, INK, svg
+from heliograph.report.figures import svg
 from heliograph_studies.curves import Curve, Panel, curves_over, curves_over_time
+
+BLUE, INK = "#0072b2", "#1f2933"
 
 
 def test_each_panel_has_its_curves_and_names_them():

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliograph.cli import main
+from heliograph import cli
 from heliograph.live.timeline import Timeline
 from heliograph.report.figures import svg
 from heliograph_studies.demo.recording import read_recording
@@ -79,20 +79,20 @@ def test_what_is_no_log_is_said_in_one_line(tmp_path, content, message, capsys):
     path = tmp_path / "log"
     if content is not None:
         path.write_bytes(content)
-    assert main(["example", "late-data", "--out", str(tmp_path / "out"), "--trace", str(path)]) == 2
+    assert cli.main(["example", "late-data", "--out", str(tmp_path / "out"), "--trace", str(path)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert message in lines[-1] and str(path) in lines[-1]
 
 
 def test_a_log_too_short_is_said_in_one_line(tmp_path, capsys):
     path = written(tmp_path / "log", [row(2, k, 100 * k, 100 * k + 3) for k in range(20)])
-    assert main(["example", "late-data", "--out", str(tmp_path / "out"), "--trace", str(path)]) == 2
+    assert cli.main(["example", "late-data", "--out", str(tmp_path / "out"), "--trace", str(path)]) == 2
     expected = "trace: expected packets sent from 300 to 1200 s after the first, got 0 of 20 over 28 s"
     assert expected in capsys.readouterr().err
 
 
 def test_another_example_takes_no_trace(tmp_path, capsys):
-    assert main(["example", "live", "--out", str(tmp_path), "--trace", "x"]) == 2
+    assert cli.main(["example", "live", "--out", str(tmp_path), "--trace", "x"]) == 2
     error = capsys.readouterr().err
     assert error == "heliograph: --trace: expected an example that takes it, got 'live'\n"
 

@@ -14,7 +14,7 @@ from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
 from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.listening import listen
-from heliograph.serving.brokers.opcua import OF_RANGE, Reporting, read_reporting, reporting_of
+from heliograph.serving.brokers.opcua import Reporting, read_reporting, reporting_of
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.url import address
 from heliograph.serving.running import connected
@@ -42,7 +42,7 @@ async def served(port: int, percent: bool = False) -> Server:
     variable = await server.nodes.objects.add_variable(ua.NodeId("Boiler.Temperature", space), "Temperature", 20.0)
     await variable.add_property(space, "ExceptionDeviation", 0.25 if percent else 0.5)
     if percent:
-        await variable.add_property(space, "ExceptionDeviationFormat", ua.Variant(OF_RANGE, ua.VariantType.Int32))
+        await variable.add_property(space, "ExceptionDeviationFormat", ua.Variant(3, ua.VariantType.Int32))
         await variable.add_property(space, "EURange", ua.Range(-100.0, 100.0))
     await variable.write_attribute(
         ua.AttributeIds.MinimumSamplingInterval, ua.DataValue(ua.Variant(100.0, ua.VariantType.Double))

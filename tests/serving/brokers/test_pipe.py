@@ -12,11 +12,12 @@ import pytest
 from heliograph.serving import loop
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.loop import keep_running
-from heliograph.serving.message import LONGEST
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from tests.serving.worlds import fleet, lines, messages, stepping
+
+LONGEST = 1 << 20  # bytes of a message
 
 
 def fed(parts):

@@ -19,7 +19,7 @@ import pytest
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
-from heliograph.live.stored.carrier import DESCRIPTION, Carrier
+from heliograph.live.stored.carrier import Carrier
 from heliograph.numerics.check import InputError
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import LAYOUT, Store
@@ -123,6 +123,6 @@ def test_filters_go_on_where_the_nodes_have_changed_places_too(place, lanes):
 
 def test_each_number_of_a_state_is_described_once(lanes):
     """Flags among them, whose columns cannot be told from the numbers in them."""
-    layout = json.loads(identity(Fleet(lanes, OPTIONS))[DESCRIPTION])["layout"]
+    layout = json.loads(identity(Fleet(lanes, OPTIONS))["description"])["layout"]
     columns = [i for parts in layout["filters"].values() for _, *ends in parts.values() for i in range(*ends)]
     assert sorted(columns) == list(range(layout["state"]))

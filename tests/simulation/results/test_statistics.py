@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
+from heliograph.simulation.results.statistics import ErrorStatistics
+
+BATCHES = 50  # of runs, whose spread gives standard errors
 
 
 def statistics(errors, bound, claim="exact"):

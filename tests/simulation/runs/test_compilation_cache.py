@@ -9,7 +9,6 @@ import jax
 import pytest
 
 import heliograph as hg
-from heliograph.engine.choice import SETTING
 
 PROGRAM = """
 import sys, heliograph
@@ -30,7 +29,7 @@ print(received.count("/jax/compilation_cache/cache_hits"), received.count("/jax/
 def clean():
     """Of a process whose simulations XLA compiles, and which nobody gave a folder."""
     ours = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
-    return {name: value for name, value in os.environ.items() if name not in ours} | {SETTING: "xla"}
+    return {name: value for name, value in os.environ.items() if name not in ours} | {"HELIOGRAPH_ENGINE": "xla"}
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.engine.choice import SETTING
 from heliograph.relays.design import local_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
@@ -87,7 +86,7 @@ NETWORKS = {
 
 def by(engine: str, *args: object, **kwargs: object) -> object:
     with pytest.MonkeyPatch.context() as setting:
-        setting.setenv(SETTING, engine)
+        setting.setenv("HELIOGRAPH_ENGINE", engine)
         return hg.monte_carlo(*args, **kwargs)
 
 
@@ -154,7 +153,7 @@ def test_smoothed_estimates_are_those_of_xla():
 
 def test_a_run_depends_on_no_other(monkeypatch):
     """Whatever the chunk, the first run, the number of runs: bit for bit."""
-    monkeypatch.setenv(SETTING, "native")
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     network = linear()
     whole = hg.monte_carlo(network, HORIZON, 300, 9)
     cut, later = (
@@ -168,7 +167,7 @@ def test_a_run_depends_on_no_other(monkeypatch):
 
 
 def test_sums_depend_on_no_chunk(monkeypatch):
-    monkeypatch.setenv(SETTING, "native")
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     some = [hg.monte_carlo(linear(), HORIZON, 1000, 9, hg.Statistics(), chunk=chunk) for chunk in (32, 300, 4096)]
     for node, filters in some[0].items():
         for name, filter_ in filters.items():
@@ -185,7 +184,7 @@ def code(network: hg.Network, seed: int = 0):
 
 def test_many_nodes_are_what_each_is_alone(monkeypatch):
     """A few at a time: each node's numbers are those of a network of its own."""
-    monkeypatch.setenv(SETTING, "native")
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     relay = hg.hop(hg.Rayleigh(0.8), 0.05)
     nodes = {f"n{i}": hg.Node(POSITION, relay, {"linear": hg.linear_filter(LINEAR, POSITION, relay)}) for i in range(6)}
     nodes["last"] = hg.Node(POSITION, hg.erasure(relay, 0.5), nodes["n0"].filters)
@@ -226,7 +225,7 @@ class Largest(AbstractReducer):
 def test_a_reducer_of_ones_own_is_computed_by_both_engines(monkeypatch):
     network, results = shadowed(), {}
     for engine in ("native", "xla"):
-        monkeypatch.setenv(SETTING, engine)
+        monkeypatch.setenv("HELIOGRAPH_ENGINE", engine)
         results[engine] = hg.monte_carlo(network, 3, 35, 0, Largest())
     for native_part, other in zip(*results.values(), strict=True):
         np.testing.assert_allclose(native_part, other, rtol=0, atol=1e-13)
