@@ -206,9 +206,9 @@ def test_steps_after_the_moments_have_come_to_stay_are_copied():
         assert still.steady_from < 150
         for gain, two in zip(lmmse(still).gains, lmmse(items).gains, strict=True):
             np.testing.assert_allclose(gain, two, rtol=1e-13, atol=1e-15)
-    begun = time.perf_counter()
-    item = hg.polynomial_filter(plant, sensor, hop, horizon=100_000)
-    assert time.perf_counter() - begun < 20  # 1 s; step by step it was 60 s
+    begun = time.process_time()
+    item = hg.polynomial_filter(plant, sensor, hop, horizon=20_000)
+    assert time.process_time() - begun < 6  # 1 s; step by step it was 12 s
     assert item.horizon is None
 
 

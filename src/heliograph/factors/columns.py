@@ -210,9 +210,13 @@ def columns_of(covariance: Array) -> Columns:
 def columns_of_each(covariances: np.ndarray) -> Columns:
     """Columns (..., n, n) of known covariances (..., n, n), as many as components, some of them zero."""
     n = covariances.shape[-1]
-    roots = [root_of(covariance) for covariance in covariances.reshape(-1, n, n)]
-    padded = [np.pad(root, ((0, 0), (0, n - root.shape[1]))) for root in roots]
-    return Columns(np.reshape(padded, covariances.shape), np.ones(covariances.shape[:-1]))
+    each = list(covariances.reshape(-1, n, n))
+    # Most steps of a long horizon have the same covariance, which is factored once.
+    different = {covariance.tobytes(): covariance for covariance in each}
+    roots = {numbers: root_of(covariance) for numbers, covariance in different.items()}
+    padded = {numbers: np.pad(root, ((0, 0), (0, n - root.shape[1]))) for numbers, root in roots.items()}
+    matrices = [padded[covariance.tobytes()] for covariance in each]
+    return Columns(np.reshape(matrices, covariances.shape), np.ones(covariances.shape[:-1]))
 
 
 def rounding_of(seconds: Array) -> Columns:
