@@ -1,12 +1,11 @@
 """Filters behind sums of links with memory: equal to those of all joint modes, of far fewer functions."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import heliograph as hg
 from heliograph.filters.modes.modal import modal_filter
-from heliograph.numerics.float64 import in_float64
+from tests.follow import follow
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], [[0.1, 0.02], [0.02, 0.2]], [0.5, -1.0], [[1.0, 0.1], [0.1, 0.4]])
 
@@ -26,16 +25,12 @@ def sensor(count):
     return hg.LinearSensor(np.random.default_rng(7).normal(size=(count, 2)), 0.1 * np.eye(count) + 0.02)
 
 
-@in_float64
 def run(made, steps, missing=()):
     """All that the filter says over time, of measurements that are the same for all filters."""
-    generator, said, state = np.random.default_rng(3), [], made.init()
-    for k in range(steps):
-        z = np.where(k in missing, np.nan, generator.normal(size=1))
-        state, innovation = made.correct(made.predict(state, (), k), jnp.asarray(z), k)
-        estimate = made.estimate(state)
-        said.append((estimate.mean, estimate.covariance, innovation.covariance, innovation.log_likelihood))
-    return [np.array(part) for part in zip(*said, strict=True)]
+    z = np.random.default_rng(3).normal(size=(steps, 1))
+    z[list(missing)] = np.nan
+    said = follow(made, z)
+    return said.mean, said.covariance, said.innovation.covariance, said.innovation.log_likelihood
 
 
 def memoryless():
