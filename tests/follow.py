@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import chosen, compute_once
-from heliograph.filters.base import AbstractFilter, check_input, check_measurement
+from heliograph.filters.base import AbstractFilter
 from heliograph.model import Estimate, Innovation
 from heliograph.numerics.float64 import compile_in_float64
 
@@ -37,8 +37,8 @@ def follow(item: AbstractFilter, z: Any, u: Any = None, written_out: bool = True
     z: (rows, received), or (rows,) for one component, NaN where nothing arrived; u: (rows, inputs). Matrices of many
     entries are not `written_out`, 100,000 instructions of native code: XLA has each product as one operation.
     """
-    z = np.array([check_measurement(item, row) for row in z])
-    u = np.array([check_input(item, row) for row in (np.zeros((len(z), 0)) if u is None else u)])
+    z = np.array([item.check_measurement(row) for row in z])
+    u = np.array([item.check_input(row) for row in (np.zeros((len(z), 0)) if u is None else u)])
     assert len(u) == len(z) and (item.horizon is None or len(z) <= item.horizon)
     arguments = (item, *_padded(z, u), np.asarray(len(z)))
     return _cut(compute_once(_scan, _scan_by_xla, arguments) if written_out else _scan_by_xla(*arguments), len(z), 0)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from heliograph.filters.innovation import log_density
+from heliograph.numerics.density import log_density
 from heliograph.numerics.linalg import cholesky, psd_solve
 from straightline.compiled import compile
 

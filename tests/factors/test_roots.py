@@ -7,7 +7,7 @@ import pytest
 from heliograph.factors.columns import columns_of
 from heliograph.factors.gaussian import given, observe
 from heliograph.factors.roots import observe_root, roots_of, square
-from heliograph.linear.recursion import information_step
+from heliograph.numerics.lapack import add_information
 from tests.factors.exact import after, congruence, exactly
 
 
@@ -85,6 +85,6 @@ def test_roots_are_those_of_the_nearest_covariance():
 
 def test_information_adds_to_that_of_the_prior_which_may_be_singular():
     p, h, _ = problem(3, 2)
-    np.testing.assert_allclose(information_step(p, h.T @ h), np.linalg.inv(np.linalg.inv(p) + h.T @ h), rtol=1e-9)
-    known = information_step(np.diag([0.0, 1.0]), np.array([[3.0, 1.0], [1.0, 2.0]]))
+    np.testing.assert_allclose(add_information(p, h.T @ h), np.linalg.inv(np.linalg.inv(p) + h.T @ h), rtol=1e-9)
+    known = add_information(np.diag([0.0, 1.0]), np.array([[3.0, 1.0], [1.0, 2.0]]))
     np.testing.assert_allclose(known, [[0.0, 0.0], [0.0, 1 / 3]], atol=1e-15)

@@ -6,7 +6,8 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.filters.innovation import gaussian_innovation, log_density, posterior_weights
+from heliograph.filters.innovation import gaussian_innovation, posterior_weights
+from heliograph.numerics.density import log_density
 
 ROUNDING = 1e-12
 

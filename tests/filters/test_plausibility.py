@@ -92,7 +92,7 @@ def test_the_bound_is_where_it_says():
     item = hg.linear_filter(PLANT, SENSOR, hg.perfect())
     deviation = np.sqrt(0.9**2 + 0.1 + 0.1)  # of the first innovation, with nothing expected
     for factor, refused in ((0.999, False), (1.001, True)):
-        judged = item.step_judged(item.init(), [factor * 1e6 * deviation])[2]
+        judged = item.judge_step(item.init(), [factor * 1e6 * deviation])[2]
         assert (judged.reason == FAR) == refused
         np.testing.assert_allclose(judged.distance, (factor * 1e6) ** 2, rtol=1e-12)
 
@@ -125,7 +125,7 @@ def test_in_single_precision_too():
         with jax.enable_x64(False):
             state = jax.tree.map(lambda x: jax.numpy.asarray(x, jax.numpy.asarray(x).dtype), item.init())
             state = jax.tree.map(lambda x: x.astype("float32") if x.dtype == "float64" else x, state)
-            judged = jax.jit(lambda z, u: item.step_judged(state, z, u, 0)[2])  # noqa: B023
+            judged = jax.jit(lambda z, u: item.judge_step(state, z, u, 0)[2])  # noqa: B023
             values = np.float32([1e2, 1e3, 1e5, 1e6, 1e20, 3e38])
             said = [judged(np.float32([z]), np.float32([0.0])) for z in values]
             assert {item.reason.dtype for item in said} == {np.dtype(np.float32)}

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live import later
-from heliograph.live.later import Sweeper
+from heliograph.simulation.rows import row_smoother
+from heliograph.simulation.rows.row_smoother import RowSmoother
 
 GAPS = {"a": (3, 5, 11), "b": (3, 5, 7, 11)}  # two of them at both nodes, one at the end
 
@@ -81,16 +81,18 @@ def test_filters_without_a_covariance_refuse_and_are_left_out():
     both = {"f": gains, "linear": hg.linear_filter(plant, sensor, hg.perfect())}
     fused = {"informed": hg.Fusion("linear", hg.fusion.MatrixWeights())}
     others = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), both)}, fused)
-    smoothed = Sweeper(others, None).sweep
+    smoothed = RowSmoother(others, None).sweep
     assert smoothed.fusions == () and [others.kinds[kind].filters for kind in smoothed.kinds] == [("linear",)]
 
 
 def test_a_moment_costs_the_rows_of_its_lag_and_not_of_the_window(monkeypatch):
     """Rows before the moment were read too, all of the window, and the engine was chosen anew for each moment."""
     lengths, engines = [], []
-    estimates, chosen = Sweeper.estimates, later.chosen
-    monkeypatch.setattr(Sweeper, "estimates", lambda self, h, *span: lengths.append(span) or estimates(self, h, *span))
-    monkeypatch.setattr(later, "chosen", lambda *arguments: engines.append(1) or chosen(*arguments))
+    estimates, chosen = RowSmoother.estimates, row_smoother.chosen
+    monkeypatch.setattr(
+        RowSmoother, "estimates", lambda self, h, *span: lengths.append(span) or estimates(self, h, *span)
+    )
+    monkeypatch.setattr(row_smoother, "chosen", lambda *arguments: engines.append(1) or chosen(*arguments))
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})
     timeline = hg.Timeline(hg.Network(plant, {"a": node}), window=50.0)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.simulation.claims import beliefs
 
 PLANT = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
@@ -74,7 +73,7 @@ def test_a_filter_made_for_another_world_claims_nothing_and_the_part_is_named(ca
     network = network_of(link, item, **options)
     assert item.claim in STRONG
     assert network.claims() == {"a": {"f": "nominal"}}
-    assert [belief.words for belief in beliefs(network)] == [f"filter 'f' believes another {part} than node 'a'"]
+    assert [belief.words for belief in network.beliefs()] == [f"filter 'f' believes another {part} than node 'a'"]
     assert f"f (nominal, believes another {part})" in repr(network)
 
 
@@ -134,7 +133,7 @@ def test_links_that_are_shared_at_nodes_and_not_in_the_filter_of_the_centre():
     nodes = {n: hg.Node(SENSOR, link, {}) for n, link in zip("ab", streets, strict=True)}
     network = hg.Network(plant, nodes, central)
     assert network.claims()["fused"] == {"apart": "nominal", "together": "exact"}
-    assert [b.words for b in beliefs(network)] == ["filter 'apart' believes another channel than all nodes together"]
+    assert [b.words for b in network.beliefs()] == ["filter 'apart' believes another channel than all nodes together"]
 
 
 def test_a_filter_alone_keeps_its_claim():
@@ -241,7 +240,7 @@ def test_of_random_worlds_only_the_filters_own_keeps_its_claim(seed):
         network = hg.Network(world.plant, {"a": node})
         assert right.claim in STRONG and wrong.claim in STRONG
         assert network.claims()["a"] == {"right": right.claim, "wrong": "nominal"}, (world.numbers, part)
-        assert [(b.filter, b.parts) for b in beliefs(network)] == [("wrong", (PART.get(part, "channel"),))]
+        assert [(b.filter, b.parts) for b in network.beliefs()] == [("wrong", (PART.get(part, "channel"),))]
 
 
 def test_a_filter_that_does_not_say_what_it_believes_claims_nothing():
@@ -249,10 +248,10 @@ def test_a_filter_that_does_not_say_what_it_believes_claims_nothing():
     said = hg.filters.LinearSystemFilter(system)
     bare = hg.linear.LinearSystem(system.steps, system.mean, system.covariance, system.projection)
     network = network_of(LINK, said)
-    assert network.claims() == {"a": {"f": "exact"}} and list(beliefs(network)) == []
+    assert network.claims() == {"a": {"f": "exact"}} and network.beliefs() == ()
     network = network_of(LINK, hg.filters.LinearSystemFilter(bare))
     assert network.claims() == {"a": {"f": "nominal"}}
-    assert [b.words for b in beliefs(network)] == ["filter 'f' believes something that it does not say at node 'a'"]
+    assert [b.words for b in network.beliefs()] == ["filter 'f' believes something that it does not say at node 'a'"]
 
 
 def relayed(gain=1.0, own=0.1):

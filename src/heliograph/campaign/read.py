@@ -9,8 +9,8 @@ from itertools import product
 from pathlib import Path
 
 from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, versions
+from heliograph.engine.limits import BLOCK
 from heliograph.numerics.check import check_count, check_seed, fail, file_path
-from heliograph.simulation.runs.lanes import BLOCK
 
 KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "timeout", "grid", "settings")
 KEEP = ("errors", "trajectories")

@@ -27,7 +27,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import measurements_of, split_by_name
+from heliograph.simulation.results.by_name import split_by_name, split_measurements
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep
 from heliograph.simulation.simulate import monte_carlo
 
@@ -193,7 +193,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
         }
         if not self.world:
             return {"estimates": estimates}
-        measurements = measurements_of(network, collected["measurements"])
+        measurements = split_measurements(network, collected["measurements"])
         return {"estimates": estimates, "truth": collected["truth"], "measurements": measurements}
 
 

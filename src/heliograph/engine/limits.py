@@ -15,3 +15,5 @@ MESH_NUMBERS = 3_000
 # Rows of a joint covariance that a mesh follows: of 48 (12 nodes) the first call takes 11.5 s natively and 9.2 s by
 # XLA, later ones 21 and 20 us a node, run and step.
 MESH_ROWS = 40
+# Runs of a simulation side by side: wide enough for vector units, small enough for the cache.
+BLOCK = 32

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, step_with_judgement
-from heliograph.filters.plausibility import LIMIT
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import Judgement
 from heliograph.model.inputs import inputs_spoil
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
@@ -65,11 +65,14 @@ def step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram
 
     @jax.jit
     def step(leaves: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
-        after, estimate, judgement, innovation = step_with_judgement(filter, jax.tree.unflatten(tree, leaves), z, u, k)
+        after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, leaves), z, u, k)
         # Each component by itself, which is cheap: larger than expected, and beyond the bound of its own deviations.
-        differs, variances = jnp.abs(innovation.value), jnp.diagonal(jnp.asarray(innovation.covariance))
-        far = differs > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
-        far &= (jnp.abs(z) > jnp.abs(z - innovation.value)) & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
+        differs = jnp.abs(innovation.value)
+        far = (
+            Judgement.find_far(innovation)
+            & (jnp.abs(z) > jnp.abs(z - innovation.value))
+            & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
+        )
         implausible = jnp.any(far) | (judgement.input > 0)
         spoilt = inputs_spoil(filter, filter.inputs, u, k, precision)
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]

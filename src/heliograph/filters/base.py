@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.plausibility import Judgement, judge
-from heliograph.filters.rows import Filtered, filtered
+from heliograph.filters.rows import Filtered, filtered, over_rows
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
 from heliograph.filters.vector import check_vector
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -27,8 +27,8 @@ from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
-    "AbstractFilter", "AbstractSizedFilter", "Step", "believes", "check_input", "check_measurement",
-    "corrects", "estimates", "in_float64", "predicts", "step_number",
+    "AbstractFilter", "AbstractSizedFilter", "Step", "believes", "corrects", "estimates", "in_float64", "predicts",
+    "step_number",
 ]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
@@ -119,7 +119,7 @@ class AbstractFilter(Module):
             ValueError: a state of another form than the filter's; z, u or k of another size; infinite values; an input
                 that is NaN.
         """
-        z, u = check_measurement(self, z), check_input(self, u)
+        z, u = self.check_measurement(z), self.check_input(u)
         return _call_with_state(self, state, _step, z, u, step_number(self, k))
 
     def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
@@ -136,18 +136,33 @@ class AbstractFilter(Module):
         """
         return filtered(self, z, u)
 
-    def step_judged(
+    def scan(
+        self,
+        z: Float[Array, "steps received"],
+        u: Float[Array, "steps inputs"],
+        output: Callable[[PyTree, Innovation, jax.Array], PyTree],
+    ) -> PyTree:
+        """Run over rows within a compiled computation: stack output(state, innovation, k) of each, unchecked.
+
+        Args:
+            z: measurements, NaN for what did not arrive.
+            u: inputs, the one that led to each row.
+            output: arrays of the state after a row, its innovation and its number.
+        """
+        return over_rows(self, z, u, output)
+
+    def judge_step(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
-    ) -> tuple[PyTree, Estimate, Judgement]:
-        """Step like `step`, and judge whether z and u are plausible.
+    ) -> tuple[PyTree, Estimate, Judgement, Innovation]:
+        """Step like `step`, judge whether z and u are plausible, and return the innovation too.
 
         A state with which something is implausible should be discarded.
 
         Raises:
             ValueError: what `step` refuses.
         """
-        z, u = check_measurement(self, z), check_input(self, u)
-        return _call_with_state(self, state, step_with_judgement, z, u, step_number(self, k))[:3]
+        z, u = self.check_measurement(z), self.check_input(u)
+        return _call_with_state(self, state, step_with_judgement, z, u, step_number(self, k))
 
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
@@ -157,8 +172,34 @@ class AbstractFilter(Module):
         Raises:
             ValueError: what `step` refuses; a filter that cannot be smoothed.
         """
-        z, u = check_measurement(self, z), check_input(self, u)
+        z, u = self.check_measurement(z), self.check_input(u)
         return _call_with_state(self, state, _step_with_smoother, z, u, step_number(self, k))
+
+    def check_measurement(self, z: ArrayLike) -> Float[Array, " received"]:
+        """Return z as a measurement of the filter's length, NaN where a component did not arrive.
+
+        Empty for a filter that uses no measurements.
+
+        Raises:
+            ValueError: another length, infinite values.
+        """
+        values = check_vector("measurement", z, self.received or None)
+        if isinstance(values, np.ndarray) and np.isinf(values).any():
+            raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(values).tolist())
+        return values if self.received else values[:0]
+
+    def check_input(self, u: ArrayLike) -> Float[Array, " inputs"]:
+        """Return u as an input of the filter's length.
+
+        Raises:
+            ValueError: another length, values that are not finite, a step of time that is not positive.
+        """
+        values = check_vector(f"inputs {list(self.inputs)}" if self.inputs else "inputs", u, len(self.inputs))
+        if isinstance(values, np.ndarray) and not np.isfinite(values).all():
+            raise fail("inputs", "finite numbers", np.asarray(values).tolist())
+        if isinstance(values, np.ndarray):
+            check_time_step(self.inputs, values)
+        return values
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return what the backward pass needs of a step, from the filter's states around it.
@@ -307,7 +348,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(predict, check_input)
+    return _check_calls(predict, AbstractFilter.check_input)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
@@ -316,7 +357,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(correct, check_measurement)
+    return _check_calls(correct, AbstractFilter.check_measurement)
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
@@ -346,40 +387,13 @@ def _check_calls(
     return cast(Callable[P, R], call)
 
 
-def check_measurement(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
-    """Return z as a measurement of the filter's length, NaN where a component did not arrive.
-
-    Empty for a filter that uses no measurements.
-    """
-    values = check_vector("measurement", z, filter.received or None)
-    if isinstance(values, np.ndarray) and np.isinf(values).any():
-        raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(values).tolist())
-    return values if filter.received else values[:0]
-
-
-def check_input(filter: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
-    """Return u as an input of the filter's length."""
-    values = check_vector(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
-    if isinstance(values, np.ndarray) and not np.isfinite(values).all():
-        raise fail("inputs", "finite numbers", np.asarray(values).tolist())
-    if isinstance(values, np.ndarray):
-        check_time_step(filter.inputs, values)
-    return values
-
-
 def step_number(filter: AbstractFilter, k: Step) -> Step:
     """Return k as the number of a step that the filter covers."""
     if isinstance(k, jax.core.Tracer):
         return k
-    if (
-        not isinstance(k, int | np.integer | np.ndarray | jax.Array)
-        or np.shape(k)
-        or np.asarray(k).dtype.kind not in "iu"
-    ):
+    is_one = isinstance(k, int | np.integer | np.ndarray | jax.Array) and not np.shape(k)
+    if not is_one or np.asarray(k).dtype.kind not in "iu" or np.asarray(k) < 0:
         raise fail("step", "a whole number from 0", show_value(k))
-    values = np.asarray(k)
-    if values < 0:
-        raise fail("step", "a whole number from 0", k)
-    if filter.horizon is not None and values >= filter.horizon:
+    if filter.horizon is not None and np.asarray(k) >= filter.horizon:
         raise fail("step", f"one of the {filter.horizon} that the filter covers, counted from 0", k)
-    return values
+    return np.asarray(k)

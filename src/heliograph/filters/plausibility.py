@@ -3,9 +3,10 @@
 An implausible value is never used: a live estimator, a timeline and a recording refuse it and report it.
 """
 
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import reduce
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ from heliograph.numerics.linalg import (
 )
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float, PyTree
+
+Candidate = TypeVar("Candidate")
 
 LIMIT = 1e6
 """Deviations of the innovation beyond which an update loses its digits.
@@ -73,6 +76,28 @@ class Judgement(NamedTuple):
     def implausible(self) -> Array:
         """True where the measurement must not be used."""
         return self.reason > 0
+
+    @staticmethod
+    def find_far(innovation: Innovation) -> jax.Array:
+        """Mask of the components e_j that are beyond the bound of their own deviations, |e_j| > 1e6 sqrt(S_jj)."""
+        variances = jnp.diagonal(jnp.asarray(innovation.covariance))
+        return jnp.abs(innovation.value) > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
+
+    @staticmethod
+    def find_culprit(
+        candidates: "Sequence[Candidate]", size: "Callable[[Candidate], float]", excuses: "Callable[[Candidate], bool]"
+    ) -> "Candidate":
+        """Return the first, from the largest on, without which a row is plausible; the largest if there is none.
+
+        Args:
+            candidates: values of several nodes that one filter judged together, and found implausible.
+            size: of a value, by which they are ordered.
+            excuses: whether the row is plausible without a value.
+        """
+        ordered = sorted(candidates, key=size, reverse=True)
+        if len(ordered) == 1:
+            return ordered[0]
+        return next((one for one in ordered if excuses(one)), ordered[0])
 
     @staticmethod
     def is_spoilt(reason: float) -> bool:

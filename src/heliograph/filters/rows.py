@@ -14,10 +14,10 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
 from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_spacing
 from heliograph.model.row_times import common_dates, judge_dates
-from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
-from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.module import readable
+from heliograph.numerics.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 
@@ -149,10 +149,10 @@ def data_of(
     Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
     """
     judge_dates(filter.inputs, _tables(measurements, inputs))
-    z = rows("measurements", measurements, None, filter.received or None, missing=True)
+    z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
     given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
-    u = rows("inputs", given, len(z), len(filter.inputs), missing=False)
+    u = check_rows("inputs", given, len(z), len(filter.inputs), missing=False)
     check_inputs(filter.inputs, u, filter)
     if filter.horizon is not None and len(z) > filter.horizon:
         raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", len(z))
@@ -161,20 +161,3 @@ def data_of(
 
 def _tables(measurements: object, inputs: object) -> dict[str, object]:
     return {"measurements": measurements, "inputs": inputs}
-
-
-def rows(
-    name: str, value: ArrayLike | None, steps: int | None, length: int | None, missing: bool
-) -> Float[Array, "steps n"]:
-    """Return an array of `length` numbers a step, one axis standing for one number; NaN where `missing` is allowed."""
-    if isinstance(value, jax.core.Tracer):
-        return value
-    if value is None:
-        raise fail(name, f"shape ({steps}, {length})", "none")
-    try:
-        values = np.asarray(fill_masked(value), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise fail(name, "an array of numbers", show_value(value)) from None
-    values = values[:, None] if values.ndim == 1 and length in (1, None) else values
-    table: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
-    return table

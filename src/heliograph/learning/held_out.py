@@ -16,7 +16,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.results.whiteness import MemoryTest, innovations_of
+from heliograph.simulation.results.whiteness import MemoryTest, score_innovations
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 
@@ -134,7 +134,7 @@ def _integrate_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarr
 
 
 def _score_expected(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
-    likelihood, white = (np.asarray(values)[cut:] for values in innovations_of(filter, z, u))
+    likelihood, white = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
     return Expected(likelihood, white, MemoryTest.of(white, lags, claimed=True) if enough else None)

@@ -3,18 +3,16 @@
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
 from heliograph.filters.gaussian.belief import open_loop_filter
-from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
+from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.learning.intervals import long_run_deviation
-from heliograph.learning.likelihood.predictive_density import NODES, StackDensities, expect_signals, score_signals
+from heliograph.learning.likelihood.predictive_density import NODES, StackDensities, score_signals
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
-from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import readable, same
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.law import AbstractLaw, Constant
@@ -140,13 +138,6 @@ def _ratios(
     for channel in (true, other):
         received = condition_on_arrival(channel)
         filter, parts = cubature_filter(network.plant, node.sensor, received), StackDensities.of(received, nodes)
-        y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in _side_by_side(filter, z, u))
+        y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in filter.expect_signals(z, u))
         said.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
     return np.asarray(said[0] - said[1])
-
-
-@compile_in_float64
-def _side_by_side(
-    filter: GaussianFilter, z: Float[Array, "runs steps m"], u: Float[Array, "steps inputs"]
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return jax.vmap(lambda single: expect_signals(filter, single, u))(jnp.asarray(z))

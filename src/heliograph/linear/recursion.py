@@ -59,14 +59,6 @@ def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: Noises) ->
     return Corrected(gain, predicted, after)
 
 
-def information_step(
-    predicted: Float[np.ndarray, "*nodes n n"], information: Float[np.ndarray, "*nodes n n"]
-) -> Float[np.ndarray, "*nodes n n"]:
-    """P = (P-^-1 + J)^-1 = (I + P- J)^-1 P- by the information J = C' Cov(v)^-1 C; P- may be singular."""
-    after = np.linalg.solve(np.eye(predicted.shape[-1]) + predicted @ information, predicted)
-    return np.asarray(after + after.swapaxes(-1, -2)) / 2
-
-
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     """The best linear filter of x = W y from z_1 ... z_k: an ordinary Kalman recursion, since w and v are white.
 

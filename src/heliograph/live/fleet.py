@@ -87,7 +87,9 @@ class Fleet:
         nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
         deciding = {name: (node.trigger, node) for name, node in nodes.items() if node.trigger is not None}
         self.periods = dict[str, int]()  # after how many messages a node's count begins at 0 again, where it does
-        self.deciding = {name: (trigger, LossChain.of_node(node)) for name, (trigger, node) in deciding.items()}
+        self.deciding = {
+            name: (trigger, LossChain.of_channel(node.channel)) for name, (trigger, node) in deciding.items()
+        }
         self._numbered = {
             i: nodes[name].received - trigger.side_information(len(nodes[name].outputs))
             for i, name in enumerate(network.names)

@@ -15,7 +15,6 @@ from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.model.estimate import Estimate
 from heliograph.model.faults import function_fault
 from heliograph.numerics.types import Float
-from heliograph.simulation.centres.blame import find_blamed
 from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import Network
 from heliograph.simulation.rows.columns import FilterColumns
@@ -133,7 +132,9 @@ class Judges:
                 rows.setdefault(taken[i][-1].slot, []).append(i)
         for those in rows.values():
             if len({taken[i][2].node_index for i in those}) > 1:
-                one = find_blamed(those, lambda i: _size(taken[i][2]), lambda i: self._plausible_without(taken[i]))
+                one = Judgement.find_culprit(
+                    those, lambda i: _size(taken[i][2]), lambda i: self._plausible_without(taken[i])
+                )
                 for i in those:
                     if i != one:
                         del reasons[i]

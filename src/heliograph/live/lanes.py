@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.live.later import Sweeper
 from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP, AbstractPlant
@@ -16,6 +15,7 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.rows.row_smoother import RowSmoother
 from heliograph.simulation.rows.row_step import RowStep
 
 CUTS = ((0.0, 1.0), (0.25, 0.75), (1.0, 0.0))  # of an interval of length one, in the plant's own unit
@@ -120,13 +120,13 @@ class Lanes:
         self.places = self.step_rows.columns
 
     @cached_property
-    def sweeper(self) -> Sweeper:
+    def smoother(self) -> RowSmoother:
         """Return the smoother of these filters, compiled at the first call.
 
         Raises:
             ValueError: no filter that can be smoothed.
         """
-        return Sweeper(self.network, self.dt)
+        return RowSmoother(self.network, self.dt)
 
     @cached_property
     def identity(self) -> Identity:

@@ -7,10 +7,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from heliograph.live.lanes import Lanes
-from heliograph.live.later import History
 from heliograph.live.long_gap import LONG, TAIL, factors_in, states_after
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
+from heliograph.simulation.rows.row_smoother import RowHistory
 
 FEWEST = 1024  # rows of the table at first; it doubles when it is full
 SHORTEST = 64  # rows of a history
@@ -116,12 +116,12 @@ class Pool:
         after = states_after(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
         self.table[slot, self.state], self.table[slot, self.at.start] = after, to
 
-    def history(self, slots: Sequence[int]) -> History:
+    def history(self, slots: Sequence[int]) -> RowHistory:
         """Return the rows in these slots, in order, and behind them copies of the last up to a power of two."""
         length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())
         rows, steps = self.table[[*slots, *[slots[-1]] * (length - len(slots))]], self.step_rows
         state, outputs = steps.state.tree(rows[:, self.state]), steps.outputs.tree(rows[:, self.outputs])
-        return History(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start].astype(int), outputs)
+        return RowHistory(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start].astype(int), outputs)
 
 
 def _insert_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[np.ndarray, " row"]) -> np.ndarray:

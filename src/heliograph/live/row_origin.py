@@ -1,14 +1,11 @@
 """Forecasts of live plants start from a row: its filters' states, the inputs held there, and its estimates."""
 
-from operator import attrgetter
-
 import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.lanes import Lanes
 from heliograph.model.estimate import Estimate, lower_unsound_claim
 from heliograph.model.origin import Origin
-from heliograph.simulation.results.by_name import split_by_name
 
 
 def row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
@@ -29,13 +26,10 @@ def row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
 
 def estimates_by_name(lanes: Lanes, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
     """Arrange the outputs of a row, or of rows, by node and filter."""
-    estimates = lanes.step_rows.outputs.tree(outputs)
-    mean = split_by_name(lanes.network, estimates, attrgetter("mean"), -3)
-    covariance = split_by_name(lanes.network, estimates, attrgetter("covariance"), -4)
-    return {
-        node: {
-            name: lower_unsound_claim(Estimate(mean[node][name], covariance[node][name], claim))
-            for name, claim in claims.items()
-        }
-        for node, claims in lanes.claims.items()
-    }
+    n = len(lanes.network.states)
+    estimates: dict[str, dict[str, Estimate]] = {node: {} for node in lanes.claims}
+    for place in lanes.places:
+        mean = outputs[..., place.mean : place.mean + n]
+        covariance = outputs[..., place.covariance : place.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
+        estimates[place.node][place.filter] = lower_unsound_claim(Estimate(mean, covariance, place.claim))
+    return estimates

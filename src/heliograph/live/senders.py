@@ -4,13 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.filters.event.gaussian_sum import EventFilter
-from heliograph.filters.event.stochastic import StochasticEventFilter
+from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import joint_modes
-from heliograph.simulation.node import Node
 
 DEAD = 1e-3  # probability below which heartbeats are not lost one after another by chance
 
@@ -45,19 +43,11 @@ class LossChain(NamedTuple):
     initial: np.ndarray
 
     @staticmethod
-    def of_node(node: Node) -> "LossChain":
-        """Losses of the link of a node."""
-        modes = joint_modes(first(node.channel))
+    def of_channel(channel: Channel) -> "LossChain":
+        """Losses of a link."""
+        modes = joint_modes(first(channel))
         loss = [sum(float(o.probability) for o in outcomes(m) if not o.arrived.any()) for m in modes.maps]
         return LossChain(np.array(loss), np.asarray(modes.transition), np.asarray(modes.initial))
-
-    @staticmethod
-    def of_filter(filter: EventFilter | StochasticEventFilter) -> "LossChain":
-        """Losses of the link of an event filter."""
-        channel = first(filter.channel)
-        nothing = ~np.any(np.asarray(channel.present), axis=1)
-        loss = np.asarray(channel.chance) @ nothing
-        return LossChain(loss, np.asarray(channel.transition), np.asarray(filter.initial))
 
     def in_a_row(self, apart: int, count: int) -> float:
         """Return the probability that `count` transmissions, so many steps apart, are all lost."""

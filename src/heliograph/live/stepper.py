@@ -99,7 +99,7 @@ def _judge_step(
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
     """Step a filter from its arrays; return judgement, whether to refuse, leaves of the state and of the estimate."""
     filter: AbstractFilter = static.filled(numbers)
-    after, estimate, judgement = filter.step_judged(state, z, u, k)
+    after, estimate, judgement, _ = filter.judge_step(state, z, u, k)
     spoilt = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
     flagged = spoilt | (judgement.reason > 0) | (judgement.input > 0)
     return jnp.stack(judgement), flagged, jax.tree.leaves(after), jax.tree.leaves(estimate)

@@ -2,25 +2,26 @@
 
 import warnings
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from scipy.stats import chi2
 
-from heliograph.filters.base import AbstractFilter, check_input, check_measurement
-from heliograph.filters.event.gaussian_sum import EventFilter
-from heliograph.filters.event.stochastic import StochasticEventFilter
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.live.stored.layout import describe_old_layout, fits, parts_of, relocate_parts
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
+from heliograph.model.channel import Channel
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim
 from heliograph.model.faults import function_fault
 from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.model.origin import Origin
+from heliograph.model.over_time import first
+from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
@@ -94,10 +95,10 @@ class Stream:
         # Arrays of doubles of the right size pass at once; everything else is checked and converted.
         z, outside = _row(measurement, placed.received), None
         if z is None or self.limits is not None:
-            z = np.asarray(check_measurement(self.filter, measurement))
+            z = np.asarray(self.filter.check_measurement(measurement))
         u = _row(inputs, placed.given)
         if u is None:
-            u = np.asarray(check_input(self.filter, inputs))
+            u = np.asarray(self.filter.check_input(inputs))
         if self.limits is not None:
             # Values beyond the limits count as not arrived.
             outside = self.limits.outside(z)
@@ -136,8 +137,8 @@ class Stream:
 
     def _refuse(self, z: np.ndarray, u: np.ndarray) -> None:
         """Refuse implausible values, or accept the step that was flagged."""
-        check_measurement(self.filter, z)
-        check_input(self.filter, u)
+        self.filter.check_measurement(z)
+        self.filter.check_input(u)
         stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
         if len(u) and (why := Judgement.why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
@@ -165,10 +166,10 @@ class Stream:
         Raises:
             ValueError: a filter that is none of `event_filter`.
         """
-        if not isinstance(self.filter, EventFilter | StochasticEventFilter):
+        if (sender := _sender_of(self.filter)) is None:
             raise fail("filter of a stream", "one of event_filter, whose sender decides", type(self.filter).__name__)
         last, now = None if self._last < 0 else self._last, self.steps - 1
-        return sender_status(self.filter.trigger, LossChain.of_filter(self.filter), last, now, now)
+        return sender_status(sender.trigger, LossChain.of_channel(sender.channel), last, now, now)
 
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""
@@ -237,6 +238,23 @@ class Stream:
         self._stepper.put(state)
 
 
+class _Sender(NamedTuple):
+    """A sender that decides when to send, as its filter believes it: its rule, its link, its number of outputs."""
+
+    trigger: AbstractTrigger
+    channel: Channel
+    outputs: int
+
+
+def _sender_of(filter: AbstractFilter) -> _Sender | None:
+    """Return the sender of which a filter knows what its silence means; None of any other filter."""
+    world = filter.premise
+    if not filter.silence_tells or world is None or world.trigger is None:
+        return None
+    assert world.sensor is not None and world.channel is not None  # a sender has both
+    return _Sender(world.trigger, world.channel, len(first(world.sensor).outputs))
+
+
 def _row(value: object, length: int) -> np.ndarray | None:
     """Return an array or list as `length` doubles; None for anything else, which needs a slower check."""
     if type(value) is not np.ndarray and (type(value) is not list or any(part is np.ma.masked for part in value)):
@@ -256,8 +274,8 @@ class _Placed:
         self.received, self.given = filter.received, len(filter.inputs)
         # Numbers of what a sender sent, if it decides when to send; losses that are known follow them.
         self.values = 0
-        if isinstance(filter, EventFilter | StochasticEventFilter):
-            self.values = filter.received - filter.trigger.side_information(filter.outputs)
+        if sender := _sender_of(filter):
+            self.values = filter.received - sender.trigger.side_information(sender.outputs)
         with jax.enable_x64(True):
             self.numbers, self._static = cast(filter)
             self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape

@@ -248,7 +248,7 @@ class Timeline:
         if not there:
             self._fleet.look(rows.held[after - 1], time, self._spare)
             slots.insert(1, self._spare)
-        return self._lanes.sweeper.estimates(self._fleet.pool.history(slots), 1, len(slots))
+        return self._lanes.smoother.estimates(self._fleet.pool.history(slots), 1, len(slots))
 
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
-from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
@@ -14,13 +14,13 @@ from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
 from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.keys import seed_key
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import compute_sent_powers, steady_powers
 from heliograph.relays.design import given_design
-from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -140,24 +140,25 @@ def _sources(network: Network) -> Sources:
     return {name: (node.sensor, node.channel) for name, node in network.nodes.items() if isinstance(node, Node)}
 
 
-def _feedback_filters(network: Network) -> dict[str, FedBackFilter]:
+def _feedback_filters(network: Network) -> dict[str, AbstractFilter]:
     """Filters that send their prediction back to the sensor, by node."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    return {name: f for name, node in nodes.items() for f in node.filters.values() if isinstance(f, FedBackFilter)}
+    return {name: node.filters[node.informed_by] for name, node in nodes.items() if node.informed_by is not None}
 
 
-def _innovation_moments(filter: FedBackFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> Moments:
+def _innovation_moments(filter: AbstractFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> Moments:
     """C P C' + R of the filter's prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
         raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
-    state, moments = filter.init(), []
+    world, state, moments = filter.premise, filter.init(), []
+    assert world is not None and world.sensor is not None  # of a filter that is fed back
     for k, u in enumerate(inputs):
         state = filter.predict(state, u, k)
-        sensor = at(filter.base.sensor, k)
+        sensor = at(world.sensor, k)
         c = np.asarray(sensor.matrix)
         moment = np.eye(len(c) + 1)
-        moment[:-1, :-1] = c @ np.asarray(state.covariance) @ c.T + np.asarray(sensor.noise.covariance)
+        moment[:-1, :-1] = c @ np.asarray(filter.estimate(state).covariance) @ c.T + np.asarray(sensor.noise.covariance)
         moments.append(moment)
         state, _ = filter.correct(state, np.zeros(filter.received), k)
     return np.array([moments])

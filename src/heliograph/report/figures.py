@@ -12,7 +12,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from heliograph.simulation.results.plots import COLOURS as COLOURS
+from heliograph.disk.palette import COLOURS as COLOURS
 
 INK, PALE, GRID = "#1f2933", "#bcc4cd", "#e4e7eb"
 BLUE, VERMILION, GREEN, PURPLE, AMBER, MUTED = COLOURS

@@ -15,9 +15,8 @@ from heliograph.random_affine.erasure import outcomes
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
-from heliograph.simulation.claims import beliefs
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Node, ReceivingNode
+from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, whitened_innovations
 
@@ -188,7 +187,7 @@ def examine(
             test = _test_of(about_mean(white) if weighs(filter) else white)
         lost = np.any(record.estimates[node][name].claims == "none")
         filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
-    others = tuple(belief.words for belief in beliefs(network))
+    others = tuple(belief.words for belief in network.beliefs())
     return Health(
         record, arrivals_of(network, record.time, record.measurements), filters, outputs, network.shared, others
     )
@@ -213,7 +212,8 @@ def arrivals_of(network: Network, times: np.ndarray, received: Mapping[str, np.n
     links = []
     for node, z in received.items():
         receiver = network.nodes[node]
-        declared, may_be_lost, shares = None, not receiver.complete, _state_shares(receiver)
+        declared, may_be_lost = None, not receiver.complete
+        shares = _state_shares(receiver) if isinstance(receiver, Node) else None
         if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
             declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
         for i, name in enumerate(receiver.received_names):
@@ -243,10 +243,10 @@ def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     return MemoryTest.of(came, lags, claimed=True)
 
 
-def _state_shares(receiver: Node | ReceivingNode) -> Float[np.ndarray, " received"] | None:
+def _state_shares(receiver: Node) -> Float[np.ndarray, " received"] | None:
     """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
-    sends_always = isinstance(receiver, Node) and (receiver.trigger is None or isinstance(receiver.trigger, Periodic))
-    if not isinstance(receiver, Node) or not sends_always or isinstance(receiver.channel, OverTime):
+    sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
+    if not sends_always or isinstance(receiver.channel, OverTime):
         return None
     if receiver.channel.remembers or not receiver.channel.erases:
         return None

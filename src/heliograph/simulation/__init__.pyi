@@ -22,12 +22,19 @@ from .boundedness import (
     Boundedness as Boundedness,
     certify_boundedness as certify_boundedness,
 )
+from .description.wide_angles import (
+    WideAngles as WideAngles,
+)
 from .description.doubts import (
     Doubt as Doubt,
     doubts_before_data as doubts_before_data,
 )
 from .rows.columns import (
     FilterColumns as FilterColumns,
+)
+from .rows.row_smoother import (
+    RowHistory as RowHistory,
+    RowSmoother as RowSmoother,
 )
 from .rows.row_step import (
     RowStep as RowStep,
@@ -50,6 +57,10 @@ from .centres.uplinks import (
     SentReports as SentReports,
     Uplink as Uplink,
 )
+from .centres.node_filter import (
+    NodeFilter as NodeFilter,
+    node_network as node_network,
+)
 from .centres.tree import (
     RelayTree as RelayTree,
     relay_tree as relay_tree,
@@ -64,12 +75,17 @@ from .results.sums import (
 from .results.statistics_by_name import (
     StatisticsByName as StatisticsByName,
 )
+from .results.by_name import (
+    split_by_name as split_by_name,
+    split_measurements as split_measurements,
+)
 from .results.consistency import (
     Consistency as Consistency,
 )
 from .results.whiteness import (
     memory_test as memory_test,
     MemoryTest as MemoryTest,
+    score_innovations as score_innovations,
     whitened_innovations as whitened_innovations,
 )
 from .transmission import (

@@ -6,8 +6,8 @@ import numpy as np
 
 from heliograph.model.inputs import check_inputs
 from heliograph.numerics.check import array, check_seed, fail, rank
+from heliograph.numerics.keys import seed_key
 from heliograph.numerics.types import ArrayLike
-from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import Network
 
 

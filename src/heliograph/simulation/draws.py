@@ -12,13 +12,6 @@ WORLD = 0  # the plant's place among the checksums of names
 Number = int | jax.Array | np.ndarray
 
 
-def seed_key(seed: int) -> jax.Array:
-    """Key of a seed below 2^32: that of `jax.random.key`, which compiles a program for it in each process."""
-    words: jax.Array = jax.device_put(np.array([0, seed], dtype=np.uint32))
-    key: jax.Array = jax.random.wrap_key_data(words, impl="threefry2x32")
-    return key
-
-
 def draw_key(run_key: jax.Array, k: Number, source: Number, purpose: int) -> jax.Array:
     """Key of one draw: folded in by step, source and purpose, so no draw depends on how many others there are."""
     for number in (k, source, purpose):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.rows import data_of, over_rows
+from heliograph.filters.rows import data_of
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.traced import is_traced
@@ -41,7 +41,7 @@ def log_likelihood(
 
 
 def _sum(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
-    return jnp.sum(over_rows(filter, z, u, lambda state, innovation, k: jnp.asarray(innovation.log_likelihood)))
+    return jnp.sum(filter.scan(z, u, lambda state, innovation, k: jnp.asarray(innovation.log_likelihood)))
 
 
 _by_xla = compile_in_float64(_sum)

@@ -28,6 +28,8 @@ from heliograph.random_affine.base import check_forgets, drop_names, memories
 from heliograph.simulation.centres.centre import along_estimates, claim_of_informed, claim_of_reports
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.claims import (
+    Belief,
+    beliefs,
     judge_fused_standing,
     lower_claim,
     nodes_alike,
@@ -331,6 +333,10 @@ class Network(Module):
                 for claim in (self._claim_of_fusion(fusion),)
             }
         return claims
+
+    def beliefs(self) -> tuple[Belief, ...]:
+        """Filters that believe another world than that in which they stand, node after node, fused ones last."""
+        return tuple(beliefs(self))
 
     def in_single_precision(self) -> "Network":
         """Return the network for single precision: the lost digits are not bounded, so that all claims are lowered."""

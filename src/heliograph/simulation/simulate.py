@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.engine.limits import BLOCK
 from heliograph.numerics.check import check_count, check_progress, fail, instance, show_value
 from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
@@ -26,7 +27,6 @@ from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Resul
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.by_run import each_run, read_by, trajectories
 from heliograph.simulation.runs.lanes import (
-    BLOCK,
     LANES,
     RunLanes,
     Shared,

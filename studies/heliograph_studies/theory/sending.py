@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.linear.recursion import information_step
 from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.lapack import add_information
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.paths.model import Paths, Plants, error_covariances, path_information
 from heliograph.planning.paths.relaxation import envelope, split_paths
@@ -180,7 +180,7 @@ def _greedy(paths: Paths, information: Float[np.ndarray, "path"]) -> Steps:
     before: list[np.ndarray] = []
     taken: list[int] = []
     for _ in range(LONGEST):
-        after = [information_step(a @ p @ a.T + q, received) for received in alone]
+        after = [add_information(a @ p @ a.T + q, received) for received in alone]
         best = int(np.argmin([np.trace(covariance) for covariance in after]))
         p = after[best]
         for k, past in enumerate(before):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.numerics.keys import seed_key
 from heliograph.relays.design import local_error_design
-from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
 from heliograph.simulation.runs.native import native

@@ -15,7 +15,6 @@ from heliograph.filters.event.parts import FLOOR, GaussianSum, join, safe_log, t
 from heliograph.filters.gaussian.belief import predict_gaussian, smoother_step_by_transform, start_of
 from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.multiple_model import receive, repeat
 from heliograph.filters.modes.patterns import SideInformation, append_flag
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
@@ -25,6 +24,7 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import Periodic, StochasticTrigger
+from heliograph.numerics.density import log_density
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float
 

@@ -30,13 +30,13 @@ from heliograph.filters.gaussian.scores import (
     score_update,
     square_residuals,
 )
-from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import Law, ReceivedNoise, received_noise
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.model.premise import believing
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
+from heliograph.numerics.density import log_density
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
 

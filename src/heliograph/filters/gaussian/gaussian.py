@@ -24,8 +24,9 @@ from heliograph.model.over_time import OverTime, at, at_each_step, first, unstac
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
-from heliograph.numerics.angle import Angles
+from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
 
@@ -56,6 +57,32 @@ class GaussianFilter(AbstractBeliefFilter):
         """Moments of the sensor's signal y at step k, from the state before its measurement."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return signal_of(plant, sensor, self.transform, state, start_of(self.plant, self))
+
+    @compile_in_float64
+    def expect_signals(
+        self, z: Float[Array, "*runs steps m"], u: Float[Array, "steps inputs"]
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Mean (steps, p) and covariance (steps, p, p) of the signal before each row, and z (angles near them).
+
+        Args:
+            z: measurements of a run, or of several.
+            u: inputs, the same of all runs.
+        """
+
+        def body(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
+            k, z_k, u_k = row
+            prior = self.predict(state, u_k, k)
+            channel, y = at(self.channel, k), self.predict_signal(prior, k)
+            near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, self.observed_angles)
+            return self.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
+
+        def expect(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            start, rows = jax.tree.map(jnp.asarray, self.init()), (jnp.arange(len(z)), z, jnp.asarray(u))
+            mean, covariance, near = jax.lax.scan(body, start, rows)[1]
+            return mean, covariance, near
+
+        many = jnp.ndim(z) == 3
+        return (jax.vmap(expect) if many else expect)(jnp.asarray(z))
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:

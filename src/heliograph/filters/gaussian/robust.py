@@ -24,7 +24,6 @@ from heliograph.filters.gaussian.scores import (
 )
 from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Innovation
@@ -35,6 +34,7 @@ from heliograph.model.premise import believes
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
+from heliograph.numerics.density import log_density
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
@@ -25,6 +24,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.density import log_density
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree

@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.filters.rows import rows
 from heliograph.model.inputs import check_inputs
 from heliograph.model.row_times import judge_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.rows import check_rows
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
@@ -111,12 +111,12 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
         columns: list[np.ndarray] = []
         for name, z in zip(network.names, run, strict=True):
             like = len(columns[0]) if columns else None
-            measured = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            measured = check_rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
             columns.append(np.asarray(measured))
         steps, count = len(columns[0]), len(network.inputs)
         if known is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
-        u = np.zeros((steps, 0)) if known is None else rows("inputs", known, steps, count, missing=False)
+        u = np.zeros((steps, 0)) if known is None else check_rows("inputs", known, steps, count, missing=False)
         check_inputs(network.inputs, np.asarray(u), (network.plant, network.nodes, network.fused))
         results.append((np.concatenate(columns, axis=1), np.asarray(u)))
     return results

@@ -12,9 +12,7 @@ import numpy as np
 from heliograph.engine.choice import chosen
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import cubature_filter
-from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.linear import linear_filter
-from heliograph.filters.rows import over_rows
 from heliograph.learning.description import Build, Description
 from heliograph.learning.likelihood.data import Data
 from heliograph.model.channel import Channel, parallel
@@ -26,6 +24,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail
+from heliograph.numerics.density import log_density
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.module import same
@@ -128,8 +127,8 @@ class Objective:
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m)."""
-        innovations: tuple[jax.Array, jax.Array] = over_rows(
-            self.filter(x), z, u, lambda state, innovation, k: (innovation.value, innovation.covariance)
+        innovations: tuple[jax.Array, jax.Array] = self.filter(x).scan(
+            z, u, lambda state, innovation, k: (innovation.value, innovation.covariance)
         )
         return innovations
 
@@ -141,7 +140,7 @@ class Objective:
             estimate = filter.estimate(state)
             return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 
-        mean, covariance = over_rows(filter, z, u, claimed)
+        mean, covariance = filter.scan(z, u, claimed)
         return nearest(jnp.asarray(truth), mean, angles) - mean, covariance
 
 

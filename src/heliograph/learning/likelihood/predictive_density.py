@@ -4,23 +4,20 @@ from functools import cache
 from typing import NamedTuple, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from scipy.special import logsumexp, ndtr
 
-from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
-from heliograph.filters.modes.mixture import Component, atoms_of
-from heliograph.filters.rows import rows
-from heliograph.model.over_time import at
+from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.row_times import judge_dates
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.float64 import compile_in_float64, in_float64
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.numerics.rows import check_rows
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.atoms import Component, list_atoms
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.erasure import condition_on_arrival
@@ -153,9 +150,11 @@ def predictive(
     received = condition_on_arrival(channel)
     filter = cubature_filter(plant, sensor, received)
     judge_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
-    z = rows("measurements", measurements, None, filter.received, missing=True)
-    u = rows("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False)
-    y, spread, near = expect_signals(filter, z, u)
+    z = check_rows("measurements", measurements, None, filter.received, missing=True)
+    u = check_rows(
+        "inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False
+    )
+    y, spread, near = filter.expect_signals(z, u)
     return score_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), StackDensities.of(received, nodes))
 
 
@@ -178,31 +177,13 @@ class StackDensities(tuple[StackDensity, ...]):
     def of(channel: AbstractRandomAffine, nodes: int) -> "StackDensities":
         """Combinations of each part of a stack, of everything else as a whole."""
         parts = channel.maps if isinstance(channel, Stack) else (channel,)
-        return StackDensities(_part(atoms_of(discretise_laws(affine, nodes))) for affine in parts)
+        return StackDensities(_part(list_atoms(discretise_laws(affine, nodes))) for affine in parts)
 
 
 def _part(components: list[Component]) -> StackDensity:
     possible = [component for component in components if component.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
     return StackDensity(np.log(weight), gain, offset, noise)
-
-
-@compile_in_float64
-def expect_signals(
-    filter: GaussianFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mean (steps, p) and covariance (steps, p, p) of the signal before each step, and z (angles near them)."""
-
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, ...]]:
-        k, z_k, u_k = row
-        prior = filter.predict(state, u_k, k)
-        channel, y = at(filter.channel, k), filter.predict_signal(prior, k)
-        near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, filter.observed_angles)
-        return filter.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
-
-    start = jax.tree.map(jnp.asarray, filter.init())
-    signals: tuple[jax.Array, ...] = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
-    return signals[0], signals[1], signals[2]
 
 
 def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: StackDensities) -> Predictive:

@@ -33,7 +33,7 @@ from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
 from heliograph.random_affine.moments.second_moments import has_known_mean, second_order
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Common, Node
+from heliograph.simulation.node import Node
 
 MOST_MODES = 64  # of all nodes together
 
@@ -73,18 +73,18 @@ def sources_of(network: Network) -> dict[str, Source]:
     """
     if network.relays is not None:
         raise fail("network of a design", "nodes that receive sensors through channels", "relays that filter")
-    shared = {} if network.common is None else {"common": network.common}
-    sources = {}
-    for name, node in (network.nodes | shared).items():
-        if isinstance(node, Node | Common):
-            sensor, channel = first(node.sensor), first(node.channel)
-            if not isinstance(sensor, LinearSensor) or channel.past:
-                got = "a channel with delays" if isinstance(sensor, LinearSensor) else type(sensor).__name__
-                raise fail(f"node {name!r}", "a LinearSensor and a channel without delays", got)
-            if isinstance(node, Node) and node.informed_by is not None:
-                raise fail(f"node {name!r}", "a sensor without feedback", "one that receives a filter's estimate")
-            refuse_angles("design", sensor)
-            sources[name] = Source(node.sensor, node.channel)
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    sources = {name: Source(node.sensor, node.channel) for name, node in nodes.items()}
+    if network.common is not None:
+        sources["common"] = Source(network.common.sensor, network.common.channel)
+    for name, source in sources.items():
+        sensor, channel = first(source.sensor), first(source.channel)
+        if not isinstance(sensor, LinearSensor) or channel.past:
+            got = "a channel with delays" if isinstance(sensor, LinearSensor) else type(sensor).__name__
+            raise fail(f"node {name!r}", "a LinearSensor and a channel without delays", got)
+        if name in nodes and nodes[name].informed_by is not None:
+            raise fail(f"node {name!r}", "a sensor without feedback", "one that receives a filter's estimate")
+        refuse_angles("design", sensor)
     return sources
 
 

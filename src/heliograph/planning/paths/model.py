@@ -18,9 +18,9 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.linear.jump_system import JumpSystem
-from heliograph.linear.recursion import information_step
 from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank
+from heliograph.numerics.lapack import add_information
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error import Error
@@ -92,7 +92,7 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
     for k, received in enumerate(information):
         if k:
             predicted = a[k] @ posteriors[-1] @ a[k].T + q[k]
-        posteriors.append(information_step(predicted, received))
+        posteriors.append(add_information(predicted, received))
     return np.array(posteriors)
 
 

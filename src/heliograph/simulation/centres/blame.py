@@ -1,7 +1,6 @@
 """Which node a row's implausible values are of, where a central filter judges those of all nodes together."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
@@ -12,18 +11,6 @@ from heliograph.filters.plausibility import Judgement
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.side_by_side import filter_step, map_all
-
-Candidate = TypeVar("Candidate")
-
-
-def find_blamed(
-    candidates: Sequence[Candidate], size: Callable[[Candidate], float], plausible_without: Callable[[Candidate], bool]
-) -> Candidate:
-    """Return the first, from the largest on, without which a row is plausible; the largest if there is none."""
-    ordered = sorted(candidates, key=size, reverse=True)
-    if len(ordered) == 1:
-        return ordered[0]
-    return next((one for one in ordered if plausible_without(one)), ordered[0])
 
 
 def refuse_centrally(
@@ -59,7 +46,7 @@ def refuse_centrally(
     refused = dict[str, dict[int, str]]()
     for k, reason in why.items():
         if candidates := [removal for removal in removals if removal[0] == k]:
-            _, name = find_blamed(
+            _, name = Judgement.find_culprit(
                 candidates, lambda removal: float(np.nanmax(np.abs(z[removal[1]][removal[0]]))), plausible.__getitem__
             )
             refused.setdefault(name, {})[k] = reason

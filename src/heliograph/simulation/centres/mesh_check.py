@@ -12,12 +12,12 @@ from heliograph.fusion.mesh.rules import DiffusionWeights, FrozenWeights
 from heliograph.fusion.quantizer import UniformQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.jump_system import propagate
-from heliograph.linear.recursion import information_step
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
+from heliograph.numerics.lapack import add_information
 from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import claim_of_informed
@@ -301,7 +301,7 @@ def _steps(
     total = np.where(graph.present[:, :, None, None], squares[graph.senders], 0.0).sum(axis=1)
     p = np.tile(np.eye(n), (len(squares), 1, 1))
     for _ in range(STEPS):
-        p = information_step(a @ p @ a.T + q, total)
+        p = add_information(a @ p @ a.T + q, total)
     # c_ij F_i A e_j, and -c_ij F_i A e_i - P_i S_j A e_i.
     pulled = shares[:, :, None, None] * ((np.eye(n) - p @ total) @ a)[:, None]
     return a - p @ squares @ a, pulled, -pulled - p[:, None] @ squares[graph.senders] @ a

@@ -13,10 +13,10 @@ from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transit
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.jump_system import propagate
-from heliograph.linear.recursion import information_step
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, instance, is_whole
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.lapack import add_information
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
@@ -219,7 +219,7 @@ def best_possible(
     covariance = np.array(start.covariance)
     for model, total in zip(steps, reversed(information), strict=True):
         a = np.asarray(model.motion.matrix)
-        covariance = information_step(propagate(a, covariance, model.motion.noise), total)
+        covariance = add_information(propagate(a, covariance, model.motion.noise), total)
     return covariance
 
 

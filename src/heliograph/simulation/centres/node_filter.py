@@ -46,12 +46,18 @@ class NodeFilter(AbstractSizedFilter):
 
     The measurement is z of the node itself, then for each neighbour j the mean (n,) and covariance (n, n) of its
     estimate before the step and its z_j: NaN where the message did not come. Claim: as the fusion's, whatever comes.
+
+    Args:
+        mesh: the fusion, with the node's row of the graph.
+        measured: numbers of each sensor, the node's first.
+        receivers: names of the nodes that receive this one's messages.
+        quantizer: of its messages; None of messages that are not quantized.
     """
 
     mesh: Mesh
-    measured: tuple[int, ...] = eqx.field(static=True)  # numbers of each sensor, the node's first
-    receivers: tuple[str, ...] = eqx.field(static=True)  # nodes that receive this one's messages
-    quantizer: AbstractQuantizer | None  # of its messages
+    measured: tuple[int, ...] = eqx.field(static=True)
+    receivers: tuple[str, ...] = eqx.field(static=True)
+    quantizer: AbstractQuantizer | None
 
     @in_float64
     def init(self) -> NodeState:
@@ -172,6 +178,10 @@ def _check_alone(what: str, network: Network, between: Fusion) -> None:
 
 def node_network(network: Network, node: str) -> Network:
     """Network of one node of a fusion between neighbours: itself, and its neighbours as senders of messages.
+
+    Args:
+        network: the whole network.
+        node: name of the node.
 
     Raises:
         ValueError: not one fusion between neighbours, no node of it, one that cannot run by itself.

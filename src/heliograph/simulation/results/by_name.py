@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.filters.innovation import Weighed
 from heliograph.fusion.rules import Fusion
-from heliograph.numerics.types import PyTree
+from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED, Network
 
@@ -45,8 +45,15 @@ def _arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, Sen
     return reports
 
 
-def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Measurements by node, in the order of the network, from those of the groups (..., node, received)."""
+def split_measurements(
+    network: Network, groups: Sequence[Float[np.ndarray, "*runs node received"]]
+) -> dict[str, np.ndarray]:
+    """Split measurements of the groups of nodes (..., node, received) by node, in the order of the network.
+
+    Args:
+        network: the network, whose `groups` are the nodes of each.
+        groups: measurements of each group, as a reducer collects them.
+    """
     received = {
         name: np.asarray(z)[..., i, :]
         for names, z in zip(network.groups, groups, strict=True)
@@ -78,9 +85,13 @@ def collect_weighed(network: Network, batch: PyTree) -> dict[str, dict[str, Weig
 def split_by_name(
     network: Network, batch: PyTree, read: Callable[[PyTree], Any], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Results of `read` by node and filter: each kind's part split at its axes (filter, node), the first at `axis`.
+    """Split what is collected of estimates by node and filter, at its axes (filter, node), the first of them at `axis`.
 
-    `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
+    Args:
+        network: the network, whose `kinds` are the filters of each.
+        batch: "estimates" by kind, and "fused" by name, which has not these two axes.
+        read: gives the array of an entry of `batch`.
+        axis: of the filters in that array; the nodes' follows it.
     """
     by_node: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
     parts = batch["estimates"]

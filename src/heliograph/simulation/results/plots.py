@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from heliograph.disk.palette import COLOURS
 from heliograph.disk.quoting import label_with_unit
 from heliograph.numerics.check import fail
 
-# Okabe and Ito's palette, which people with colour blindness can tell apart; then grey.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b05c92", "#e69f00", "#66727f")
 FAR = 10.0  # times the best filter's error: from there an axis is logarithmic
 
 if TYPE_CHECKING:  # an extra

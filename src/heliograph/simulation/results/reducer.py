@@ -17,9 +17,9 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import (
     collect_weighed,
-    measurements_of,
     reports_by_name,
     split_by_name,
+    split_measurements,
     transmissions_of,
     uplinks_by_name,
 )
@@ -121,7 +121,7 @@ class Trajectories(AbstractReducer[Record]):
 
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
     """Record from the scan's output; nodes in the network's order."""
-    measurements = measurements_of(network, batch["measurements"])
+    measurements = split_measurements(network, batch["measurements"])
     mean = split_by_name(network, batch, attrgetter("mean"), -3)
     covariance = split_by_name(network, batch, attrgetter("covariance"), -4)
     estimates = {

@@ -10,7 +10,7 @@ import scipy
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import HALF
-from heliograph.filters.rows import data_of, over_rows
+from heliograph.filters.rows import data_of
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance, rank
 from heliograph.numerics.float64 import quickly_compiled
@@ -137,7 +137,7 @@ def whitened_innovations(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     if filter.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
-    return np.asarray(innovations_of(filter, *data_of(filter, data, inputs))[1])
+    return np.asarray(score_innovations(filter, *data_of(filter, data, inputs))[1])
 
 
 def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
@@ -146,12 +146,18 @@ def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray
     return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
 
 
-def innovations_of(
+def score_innovations(
     filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
 
-    NaN where it did not arrive, counted less than half, or the components before it determine it.
+    NaN where it did not arrive, counted less than half, or the components before it determine it. The same as
+    `whitened_innovations`, unchecked, in one pass with the likelihoods.
+
+    Args:
+        filter: a filter that claims a covariance.
+        z: its measurements (steps, m).
+        u: its inputs (steps, inputs).
     """
     likelihoods, white = compute_once(_innovations, _by_xla, (filter, z, u))
     return likelihoods, white
@@ -166,7 +172,7 @@ def _innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
         white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
         return jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan)
 
-    return over_rows(filter, z, u, single)
+    return filter.scan(z, u, single)
 
 
 _by_xla = quickly_compiled(_innovations)

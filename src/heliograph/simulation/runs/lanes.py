@@ -14,11 +14,11 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from heliograph.engine.limits import BLOCK
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.results.statistics import BATCHES
 
-BLOCK = 32  # runs simulated side by side: wide enough for vector units, small enough for the cache
 LANES = 8  # of a processor: at most this many cores are used
 WIDE_LANES = 256  # of other devices, which want thousands of runs at once
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import threads, try_native
+from heliograph.engine.limits import BLOCK
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.medium import medium_of
@@ -22,7 +23,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.lanes import BLOCK, LANES, Progress, batch_counts, in_chunks
+from heliograph.simulation.runs.lanes import LANES, Progress, batch_counts, in_chunks
 from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
 from heliograph.simulation.stepping import AllFilters

@@ -1,4 +1,4 @@
-"""Rows in order, their history, and the program that sweeps back over them to smooth an earlier moment."""
+"""Smoothed estimates after a row, given the rows after it: a sweep back over the history of the rows."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import chosen, map_arrays, setting
 from heliograph.filters.base import AbstractFilter
@@ -16,30 +17,35 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate, lower_unsound_claim
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.float64 import to_numpy, understood
-from heliograph.numerics.module import Module
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.static import Static, cast
-from heliograph.numerics.types import PyTree
+from heliograph.numerics.types import Array, Float, Int, PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import Network
 from heliograph.simulation.plausible_step import reasons
 from heliograph.simulation.rows.row_step import NetworkStep
 from heliograph.simulation.stepping import AllFilters
 
+Rows = TypeAliasType("Rows", Float[Array, "row column"])
 NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by kind, and by name
 
 
-class History(NamedTuple):
+@readable
+class RowHistory(NamedTuple):
     """Rows in order: measurements of all nodes, inputs (NaN where none was given), and the time.
 
-    For each row there are also the filters' states after it, the inputs held, the step number, and the outputs.
-
-    Shapes: rows (row, received + given + 1), held (row, given), step (row,).
+    Args:
+        rows: these numbers (row, received + given + 1).
+        state: the filters' states after each row.
+        held: inputs held there (row, given).
+        step: number of the step (row,).
+        outputs: estimates and judgements after each row.
     """
 
-    rows: jax.Array | np.ndarray
+    rows: Rows
     state: PyTree
-    held: jax.Array | np.ndarray
-    step: jax.Array | np.ndarray
+    held: Rows
+    step: Int[Array, " row"]
     outputs: PyTree
 
     def parts(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -48,7 +54,7 @@ class History(NamedTuple):
         numbers = self.rows[row]
         return numbers[: -given - 1], numbers[-given - 1 : -1], numbers[-1]
 
-    def known(self, row: jax.Array) -> PyTree:
+    def state_after(self, row: jax.Array) -> PyTree:
         """Return the filters' states after a row."""
         return jax.tree.map(lambda leaf: leaf[row], self.state)
 
@@ -73,7 +79,7 @@ class Sweep(Module):
     kinds: tuple[int, ...] = eqx.field(static=True)
 
     def step(
-        self, history: History, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
+        self, history: RowHistory, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, NetworkSmootherStep]:
         """Step all filters into a row, without implausible measurements; return also their smoother steps."""
         by_kind, central = reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
@@ -81,9 +87,9 @@ class Sweep(Module):
         after, outputs = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
         return after, ({kind: outputs["smoother_steps"][kind] for kind in self.kinds}, outputs["central_steps"])
 
-    def start(self, history: History, row: jax.Array) -> PyTree:
+    def start(self, history: RowHistory, row: jax.Array) -> PyTree:
         """Return the filters' states after a row of the history."""
-        by_kind, central, *_ = history.known(row)
+        by_kind, central, *_ = history.state_after(row)
         return by_kind, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
 
     def outputs(self, steps: NetworkSmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
@@ -104,7 +110,7 @@ def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *r
 
 
 StepOfRow: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
-Into: TypeAlias = "Callable[[Sweep, History, StepOfRow], NetworkSmootherStep]"
+Into: TypeAlias = "Callable[[Sweep, RowHistory, StepOfRow], NetworkSmootherStep]"
 
 
 @lru_cache
@@ -119,7 +125,7 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
     # Continuous time: one step per row. Discrete time: also the steps between the rows.
     into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
 
-    def run(numbers: list[jax.Array], history: History, span: jax.Array) -> PyTree:
+    def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
         sweep: Sweep = static.filled(numbers)
         begin, stop = span
         last = stop - 1, history.step[stop - 1]
@@ -148,7 +154,7 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
 
 
 def _into_row(dt: int) -> Into:
-    def into(sweep: Sweep, history: History, at: StepOfRow) -> NetworkSmootherStep:
+    def into(sweep: Sweep, history: RowHistory, at: StepOfRow) -> NetworkSmootherStep:
         row, _ = at
         state, received = sweep.start(history, row - 1), history.parts(row)[0]
         return sweep.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
@@ -156,11 +162,11 @@ def _into_row(dt: int) -> Into:
     return into
 
 
-def _earlier_row(history: History, at: StepOfRow) -> StepOfRow:
+def _earlier_row(history: RowHistory, at: StepOfRow) -> StepOfRow:
     return at[0] - 1, history.step[at[0] - 1]
 
 
-def _into_step(sweep: Sweep, history: History, at: StepOfRow) -> NetworkSmootherStep:
+def _into_step(sweep: Sweep, history: RowHistory, at: StepOfRow) -> NetworkSmootherStep:
     """Compute the smoother step at step k, by way of the steps without measurements since the row before."""
     row, k = at
 
@@ -171,13 +177,24 @@ def _into_step(sweep: Sweep, history: History, at: StepOfRow) -> NetworkSmoother
     return sweep.step(history, row, state, *history.at_step(row, k), k)[1]
 
 
-def _earlier_step(history: History, at: StepOfRow) -> StepOfRow:
+def _earlier_step(history: RowHistory, at: StepOfRow) -> StepOfRow:
     row, k = at
     return jnp.where(k - 1 == history.step[row - 1], row - 1, row), k - 1
 
 
-class Sweeper:
-    """The smoothing program of a network, with its numbers and the names of its results."""
+@readable
+class RowSmoother:
+    """A network's smoothed estimates after a row, given later ones: a pure function of the rows' history.
+
+    Filters that keep no covariance are left out. One program serves all histories of one length.
+
+    Args:
+        network: the network.
+        dt: place of the time step among the inputs; None where time counts steps.
+
+    Raises:
+        ValueError: no filter that can be smoothed.
+    """
 
     def __init__(self, network: Network, dt: int | None):
         self.network = network
@@ -196,12 +213,12 @@ class Sweeper:
             self.sweep = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
             self._numbers, static = cast(self.sweep)
         self._run, self._by_xla = sweep_back(static, dt)
-        self._programs = dict[tuple[int, str], Callable[[History, np.ndarray], PyTree]]()
+        self._programs = dict[tuple[int, str], Callable[[RowHistory, np.ndarray], PyTree]]()
 
     def _fuses(self, fusion: StackedFusions, kinds: tuple[int, ...]) -> bool:
         return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
-    def _program(self, history: History) -> Callable[[History, np.ndarray], PyTree]:
+    def _program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
         """Return the program for histories of this length, which an engine is chosen for once."""
         key = len(history.rows), setting()
         if key not in self._programs:
@@ -214,8 +231,8 @@ class Sweeper:
                 self._programs[key] = lambda *arguments: _only(code(*jax.tree.leaves(arguments)))
         return self._programs[key]
 
-    def estimates(self, history: History, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
-        """Return estimates after a row given the rows after it, by node and filter."""
+    def estimates(self, history: RowHistory, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
+        """Return the estimates after row `begin` given the rows after it, up to `stop`, by node and filter."""
         with jax.enable_x64(True):
             by_kind, fused = self._program(history)(history, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}

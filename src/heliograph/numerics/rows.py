@@ -1,0 +1,25 @@
+"""Rows of data as a user gives them: an array of numbers, one row a step."""
+
+import jax
+import numpy as np
+
+from heliograph.numerics.check import array, fail, show_value
+from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+
+def check_rows(
+    name: str, value: ArrayLike | None, steps: int | None, length: int | None, missing: bool
+) -> Float[Array, "steps n"]:
+    """Return an array of `length` numbers a step, one axis standing for one number; NaN where `missing` is allowed."""
+    if isinstance(value, jax.core.Tracer):
+        return value
+    if value is None:
+        raise fail(name, f"shape ({steps}, {length})", "none")
+    try:
+        values = np.asarray(fill_masked(value), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise fail(name, "an array of numbers", show_value(value)) from None
+    values = values[:, None] if values.ndim == 1 and length in (1, None) else values
+    table: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
+    return table

@@ -1,0 +1,117 @@
+"""Atoms of a random affine map: all combinations of its gains and noises, where these are finitely many."""
+
+from collections.abc import Callable
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from heliograph.numerics.check import fail
+from heliograph.random_affine.base import AbstractRandomAffine, fold
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Independent, Shaped
+from heliograph.random_affine.noise import Gaussian as GaussianNoise
+from heliograph.random_affine.superposed import Superposed
+
+COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
+
+
+class Component(NamedTuple):
+    """One combination of atoms: with probability `weight`, z = gain x + offset + N(0, noise).
+
+    Shapes: gain (m, n), offset (m,), noise (m, m).
+    """
+
+    weight: float
+    gain: np.ndarray
+    offset: np.ndarray
+    noise: np.ndarray
+
+
+Atoms = list[list[Component]]  # of each of the maps inside
+
+
+def list_atoms(channel: AbstractRandomAffine) -> list[Component]:
+    """List all combinations of the atoms of a map's gains and noises."""
+    return fold(channel, {
+        GainAndNoise: _atoms_of_hop,
+        Series: _reduce_parts(_compose_maps),
+        Stack: _reduce_parts(_stack_maps),
+        Superposed: lambda channel, _: list_atoms(channel.as_stack),
+        # One of several maps, drawn: p(i) times the atoms of map i.
+        Mixture: lambda mixture, parts: [c._replace(weight=p * c.weight) for p, atoms in
+                                         zip(mixture.choice.probabilities, parts, strict=True) for c in atoms],
+    }, "mixture filter", "maps made of hops, series, stacks, sums and mixtures")  # fmt: skip
+
+
+def _atoms_of_hop(hop: GainAndNoise, _: object) -> list[Component]:
+    """Combine every gain with every noise of z = g H y + n."""
+    gains, noises = _gain_atoms(hop.law), _noise_atoms(hop.noise)
+    return [Component(p * q, g * np.asarray(hop.matrix), c, r) for p, g in gains for q, c, r in noises]
+
+
+def _reduce_parts(join: Callable[[Component, Component], Component]) -> Callable[[object, Atoms], list[Component]]:
+    def pairs(a: list[Component], b: list[Component]) -> list[Component]:
+        if len(a) * len(b) > COMPONENT_LIMIT:
+            raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
+        return [join(x, y) for x in a for y in b]
+
+    return lambda _, parts: reduce(pairs, parts)
+
+
+def _compose_maps(x: Component, y: Component) -> Component:
+    """Compose maps, y after x: G_y (G_x s + c_x + n_x) + c_y + n_y."""
+    noise = y.gain @ x.noise @ y.gain.T + y.noise
+    return Component(x.weight * y.weight, y.gain @ x.gain, y.gain @ x.offset + y.offset, noise)
+
+
+def _stack_maps(x: Component, y: Component) -> Component:
+    """Stack both maps, one above the other."""
+    gain, offset = np.concatenate([x.gain, y.gain]), np.concatenate([x.offset, y.offset])
+    return Component(x.weight * y.weight, gain, offset, np.asarray(scipy.linalg.block_diag(x.noise, y.noise)))
+
+
+def _gain_atoms(law: AbstractLaw) -> list[tuple[float, float]]:
+    match law:
+        case Constant():
+            return [(1.0, float(law.value))]
+        case Discrete():
+            return [(float(p), float(v)) for p, v in zip(law.probabilities, law.values, strict=True)]
+        case _:
+            raise fail("mixture filter", "gains of finitely many values", type(law).__name__)
+
+
+NoiseAtom = tuple[float, np.ndarray, np.ndarray]  # probability, value, Gaussian covariance
+
+
+def _joint(a: NoiseAtom, b: NoiseAtom) -> NoiseAtom:
+    return a[0] * b[0], np.concatenate([a[1], b[1]]), np.asarray(scipy.linalg.block_diag(a[2], b[2]))
+
+
+def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
+    """List all combinations of the atoms of a noise's components."""
+    match noise:
+        # One atom, its mean, with the covariance about it.
+        case GaussianNoise():
+            return [(1.0, np.asarray(noise.mean), np.asarray(noise.covariance))]
+        case FiniteSupport():
+            none = np.zeros((noise.dimension, noise.dimension))
+            return [(float(p), v, none) for p, v in zip(noise.probabilities, noise.atoms, strict=True)]
+        # B n: every atom mapped, B c and B R B'.
+        case Shaped():
+            b = np.asarray(noise.matrix)
+            return [(p, b @ c, b @ r @ b.T) for p, c, r in _noise_atoms(noise.source)]
+        # Independent components: the product of their laws.
+        case Independent():
+            atoms = [(1.0, np.zeros(0), np.zeros((0, 0)))]
+            for component in noise.parts:
+                more = _noise_atoms(component)
+                if len(atoms) * len(more) > COMPONENT_LIMIT:
+                    got = f"{len(atoms) * len(more):,}"
+                    raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", got)
+                atoms = [_joint(a, b) for a in atoms for b in more]
+            return atoms
+        case _:
+            raise fail("mixture filter", "noises of finite support or Gaussian", type(noise).__name__)
