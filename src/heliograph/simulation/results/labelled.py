@@ -1,7 +1,7 @@
 """Labelled arrays and wide tables: the common parts of records and of statistics."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -9,13 +9,12 @@ import heliograph
 from heliograph.disk.quoting import visible
 from heliograph.model.estimate import STRENGTH, Claim, Estimate
 from heliograph.numerics.check import fail, instance, table
+from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.centres.uplinks import Uplink
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-
-    from heliograph.simulation.centres.uplinks import Uplink
 
 LEVELS = ["node", "filter", "quantity", "component", "other"]
 Column = tuple[str, str, str, str, str]
@@ -112,31 +111,53 @@ def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[s
 
 
 TIME = "time"
-Variables = dict[str, tuple[list[str], np.ndarray]]  # by name: dimensions and values
 T = TypeVar("T")
 Shape = tuple[int, ...]
 Placed = tuple[Shape, T]  # where a value belongs, and the value
-MEANING = {
-    "truth": "true state",
-    "measurement": "what reached the node, NaN where nothing arrived and beyond its length",
-    "length": "how many numbers the node receives; -1: it is no place that receives",
-    "mean": "estimate of the state",
-    "covariance": "covariance of the error as the filter claims it",
-    "claim": "what the claimed covariance is: exact, upper, nominal or none; empty where there is no such filter",
-    "estimated": "whether estimates are kept for the node",
-    "saturated": "whether a component was out of the quantizer's reach; in statistics, in which share of the runs",
-    "symbols": "how many symbols were sent for a component; in statistics their mean over the runs",
-    "place": "place of the sender among those of the fusion; -1: it sends nothing to it",
-    "runs": "number of runs in the batch",
-    "errors": "sum over the batch's runs of e_i e_j, e = truth - mean",
-    "claimed": "mean over the batch's runs of the claimed covariance",
-    "nees": "sum over the batch's runs of e' B^-1 e",
-    "failed": "runs without a valid estimate at this step",
-    "failed_runs": "runs without a valid estimate at some step",
-    "rmse": "root mean square error",
-    "deviation": "root of the mean claimed variance",
-    "nees_per_dimension": "mean of e' B^-1 e / n, 1 if the claim is exact",
+
+
+class Field(NamedTuple):
+    """A variable of a dataset: its axes, of which "..." are those of rows (run, time), and what it means."""
+
+    axes: str
+    meaning: str
+
+
+# Everything that datasets of records, and of statistics, hold.
+FIELDS = {
+    "truth": Field("... state", "true state"),
+    "measurement": Field("... node received", "what reached the node, NaN where nothing arrived and beyond its length"),
+    "length": Field("node", "how many numbers the node receives; -1: it is no place that receives"),
+    "mean": Field("... node filter state", "estimate of the state"),
+    "covariance": Field("... node filter state other", "covariance of the error as the filter claims it"),
+    "claim": Field(
+        "node filter",
+        "what the claimed covariance is: exact, upper, nominal or none; empty where there is no such filter",
+    ),
+    "estimated": Field("node", "whether estimates are kept for the node"),
+    "saturated": Field(
+        "... fusion sender state",
+        "whether a component was out of the quantizer's reach; in statistics, in which share of the runs",
+    ),
+    "symbols": Field(
+        "... fusion sender state", "how many symbols were sent for a component; in statistics their mean over the runs"
+    ),
+    "place": Field("fusion sender", "place of the sender among those of the fusion; -1: it sends nothing to it"),
+    "runs": Field("batch", "number of runs in the batch"),
+    "errors": Field("batch ... node filter state other", "sum over the batch's runs of e_i e_j, e = truth - mean"),
+    "claimed": Field("batch ... node filter state other", "mean over the batch's runs of the claimed covariance"),
+    "nees": Field("batch ... node filter", "sum over the batch's runs of e' B^-1 e"),
+    "failed": Field("... node filter", "runs without a valid estimate at this step"),
+    "failed_runs": Field("node filter", "runs without a valid estimate at some step"),
+    "rmse": Field("... node filter state", "root mean square error"),
+    "deviation": Field("... node filter state", "root of the mean claimed variance"),
+    "nees_per_dimension": Field("... node filter", "mean of e' B^-1 e / n, 1 if the claim is exact"),
 }
+
+
+def axes_of(name: str, lead: Sequence[str]) -> list[str]:
+    """Axes of a field, with those of rows (`lead`) where it has them."""
+    return [axis for part in FIELDS[name].axes.split() for axis in (lead if part == "..." else [part])]
 
 
 def check_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
@@ -161,58 +182,73 @@ def place_filters(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) 
     return filters, places
 
 
-def fill_places(lead: Shape, places: Shape, tail: Shape, parts: Sequence[Placed[np.ndarray]]) -> np.ndarray:
-    """Fill an array (*lead, *places, *tail) with parts (*lead, *up to tail) at their places; NaN elsewhere."""
-    arrays = np.full((*lead, *places, *tail), np.nan)
-    ahead: tuple[slice, ...] = (slice(None),) * len(lead)
-    for position, values in parts:
-        where: Any = (*ahead, *position, *map(slice, values.shape[len(lead) :]))
-        arrays[where] = values
-    return arrays
+def fill_field(
+    name: str, lead: Sequence[str], sizes: Mapping[str, int], parts: Iterable[Placed[ArrayLike]]
+) -> np.ndarray:
+    """Fill a field with parts at their places along node, or node and filter; NaN where there is none.
+
+    A part that is shorter than its axis, as measurements of a node may be, fills the beginning.
+    """
+    axes = axes_of(name, lead)
+    whole, begin = np.full([sizes[axis] for axis in axes], np.nan), axes.index("node")
+    for place, part in parts:
+        lengths = np.shape(part)[begin:]
+        where: Any = (*(slice(None),) * begin, *place, *map(slice, lengths))
+        whole[where] = part
+    return whole
 
 
-def claims_of(sizes: Shape, outcome: Iterable[Placed[Any]]) -> np.ndarray:
+def claims_of(sizes: Mapping[str, int], outcome: Iterable[Placed[Any]]) -> np.ndarray:
     """Return the claim of each filter, at its place; empty elsewhere."""
-    claims = np.full(sizes, "", dtype="U7")
+    claims = np.full((sizes["node"], sizes["filter"]), "", dtype="U7")
     for position, estimate in outcome:
         claim: Claim = estimate.claim
         claims[position] = claim
     return claims
 
 
-def uplink_variables(
-    uplinks: "Mapping[str, Uplink]", lead: list[str], n: int
-) -> dict[str, tuple[list[str], np.ndarray]]:
-    """Variables of the quantizers, by fusion and sender, with integers and booleans as they are."""
+def each_filter(
+    dataset: "xr.Dataset", names: Sequence[str], lead: Sequence[str]
+) -> Iterator[tuple[str, str, Claim, dict[str, np.ndarray]]]:
+    """Yield node, filter, claim, and copies of these fields without their axes (node, filter), of each filter there."""
+    nodes, filters, claim = names_of(dataset, "node"), names_of(dataset, "filter"), values_of(dataset, "claim", lead)
+    fields = {name: values_of(dataset, name, lead) for name in names}
+    places = {name: axes_of(name, lead).index("node") for name in names}
+    for i, j in zip(*np.nonzero(claim != ""), strict=True):
+        values = {name: field[(*(slice(None),) * places[name], i, j)].copy() for name, field in fields.items()}
+        yield nodes[i], filters[j], cast(Claim, str(claim[i, j])), values
+
+
+def uplink_fields(
+    uplinks: "Mapping[str, Uplink]", rows: int, n: int
+) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
+    """Fields of the quantizers, by fusion and sender, with integers and booleans as they are; and these labels.
+
+    The first `rows` axes of what an uplink holds are those of rows.
+    """
     if not uplinks:
-        return {}
+        return {}, {}
     # Places of the senders in each fusion, -1 for none.
     senders = list(dict.fromkeys(node for uplink in uplinks.values() for node in uplink.nodes))
     fusions, first = list(uplinks), next(iter(uplinks.values()))
     positions = np.full((len(fusions), len(senders)), -1, dtype=np.int64)
-    parts = {name: np.zeros((*getattr(first, name).shape[: len(lead)], *positions.shape, n), getattr(first, name).dtype)
-             for name in ("saturated", "symbols")}  # fmt: skip
+    parts = {name: np.zeros((*getattr(first, name).shape[:rows], *positions.shape, n), getattr(first, name).dtype)
+             for name in SENT}  # fmt: skip
     # Values by fusion and sender.
     for i, uplink in enumerate(uplinks.values()):
         for j, node in enumerate(uplink.nodes):
             positions[i, senders.index(node)] = j
             for name, values in parts.items():
                 values[..., i, senders.index(node), :] = getattr(uplink, name)[..., j, :]
-    axes = [*lead, "fusion", "sender", "state"]
-    named = {"fusion": (["fusion"], text(fusions)), "sender": (["sender"], text(senders))}
-    return {"place": (["fusion", "sender"], positions), **{name: (axes, v) for name, v in parts.items()}, **named}
+    return {"place": positions, **parts}, {"fusion": fusions, "sender": senders}
 
 
-def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
+def uplinks_from(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
     """Uplinks of a dataset, by the fusion's name."""
-    from heliograph.simulation.centres.uplinks import Uplink
-
     if "place" not in dataset:
         return {}
-    senders, positions = names_of(dataset, "sender"), values_of(dataset, "place", ["fusion", "sender"])
-    saturated, symbols = (
-        values_of(dataset, name, [*lead, "fusion", "sender", "state"]) for name in ("saturated", "symbols")
-    )
+    senders, positions = names_of(dataset, "sender"), values_of(dataset, "place", lead)
+    saturated, symbols = (values_of(dataset, name, lead) for name in SENT)
     uplinks = {}
     for i, name in enumerate(names_of(dataset, "fusion")):
         order = np.array([j for j in np.argsort(positions[i], kind="stable") if positions[i, j] >= 0], dtype=int)
@@ -223,18 +259,18 @@ def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
 
 def dataset_of(
     title: str,
-    variables: Mapping[str, tuple[list[str], object]],
+    fields: Mapping[str, np.ndarray],
+    lead: Sequence[str],
     labels: Mapping[str, Sequence[str]],
     time: np.ndarray,
     units: Mapping[str, str],
     claims: str,
 ) -> "xr.Dataset":
-    """Dataset with a title, descriptions of its variables, and names, times and units as coordinates."""
+    """Dataset with a title, fields whose rows have the axes `lead`, and names, times and units as coordinates."""
     import xarray as xr
 
-    # Variables, with their meaning in words.
-    data = {name: (axes, values, {"long_name": MEANING[name]} if name in MEANING else {})
-            for name, (axes, values) in variables.items()}  # fmt: skip
+    # Fields, with their meaning in words.
+    data = {name: (axes_of(name, lead), values, {"long_name": FIELDS[name].meaning}) for name, values in fields.items()}
     # Coordinates: names, time, units.
     coordinates: dict[str, object] = {axis: ([axis], text(names)) for axis, names in labels.items()}
     coordinates[TIME] = ([TIME], time, {"units": units[TIME]} if TIME in units and time.dtype.kind == "f" else {})
@@ -279,11 +315,12 @@ def names_of(dataset: "xr.Dataset", axis: str) -> list[str]:
     return [str(name) for name in dataset[axis].values]
 
 
-def values_of(dataset: "xr.Dataset", name: str, axes: Sequence[str]) -> np.ndarray:
-    """Values of a variable with its dimensions in this order."""
+def values_of(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarray:
+    """Values of a field with its axes in their order."""
+    axes = axes_of(name, lead)
     if name not in dataset or set(dataset[name].dims) != set(axes):
         came = list(dataset[name].dims) if name in dataset else "no such variable"
-        raise fail(f"dataset, variable {name!r}", f"the dimensions {list(axes)}", came)
+        raise fail(f"dataset, variable {name!r}", f"the dimensions {axes}", came)
     return np.asarray(dataset[name].transpose(*axes).values)
 
 

@@ -1,10 +1,10 @@
 """Record of runs: trajectories of the truth, the measurements, and the estimates with their claims."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.filters.innovation import InnovationSummary, Weighed
-from heliograph.model.estimate import Claim, Estimate, is_sound
+from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.origin import KeptOrigin, Origin
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -26,13 +26,14 @@ from heliograph.simulation.results.labelled import (
     claims_of,
     claims_text,
     dataset_of,
-    fill_places,
+    each_filter,
+    fill_field,
     names_of,
     place_filters,
     record_fields,
     record_frame,
     units_of,
-    uplink_variables,
+    uplink_fields,
     uplinks_from,
     values_of,
 )
@@ -210,31 +211,27 @@ class Record(Saved):
             ModuleNotFoundError: without xarray (extra "results").
         """
         nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
-        filters, results = place_filters(nodes, self.estimates)
-        lead, axes = (*([] if self.runs is None else [self.runs]), len(self.time)), [] if self.runs is None else ["run"]
-        n, sizes = len(self.states), (len(nodes), len(filters))
+        filters, every = place_filters(nodes, self.estimates)
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
-        most = max((z.shape[-1] for _, z in received), default=0)
-        # Variables, NaN where a node has no such filter or component.
-        variables = {
-            "measurement": ([*axes, TIME, "node", "received"], fill_places(lead, (len(nodes),), (most,), received)),
-            "length": (["node"], _list_by_node(nodes, {node: z.shape[-1] for node, z in self.measurements.items()})),
-            "estimated": (["node"], np.array([node in self.estimates for node in nodes], dtype=bool)),
-            "claim": (["node", "filter"], claims_of(sizes, results)),
-            "mean": (
-                [*axes, TIME, "node", "filter", "state"],
-                fill_places(lead, sizes, (n,), [(position, np.asarray(e.mean)) for position, e in results]),
-            ),
-            "covariance": (
-                [*axes, TIME, "node", "filter", "state", "other"],
-                fill_places(lead, sizes, (n, n), [(position, np.asarray(e.covariance)) for position, e in results]),
-            ),
-            **uplink_variables(self.uplinks, [*axes, TIME], n),
+        n, lead = len(self.states), [TIME] if self.runs is None else ["run", TIME]
+        sizes = {"run": self.runs or 0, TIME: len(self.time), "node": len(nodes), "filter": len(filters), "state": n}
+        sizes |= {"other": n, "received": max((z.shape[-1] for _, z in received), default=0)}
+        # Fields, NaN where a node has no such filter or component.
+        lengths = {node: z.shape[-1] for node, z in self.measurements.items()}
+        sent, senders = uplink_fields(self.uplinks, len(lead), n)
+        fields = {
+            "measurement": fill_field("measurement", lead, sizes, received),
+            "length": np.array([lengths.get(node, -1) for node in nodes], dtype=np.int64),
+            "estimated": np.array([node in self.estimates for node in nodes], dtype=bool),
+            "claim": claims_of(sizes, every),
+            "mean": fill_field("mean", lead, sizes, [(place, e.mean) for place, e in every]),
+            "covariance": fill_field("covariance", lead, sizes, [(place, e.covariance) for place, e in every]),
+            **sent,
         }
         if self.truth is not None:
-            variables["truth"] = ([*axes, TIME, "state"], self.truth)
-        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states}
-        return dataset_of(RECORD, variables, labels, self.time, self.units, claims_text(self.estimates))
+            fields["truth"] = self.truth
+        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states, **senders}
+        return dataset_of(RECORD, fields, lead, labels, self.time, self.units, claims_text(self.estimates))
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "Record":
@@ -244,23 +241,17 @@ class Record(Saved):
             ValueError: no such dataset.
         """
         check_title(dataset, RECORD)
-        lead = ["run", TIME] if "run" in dataset.dims else [TIME]
-        nodes, filters = names_of(dataset, "node"), names_of(dataset, "filter")
-        # Variables with their axes in order.
-        measurement = values_of(dataset, "measurement", [*lead, "node", "received"])
-        mean = values_of(dataset, "mean", [*lead, "node", "filter", "state"])
-        covariance = values_of(dataset, "covariance", [*lead, "node", "filter", "state", "other"])
-        claim = values_of(dataset, "claim", ["node", "filter"])
-        length, estimated = values_of(dataset, "length", ["node"]), values_of(dataset, "estimated", ["node"])
+        lead, nodes = ["run", TIME] if "run" in dataset.dims else [TIME], names_of(dataset, "node")
+        measurement, length = values_of(dataset, "measurement", lead), values_of(dataset, "length", lead)
         # Back to nodes and filters by name.
-        estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in np.flatnonzero(estimated)}
-        for i, j in zip(*np.nonzero(claim != ""), strict=True):
-            moments = mean[..., i, j, :].copy(), covariance[..., i, j, :, :].copy()
-            estimates[nodes[i]][filters[j]] = Estimate(*moments, cast(Claim, str(claim[i, j])))
+        there = np.flatnonzero(values_of(dataset, "estimated", lead))
+        estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in there}
+        for node, name, claim, values in each_filter(dataset, ("mean", "covariance"), lead):
+            estimates[node][name] = Estimate(values["mean"], values["covariance"], claim)
         return cls(
             time=np.asarray(dataset[TIME].values),
             states=tuple(names_of(dataset, "state")),
-            truth=values_of(dataset, "truth", [*lead, "state"]) if "truth" in dataset else None,
+            truth=values_of(dataset, "truth", lead) if "truth" in dataset else None,
             measurements={
                 node: measurement[..., i, : length[i]].copy() for i, node in enumerate(nodes) if length[i] >= 0
             },
@@ -393,7 +384,3 @@ def _when(bad: np.ndarray) -> list[str]:
     by_time = bad.reshape(-1, bad.shape[-1])
     step, runs = int(np.argmax(by_time.any(axis=0))), int(by_time.any(axis=1).sum())
     return [f"from step {step} in {runs} of {len(by_time)} runs"]
-
-
-def _list_by_node(nodes: Sequence[str], values: Mapping[str, int]) -> np.ndarray:
-    return np.array([values.get(node, -1) for node in nodes], dtype=np.int64)

@@ -2,12 +2,11 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
-from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, units_in
@@ -18,11 +17,12 @@ from heliograph.simulation.results.labelled import (
     claims_of,
     claims_text,
     dataset_of,
-    fill_places,
+    each_filter,
+    fill_field,
     names_of,
     place_filters,
     units_of,
-    uplink_variables,
+    uplink_fields,
     uplinks_from,
     values_of,
 )
@@ -78,39 +78,38 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         filters, every = place_filters(nodes, self)
         if not every:
             raise fail("statistics", "those of one filter at least", "none")
-        sizes, n, first = (len(nodes), len(filters)), len(self.states), every[0][1]
-        batch, over = (len(first.count), first.nees.shape[1]), (first.nees.shape[1],)
+        n, first, lead = len(self.states), every[0][1], [TIME]
+        sizes = {"batch": len(first.count), TIME: first.nees.shape[1], "node": len(nodes), "filter": len(filters)}
+        sizes |= {"state": n, "other": n}
 
-        def of(
-            lead: tuple[int, ...], tail: tuple[int, ...], value: Callable[[ErrorStatistics], ArrayLike]
-        ) -> np.ndarray:
-            """Return a value of each filter's statistics, at its place."""
-            return fill_places(lead, sizes, tail, [(position, np.asarray(value(score))) for position, score in every])
+        def fill(name: str, value: Callable[[ErrorStatistics], ArrayLike]) -> np.ndarray:
+            """Return a field with a value of each filter's statistics at its place."""
+            return fill_field(name, lead, sizes, [(place, value(score)) for place, score in every])
 
         def variances(matrices: np.ndarray) -> np.ndarray:
             return np.diagonal(matrices, axis1=-2, axis2=-1)
 
-        by_filter = ["node", "filter"]
-        uplinks = {name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink}
+        nothing = np.full(sizes[TIME], np.nan)
+        claimed = fill("deviation", lambda s: variances(s.claimed()))
+        sent, senders = uplink_fields({f: s.uplink for f, s in self.get(FUSED, {}).items() if s.uplink}, 1, n)
         # Sums by batch, from which the statistics can be restored, then figures.
-        claimed = of(over, (n,), lambda s: variances(s.claimed()))
-        variables = {
-            "runs": (["batch"], first.count),
-            "errors": (["batch", TIME, *by_filter, "state", "other"], of(batch, (n, n), lambda s: matrices(s.pairs))),
-            "claimed": (["batch", TIME, *by_filter, "state", "other"],
-                        of(batch, (n, n), lambda s: matrices(s.claimed_pairs))),
-            "nees": (["batch", TIME, *by_filter], of(batch, (), lambda s: s.nees)),
-            "claim": (by_filter, claims_of(sizes, every)),
-            "failed": ([TIME, *by_filter], of(over, (), lambda s: np.nan if s.failed is None else s.failed)),
-            "failed_runs": (by_filter, of((), (), lambda s: s.failed_runs)),
-            "rmse": ([TIME, *by_filter, "state"], np.sqrt(of(over, (n,), lambda s: variances(s.actual())))),
-            "deviation": ([TIME, *by_filter, "state"], np.sqrt(np.where(claimed >= 0, claimed, np.nan))),
-            "nees_per_dimension": ([TIME, *by_filter], of(over, (), lambda s: s.nees.sum(axis=0) / s.runs / n)),
-            **uplink_variables(uplinks, [TIME], n),
-        }  # fmt: skip
-        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states}
-        time = np.arange(1.0, over[0] + 1)
-        return dataset_of(STATISTICS, variables, labels, time, self.units, claims_text(self))
+        fields = {
+            "runs": first.count,
+            "errors": fill("errors", lambda s: matrices(s.pairs)),
+            "claimed": fill("claimed", lambda s: matrices(s.claimed_pairs)),
+            "nees": fill("nees", lambda s: s.nees),
+            "claim": claims_of(sizes, every),
+            "failed": fill("failed", lambda s: nothing if s.failed is None else s.failed),
+            "failed_runs": fill("failed_runs", lambda s: s.failed_runs),
+            "rmse": np.sqrt(fill("rmse", lambda s: variances(s.actual()))),
+            "deviation": np.sqrt(np.where(claimed >= 0, claimed, np.nan)),
+            "nees_per_dimension": fill("nees_per_dimension", lambda s: s.nees.sum(axis=0) / s.runs / n),
+            **sent,
+        }
+        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states, **senders}
+        return dataset_of(
+            STATISTICS, fields, lead, labels, np.arange(1.0, sizes[TIME] + 1), self.units, claims_text(self)
+        )
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
@@ -120,31 +119,21 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             ValueError: no such dataset.
         """
         check_title(dataset, STATISTICS)
-        nodes, filters, states = (names_of(dataset, axis) for axis in ("node", "filter", "state"))
-        batch, of = ["batch", TIME, "node", "filter"], ["node", "filter"]
-        # Sums by batch; of symmetric matrices the pairs i <= j.
-        upper = np.triu_indices(len(states))
-        errors, claimed = (
-            values_of(dataset, name, [*batch, "state", "other"])[..., *upper] for name in ("errors", "claimed")
-        )
-        nees, claim, failed = (
-            values_of(dataset, name, axes) for name, axes in (("nees", batch), ("claim", of), ("failed", [TIME, *of]))
-        )
-        failed_runs, count = values_of(dataset, "failed_runs", of), values_of(dataset, "runs", ["batch"])
-        uplinks = uplinks_from(dataset, [TIME])
-        # Back to nodes and filters by name.
-        results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in nodes}
-        for i, j in zip(*np.nonzero(claim != ""), strict=True):
-            by_step = None if np.isnan(failed[:, i, j]).any() else failed[:, i, j].copy()
-            results[nodes[i]][filters[j]] = ErrorStatistics(
+        states, count = names_of(dataset, "state"), values_of(dataset, "runs", [TIME])
+        upper, uplinks = np.triu_indices(len(states)), uplinks_from(dataset, [TIME])
+        # Back to nodes and filters by name; of symmetric matrices the pairs i <= j.
+        results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in names_of(dataset, "node")}
+        sums = ("errors", "claimed", "nees", "failed", "failed_runs")
+        for node, name, claim, values in each_filter(dataset, sums, [TIME]):
+            results[node][name] = ErrorStatistics(
                 count=count.copy(),
-                pairs=errors[:, :, i, j].copy(),
-                claimed_pairs=claimed[:, :, i, j].copy(),
-                nees=nees[:, :, i, j].copy(),
-                claim=cast(Claim, str(claim[i, j])),
-                uplink=uplinks.get(filters[j]) if nodes[i] == FUSED else None,
-                failed=by_step,
-                failed_runs=int(failed_runs[i, j]),
+                pairs=values["errors"][..., *upper],
+                claimed_pairs=values["claimed"][..., *upper],
+                nees=values["nees"],
+                claim=claim,
+                uplink=uplinks.get(name) if node == FUSED else None,
+                failed=None if np.isnan(values["failed"]).any() else values["failed"],
+                failed_runs=int(values["failed_runs"]),
             )
         return cls(results, tuple(states), units_of(dataset))
 
