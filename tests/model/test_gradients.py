@@ -237,6 +237,7 @@ FILTERS = {
     "kalman": hg.kalman_filter, "extended": hg.extended_filter, "cubature": hg.cubature_filter,
     "unscented": hg.unscented_filter, "linear": lambda *parts: hg.linear_filter(*parts, hg.hop(1.0, 0.0)),
     "side information": lambda *parts: hg.filters.side_information_filter(*parts, hg.hop(1.0, 0.0)),
+    "mixture": lambda *parts: hg.filters.mixture_filter(*parts, hg.hop(1.0, 0.0)),
 }  # fmt: skip
 
 

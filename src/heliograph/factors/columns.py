@@ -207,8 +207,11 @@ def columns_of(covariance: Array) -> Columns:
     return eliminate(jnp.asarray(covariance))
 
 
-def columns_of_each(covariances: np.ndarray) -> Columns:
-    """Columns (..., n, n) of known covariances (..., n, n), as many as components, some of them zero."""
+def columns_of_each(covariances: Array) -> Columns:
+    """Columns (count, n, n) of covariances (count, n, n): of known ones roots, padded by zeros, else by elimination."""
+    if not isinstance(covariances, np.ndarray):
+        eliminated: Columns = jax.vmap(eliminate)(covariances)
+        return eliminated
     n = covariances.shape[-1]
     each = list(covariances.reshape(-1, n, n))
     # Most steps of a long horizon have the same covariance, which is factored once.

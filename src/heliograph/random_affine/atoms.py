@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import numpy as np
-import scipy
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.traced import block_diagonal, library, plain
+from heliograph.numerics.types import Array
 from heliograph.random_affine.base import AbstractRandomAffine, fold
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
@@ -16,6 +18,7 @@ from heliograph.random_affine.noise import Gaussian as GaussianNoise
 from heliograph.random_affine.superposed import Superposed
 
 COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
+Number: TypeAlias = float | jax.Array
 
 
 class Component(NamedTuple):
@@ -24,10 +27,10 @@ class Component(NamedTuple):
     Shapes: gain (m, n), offset (m,), noise (m, m).
     """
 
-    weight: float
-    gain: np.ndarray
-    offset: np.ndarray
-    noise: np.ndarray
+    weight: Number
+    gain: Array
+    offset: Array
+    noise: Array
 
 
 Atoms = list[list[Component]]  # of each of the maps inside
@@ -49,7 +52,7 @@ def list_atoms(channel: AbstractRandomAffine) -> list[Component]:
 def _atoms_of_hop(hop: GainAndNoise, _: object) -> list[Component]:
     """Combine every gain with every noise of z = g H y + n."""
     gains, noises = _gain_atoms(hop.law), _noise_atoms(hop.noise)
-    return [Component(p * q, g * np.asarray(hop.matrix), c, r) for p, g in gains for q, c, r in noises]
+    return [Component(p * q, g * hop.matrix, c, r) for p, g in gains for q, c, r in noises]
 
 
 def _reduce_parts(join: Callable[[Component, Component], Component]) -> Callable[[object, Atoms], list[Component]]:
@@ -69,25 +72,29 @@ def _compose_maps(x: Component, y: Component) -> Component:
 
 def _stack_maps(x: Component, y: Component) -> Component:
     """Stack both maps, one above the other."""
-    gain, offset = np.concatenate([x.gain, y.gain]), np.concatenate([x.offset, y.offset])
-    return Component(x.weight * y.weight, gain, offset, np.asarray(scipy.linalg.block_diag(x.noise, y.noise)))
+    gain, offset = _join_ends(x.gain, y.gain), _join_ends(x.offset, y.offset)
+    return Component(x.weight * y.weight, gain, offset, block_diagonal([x.noise, y.noise]))
 
 
-def _gain_atoms(law: AbstractLaw) -> list[tuple[float, float]]:
+def _join_ends(a: Array, b: Array) -> Any:
+    return library(a, b).concatenate([a, b])
+
+
+def _gain_atoms(law: AbstractLaw) -> list[tuple[Number, Number]]:
     match law:
         case Constant():
-            return [(1.0, float(law.value))]
+            return [(1.0, plain(law.value))]
         case Discrete():
-            return [(float(p), float(v)) for p, v in zip(law.probabilities, law.values, strict=True)]
+            return [(plain(p), plain(v)) for p, v in zip(law.probabilities, law.values, strict=True)]
         case _:
             raise fail("mixture filter", "gains of finitely many values", type(law).__name__)
 
 
-NoiseAtom = tuple[float, np.ndarray, np.ndarray]  # probability, value, Gaussian covariance
+NoiseAtom = tuple[Number, Array, Array]  # probability, value, Gaussian covariance
 
 
 def _joint(a: NoiseAtom, b: NoiseAtom) -> NoiseAtom:
-    return a[0] * b[0], np.concatenate([a[1], b[1]]), np.asarray(scipy.linalg.block_diag(a[2], b[2]))
+    return a[0] * b[0], _join_ends(a[1], b[1]), block_diagonal([a[2], b[2]])
 
 
 def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
@@ -95,17 +102,17 @@ def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
     match noise:
         # One atom, its mean, with the covariance about it.
         case GaussianNoise():
-            return [(1.0, np.asarray(noise.mean), np.asarray(noise.covariance))]
+            return [(1.0, noise.mean, noise.covariance)]
         case FiniteSupport():
             none = np.zeros((noise.dimension, noise.dimension))
-            return [(float(p), v, none) for p, v in zip(noise.probabilities, noise.atoms, strict=True)]
+            return [(plain(p), v, none) for p, v in zip(noise.probabilities, noise.atoms, strict=True)]
         # B n: every atom mapped, B c and B R B'.
         case Shaped():
-            b = np.asarray(noise.matrix)
+            b = noise.matrix
             return [(p, b @ c, b @ r @ b.T) for p, c, r in _noise_atoms(noise.source)]
         # Independent components: the product of their laws.
         case Independent():
-            atoms = [(1.0, np.zeros(0), np.zeros((0, 0)))]
+            atoms: list[NoiseAtom] = [(1.0, np.zeros(0), np.zeros((0, 0)))]
             for component in noise.parts:
                 more = _noise_atoms(component)
                 if len(atoms) * len(more) > COMPONENT_LIMIT:

@@ -31,6 +31,7 @@ from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
+from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.atoms import COMPONENT_LIMIT, list_atoms
 from heliograph.random_affine.base import AbstractRandomAffine, memories
@@ -49,12 +50,12 @@ class Components(Module):
     Shapes: weight, mode (a,), gain (a, m, n), offset (a, m), noise (a, m, m) columns, transition (M, M).
     """
 
-    weight: np.ndarray
-    gain: np.ndarray
-    offset: np.ndarray
+    weight: Array
+    gain: Array
+    offset: Array
     noise: Columns
     mode: np.ndarray
-    transition: np.ndarray
+    transition: Array
 
 
 class MixtureBelief(NamedTuple):
@@ -231,10 +232,11 @@ def _modes(channel: AbstractRandomAffine) -> JointModes:
 def _components(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> Components:
     assert isinstance(sensor, LinearSensor)  # checked before
     received = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
-    parts = [(c, i) for i, m in enumerate(now.maps) for c in list_atoms(Series([received, m])) if c.weight > 0]
+    atoms = [(c, i) for i, m in enumerate(now.maps) for c in list_atoms(Series([received, m]))]
+    parts = [(c, i) for c, i in atoms if is_traced(c.weight) or c.weight > 0]
     if len(parts) > COMPONENT_LIMIT:
         raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(parts):,}")
     mode = np.array([i for _, i in parts])
-    weight, gain, offset, noise = (np.array(column) for column in zip(*(c for c, _ in parts), strict=True))
+    weight, gain, offset, noise = (stack_parts(column) for column in zip(*(c for c, _ in parts), strict=True))
     noise = noise + floor * np.eye(noise.shape[-1])
-    return Components(weight, gain, offset, columns_of_each(noise), mode, np.asarray(before.transition))
+    return Components(weight, gain, offset, columns_of_each(noise), mode, before.transition)
