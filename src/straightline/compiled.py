@@ -1,5 +1,6 @@
 """Functions of one run, compiled for many: LLVM IR as code of this machine, called on arrays of runs, on all cores."""
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -91,7 +92,7 @@ class Compiled:
         arrays, given = self._arrays(arguments), len(self._first)
         runs = self._runs(arrays)
         code = self.code
-        outputs = [np.empty((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
+        outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
         shared = aligned(code.shared)
         ends = addresses([*outputs, shared])
         pointers = np.array([*self._addresses, *addresses(arrays[given:]), *self._tables, *ends], dtype=np.uint64)
@@ -276,10 +277,21 @@ def addresses(arrays: Sequence[np.ndarray]) -> list[int]:
 
 
 def aligned(size: int) -> np.ndarray:
-    """Allocate bytes at an address that is a multiple of a cache line."""
-    whole = np.zeros(size + LINE, np.uint8)
+    """Allocate bytes of zero at an address that is a multiple of a cache line."""
+    return _from_line(np.zeros(size + LINE, np.uint8))
+
+
+def in_lines(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Allocate an array, whose numbers are to be filled, at an address that is a multiple of a cache line."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    numbers: np.ndarray = _from_line(np.empty(size + LINE, np.uint8)).view(dtype)
+    return numbers.reshape(shape)
+
+
+def _from_line(whole: np.ndarray) -> np.ndarray:
+    """Return all but a line of some bytes, from the first one on that begins a line."""
     start = -whole.ctypes.data % LINE
-    return whole[start : start + size]
+    return whole[start : start + len(whole) - LINE]
 
 
 def cpu_count() -> int:

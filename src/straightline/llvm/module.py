@@ -12,11 +12,12 @@ import numpy as np
 from straightline.folding import DTYPES
 from straightline.llvm.lanes import WIDTH, flushing, gather, lane_numbers, types
 from straightline.llvm.operations import BITS
+from straightline.llvm.prefetch import Rows, longest, share
 from straightline.llvm.text import Slots, Writer, loops_of, turns_of
 from straightline.llvm.transposed import mover, mover_name
 from straightline.lowering import Lowering, Value, refusing
 from straightline.memory import LONG, InMemory, contiguous
-from straightline.nodes import REAL, Buffer, Node, Type, Unsupported
+from straightline.nodes import REAL, Buffer, Loop, Node, Type, Unsupported
 from straightline.program import (
     Program,
     Summed,
@@ -285,11 +286,14 @@ def _blocks(
         pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
         writer.line(f"call void @{mover_name(*mover_kind)}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
 
-    # Inputs to lanes, the operations, lanes to outputs.
+    # Inputs to lanes, the operations, lanes to outputs; the longest loop asks for the memory of these to come.
     taken = [] if alone else [b for b in lanes if b in in_scratch and b.size]
     given = [] if alone else [b for b in outputs if b in in_scratch and b.size]
     for buffer in taken:
         move("take", buffer)
+    writer.asking = longest(x for x in program.graph.top.items if x in writer.mine)
+    if writer.asking is not None:
+        writer.asked = _rows(writer, names, taken, given, width, writer.asking)
     helpers: list[Callable[[int], str]] = []
     if summed is not None:
         helpers.append(lane_numbers)
@@ -309,6 +313,19 @@ def _blocks(
     body = "\n".join(writer.lines)
     helpers += [partial(mover, *kind) for kind in sorted(movers)]
     return _run(body, writer), helpers
+
+
+def _rows(
+    writer: Writer, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
+) -> list[Rows]:
+    """Locate the rows that a loop asks for: the next block's inputs, and this block's outputs."""
+    following, results = writer.add(f"add i64 %first, {WIDTH}"), list[Rows]()
+    for buffer in (*taken, *given):
+        bytes_, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
+        place = writer.add(f"mul i64 {'%first' if writes else following}, {bytes_}")
+        start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {place}")
+        results.append(Rows(start, bytes_, share(bytes_, width, loop), writes))
+    return results
 
 
 def _add(

@@ -7,8 +7,9 @@ import math
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from straightline.llvm.lanes import gather_name
+from straightline.llvm.lanes import WIDTH, gather_name
 from straightline.llvm.operations import BITS, CALLED, LLVM, called, fused, operation, splat, vector
+from straightline.llvm.prefetch import Rows, requests
 from straightline.nodes import REAL, Block, Buffer, Check, Guard, Loop, Node, Store, Type
 from straightline.program import fusable
 
@@ -84,6 +85,8 @@ class Writer:
         self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
         self.counted = ""  # the lanes that count
         self.flushes = False  # whether subnormal numbers are zeros
+        self.asking: Loop | None = None  # the loop that asks for memory, and for which
+        self.asked: list[Rows] = []
 
     def add(self, text: str) -> str:
         """Append an operation; return the new name of its result."""
@@ -281,6 +284,8 @@ class Writer:
             self._keep(loop.parameters[k], f"%{name}.p{k}")
         if loop.counter is not None and loop.counter in self.mine:
             self._keep(loop.counter, self.operand(loop.counter))
+        for rows in self.asked if loop is self.asking else ():
+            self.lines += [f"  {line}" for line in requests(rows, loop.length or 1, counter, WIDTH, self.add)]
         # Counted: body, then the latch. Conditional: the check is inside the body.
         if loop.condition is None:
             self.block(loop.body)

@@ -1,0 +1,55 @@
+"""Memory asked for before it is needed, as text of LLVM IR: its time passes beside the arithmetic of a loop.
+
+Numbers of runs come from memory and go back to it, and a block of runs is computed sooner than these lines arrive. So
+its longest loop asks, a share in each turn, for the inputs of the next block and for the memory of its own outputs. A
+Kalman step with four numbers in and four out: 26.7 ns of one core without, 16.6 with, 14.5 with nothing in or out.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from straightline.nodes import Loop
+
+LINE = 64  # bytes
+MOST = 16  # lines of an array in a turn: more of them are moved in a loop so short that nothing is hidden beside it
+
+
+class Rows(NamedTuple):
+    """Rows of a block of runs, one after another in memory: what a loop asks for.
+
+    `start` names the address of the first one; a row has `bytes`, a turn's share of all so many `lines`; `writes` says
+    whether the block fills them.
+    """
+
+    start: str
+    bytes: int
+    lines: int
+    writes: bool
+
+
+def longest(items: Iterable[Any]) -> Loop | None:
+    """Return the loop of known length that has most turns, None if there is none."""
+    loops = [x for x in items if isinstance(x, Loop) and x.length]
+    return max(loops, key=lambda loop: loop.length or 0) if loops else None
+
+
+def share(bytes: int, width: int, loop: Loop) -> int:
+    """Return the lines of rows of W runs that a loop asks for in each of its turns; 0 of too many."""
+    lines = -(-bytes * width // ((loop.length or 1) * LINE))
+    return lines if lines <= MOST else 0
+
+
+def requests(rows: Rows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:
+    """Write what one turn asks for.
+
+    Args:
+        rows: the rows.
+        turns: of the loop.
+        counter: name of the number of this turn.
+        lanes: text of the number of rows.
+        add: appends an operation, and names its result.
+    """
+    done = add(f"mul i64 {add(f'mul i64 {counter}, {rows.bytes}')}, {lanes}")
+    place = add(f"getelementptr i8, ptr {rows.start}, i64 {add(f'udiv i64 {done}, {turns}')}")
+    lines = [add(f"getelementptr i8, ptr {place}, i64 {LINE * k}") for k in range(rows.lines)]
+    return [f"call void @llvm.prefetch.p0(ptr {line}, i32 {int(rows.writes)}, i32 2, i32 1)" for line in lines]
