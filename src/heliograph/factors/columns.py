@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.numerics.linalg import WRITTEN, outer, symmetric
+from heliograph.numerics.linalg import WRITTEN, outer, scale, symmetric
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array
 
@@ -134,7 +134,7 @@ def triangular(columns: Columns) -> Columns:
     n, lower, variances = len(rows), [], []
     for j in range(n):
         row = lax.index_in_dim(rows, j, keepdims=False)
-        weighted = weights * row
+        weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
         share = _below(j, outer(lax.dot(rows, weighted), lax.reshape(inverse(variances[j]), (1,))))
         rows = rows - outer(share, row)

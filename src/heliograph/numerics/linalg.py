@@ -38,6 +38,11 @@ def outer(a: jax.Array, b: jax.Array) -> jax.Array:
     return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
 
 
+def scale(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return a_i b_i as matrix products of one number each, in which a known zero stays one."""
+    return lax.dot_general(a, b, (((), ()), ((0,), (0,))))
+
+
 def contract(tensor: Array, matrix: Array) -> jax.Array:
     """sum_ab T_ijab W_ab."""
     return jnp.einsum("ijab,ab->ij", tensor, matrix)
