@@ -97,8 +97,9 @@ class Block:
 class Buffer:
     """Numbers in memory, `size` of each run; a table has the same numbers in all runs.
 
-    `kind`: "input", "scratch" or "table". A buffer that the program fills is read after the statement of `block` that
-    fills it. A buffer `inside` another starts at a place of it. `first`: of rows in which some entries are the same
+    `kind`: "input", "scratch", "table", or "carried" by a loop, of which each turn fills it anew. A buffer that the
+    program fills is read after the statement of `block` that fills it. A buffer `inside` another starts at a place of
+    it. `first`: of rows in which some entries are the same
     number, as across the diagonal of a symmetric matrix, the first place in the row that has each entry's number.
     """
 

@@ -151,7 +151,8 @@ def written(
         raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
     width = width or widest(items)
     # Numbers that differ between runs; all others are computed once.
-    spread = {*items, *program.inputs} if alone else varying(items, lanes)
+    carried = [x for x in items if isinstance(x, Buffer) and x.kind == "carried"]
+    spread = {*items, *program.inputs} if alone else varying(items, [*lanes, *carried])
     products = products_of(items) if fuse else set()
     tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
     common = [b not in spread for b in outputs]

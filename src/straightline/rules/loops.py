@@ -14,7 +14,7 @@ from straightline.memory import InMemory
 from straightline.nodes import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
 from straightline.rules.elementwise import select
 
-WRITTEN_OUT = 2000  # numbers computed by all turns of a loop that is written out
+WRITTEN_OUT = 2000  # numbers that all turns of a loop compute, written out; of an array that it carries outside memory
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 
@@ -131,29 +131,67 @@ def _mirrored(upper: np.ndarray, n: int) -> np.ndarray:
 def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     params = equation.params
     (consts, carried), length = _counts(params), params["length"]
-    fixed, rows = inputs[:consts], inputs[consts + carried :]
-    carry = [lowering.nodes(x) for x in inputs[consts : consts + carried]]
+    fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     # Short loops are written out.
     if length * size_of(lowering, params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
-        return _written_out(lowering, equation, fixed, carry, rows)
+        return _written_out(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     jaxpr = params["jaxpr"].jaxpr
-    # A carried number that the body returns unchanged is a constant of the loop.
+    # A carried number that the body returns unchanged is a constant of the loop; a long array is carried in memory.
     same = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
+    held = {k: Held(lowering, carry[k]) for k in range(carried) if not same[k] and carry[k].size > WRITTEN_OUT}
+    moving = [k for k in range(carried) if not same[k] and k not in held]
     rows = [in_memory(lowering, x) for x in rows]
 
     # One turn: the body for one row of the stacked arguments.
-    def turn(row: Node, moving: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        items = iter(moving)
-        now = [x if s else next(items) for x, s in zip(carry, same, strict=True)]
-        results = lowering.inline(params["jaxpr"], [*fixed, *now, *(x.row(row) for x in rows)])
-        nodes = [lowering.nodes(x) for x in results]
-        return [x for x, s in zip(nodes[:carried], same, strict=True) if not s], nodes[carried:]
+    def turn(row: Node, now: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        arrays: dict[int, Value] = dict(zip(moving, now, strict=True)) | {k: x.in_turn() for k, x in held.items()}
+        given = [arrays.get(k, carry[k]) for k in range(carried)]
+        results = lowering.inline(params["jaxpr"], [*fixed, *given, *(x.row(row) for x in rows)])
+        nodes = [x if k in held else lowering.nodes(x) for k, x in enumerate(results)]
+        hold(lowering, [(x, nodes[k]) for k, x in held.items()])
+        return [nodes[k] for k in moving], nodes[carried:]
 
-    moving, stacked = repeated(
-        lowering, length, [x for x, s in zip(carry, same, strict=True) if not s], turn, params["reverse"]
-    )
-    after = iter(moving)
-    return [*(x if s else next(after) for x, s in zip(carry, same, strict=True)), *stacked]
+    finals, stacked = repeated(lowering, length, [lowering.nodes(carry[k]) for k in moving], turn, params["reverse"])
+    after: dict[int, Value] = dict(zip(moving, finals, strict=True)) | {k: x.after() for k, x in held.items()}
+    return [*(after.get(k, carry[k]) for k in range(carried)), *stacked]
+
+
+class Held:
+    """Memory of an array that a loop carries and that is too long for numbers of its own.
+
+    A turn reads it, and fills it anew at its end; each run has its own, whatever it is computed from.
+    """
+
+    def __init__(self, lowering: Lowering, start: Value):
+        self._graph = lowering.graph
+        self.memory = copied(lowering, in_memory(lowering, start)).buffer
+        self.memory.kind = "carried"
+
+    def in_turn(self) -> InMemory:
+        """Return the array in the turn whose body is open."""
+        self.memory.parts = []  # a body that is lowered once more fills it alone
+        return self.after()
+
+    def after(self) -> InMemory:
+        """Return the array as the block that is open reads it from here on."""
+        return self._part(Buffer("scratch", self.memory.type, self.memory.shape, self._graph.current))
+
+    def fill(self, lowering: Lowering, x: InMemory) -> None:
+        """Fill the memory with an array that is elsewhere."""
+        self._part(copied(lowering, x).buffer)
+
+    def _part(self, buffer: Buffer) -> InMemory:
+        self.memory.take_in(buffer, 0)
+        return InMemory.whole(buffer)
+
+
+def hold(lowering: Lowering, filled: Sequence[tuple[Held, Value]]) -> None:
+    """Fill the memory of carried arrays at the end of a turn: all that is read of it is read before."""
+    memory = {held.memory for held, _ in filled}
+    arrays = [(held, in_memory(lowering, x)) for held, x in filled]
+    arrays = [(held, copied(lowering, x) if x.buffer.owner[0] in memory else x) for held, x in arrays]
+    for held, x in arrays:
+        held.fill(lowering, x)
 
 
 def _counts(params: dict[str, Any]) -> tuple[int, int]:

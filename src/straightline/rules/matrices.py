@@ -88,7 +88,7 @@ def _arg(op: str) -> Rule:
     return rule
 
 
-def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Sum products over the contracted axes, with batch axes first."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     type = result_type(equation)
@@ -251,6 +251,6 @@ RULES |= {
     "reduce_and": _reduction("and", ALL_BITS), "reduce_xor": _reduction("xor", 0),
     "reduce_max": _reduction("max", -np.inf), "reduce_min": _reduction("min", np.inf),
     "cumsum": _cumulative("add"), "cumprod": _cumulative("mul"), "cummax": _cumulative("max"),
-    "cummin": _cumulative("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": _dot_general,
+    "cummin": _cumulative("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": write_product,
     "cholesky": _each_matrix(_cholesky), "triangular_solve": _each_matrix(_triangular_solve),
 }  # fmt: skip

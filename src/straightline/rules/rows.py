@@ -4,6 +4,7 @@ What `vmap` made of a step, for all rows of a record at once, becomes that step 
 """
 
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from straightline.memory import LARGE, LONG, InMemory
 from straightline.nodes import Node
 from straightline.rules.elementwise import ELEMENTWISE
 from straightline.rules.loops import Turn, in_memory, repeated
+from straightline.rules.matrices import write_product
 
 OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
@@ -23,6 +25,7 @@ OF_ENTRIES = (
 
 
 FEW_TERMS = 256  # of a product with a known matrix, which are written out rather than looped over
+MANY_TERMS = 50_000  # of any product: above it a quarter of the longest program would be this product
 
 
 def is_long(inputs: list[Value]) -> bool:
@@ -122,6 +125,30 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     return _accumulated(lowering, equation, count, turn) if summed else list(repeated(lowering, count, [], turn)[1])
 
 
+def _of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
+    """Write a product of matrices out, but for one of many terms: a loop over rows in memory."""
+    (left, right), (batch, _) = equation.params["dimension_numbers"]
+    if batch or len(left) != 1 or _count_terms(inputs[0], left[0], inputs[1], right[0]) <= MANY_TERMS:
+        return write_product(lowering, equation, inputs)
+    return _dot_general(lowering, equation, [in_memory(lowering, x) for x in inputs])
+
+
+def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
+    """Count the terms of all sums over an axis of a and one of b, without those that a known zero leaves out."""
+    if a.size * b.size <= MANY_TERMS * a.shape[left]:
+        return 0
+    # Of each place along the axis, how many entries of a and of b are no known zero: each of these meets each.
+    met = [_count_data(x, axis) for x, axis in ((a, left), (b, right))]
+    return int(met[0] @ met[1])
+
+
+def _count_data(x: np.ndarray, axis: int) -> np.ndarray:
+    """Count the entries that are no known zero, for each place along an axis."""
+    is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
+    counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
+    return counts
+
+
 def _accumulated(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
     """Sum a number that each turn of a loop gives."""
     pair: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
@@ -191,3 +218,4 @@ REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_ma
 IN_MEMORY |= {name: _of_entries(name) for name in OF_ENTRIES}
 IN_MEMORY |= {name: _reduction(name) for name in REDUCTIONS}
 IN_MEMORY |= {"dot_general": _dot_general}
+RULES |= {"dot_general": _of_nodes}
