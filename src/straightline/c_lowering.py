@@ -9,8 +9,9 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 from straightline.folding import is_finite
 from straightline.graph import Graph
+from straightline.limits import LOADED
 from straightline.lowering import RULES, Lowering, Value, array_of, type_of
-from straightline.memory import LARGE, InMemory
+from straightline.memory import InMemory
 from straightline.nodes import REAL, Buffer, Node, Type
 
 # Finite where the arguments are, but for overflow and divisions by zero.
@@ -69,7 +70,7 @@ class CLowering(Lowering):
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Lower one operation; arithmetic is written out unless its arrays are too long."""
         if equation.primitive.name in RULES and equation.primitive.name not in VIEWS:
-            inputs = [self.nodes(x) if isinstance(x, InMemory) and x.size <= LARGE else x for x in inputs]
+            inputs = [self.nodes(x) if isinstance(x, InMemory) and x.size <= LOADED else x for x in inputs]
         return super().equation(equation, inputs)
 
     def known(self, number: Any) -> Value:

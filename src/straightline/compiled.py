@@ -14,13 +14,12 @@ import numpy as np
 from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
-from straightline.graph import MOST
+from straightline.limits import ALONE, LITTLE, MADE
 from straightline.llvm.module import LINE, Code, written
-from straightline.machine import LONG, Machine, Tiers, features, generated, narrow
+from straightline.machine import Machine, Tiers, features, generated, narrow
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower
 
-LITTLE = 100_000  # operations of vectors: done sooner than other threads are woken
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 
 
@@ -149,7 +148,7 @@ class Alone:
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
         self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
-        level = int(self.code.operations <= LONG)
+        level = int(self.code.operations <= ALONE)
         self.machine, self.tree, self._in_place = generated(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._place([])
@@ -182,7 +181,7 @@ def compile(
     function: Callable[..., PyTree],
     *examples: PyTree,
     shared: Sequence[int] = (),
-    most: int = MOST,
+    most: int = MADE,
     single: bool = False,
 ) -> Compiled:
     """Compile a JAX function of one run's arrays for many runs, in double precision or in single.

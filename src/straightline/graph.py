@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from straightline.folding import COMMUTATIVE, DTYPES, folded
+from straightline.limits import MADE
 from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, Unsupported
-
-MOST = 400_000  # nodes made, constants and what is dropped again among them
 
 
 class Graph:
     """A program under construction, of `most` nodes. Nodes are made in `current`, the innermost open block."""
 
-    def __init__(self, most: int = MOST) -> None:
+    def __init__(self, most: int = MADE) -> None:
         self.most = most
         self.top = Block(None)
         self.current = self.top

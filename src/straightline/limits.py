@@ -1,7 +1,7 @@
 """Sizes that decide how a program is written, and what is refused: each says what was measured, or what it weighs.
 
-Most separate numbers that are written out, one operation each, from arrays in memory that loops go through: writing out is
-several times as fast, and takes LLVM 0.1 ms an operation.
+Most separate numbers that are written out, one operation each, from arrays in memory that loops go through: writing
+out is several times as fast, and takes LLVM 0.1 ms an operation.
 """
 
 # Operations made while a program is folded, constants and what is dropped again among them. A refusal comes after some
@@ -9,10 +9,10 @@ several times as fast, and takes LLVM 0.1 ms an operation.
 MADE = 400_000
 # Operations of a program: of 120,000 LLVM takes half as long as XLA, 0.1 ms each.
 LONGEST = 200_000
-# Executions of each operation after which care pays: it takes LLVM 20 to 90 us an operation more, and saves a seventh to
-# a half of its time, 0.03 to 0.3 ns for a block of runs. Of thirteen filters of 180 to 42,000 operations, it pays after
-# 160,000 to 1,600,000; of small ones it takes milliseconds, and comes sooner: OFTEN of programs of LARGE operations, in
-# proportion down to SMALL.
+# Executions of each operation after which care pays: it takes LLVM 20 to 90 us an operation more, and saves a seventh
+# to a half of its time, 0.03 to 0.3 ns for a block of runs. Of thirteen filters of 180 to 42,000 operations, it pays
+# after 160,000 to 1,600,000; of small ones it takes milliseconds, and comes sooner: OFTEN of programs of LARGE
+# operations, in proportion down to SMALL.
 OFTEN, SMALL, LARGE = 500_000, 1_000, 10_000
 # Operations of a step of one plant above which care seldom pays: LLVM takes four to nine times as long (for 300
 # particles of two states, 77,000 operations, 41 s instead of 4) to save a third to half of its 0.25 ms.
@@ -32,8 +32,8 @@ WRITTEN_OUT = 2000
 # Terms of a product with a known matrix that are written out rather than looped over, and of any product: above that a
 # quarter of the longest program would be this one.
 FEW_TERMS, MANY_TERMS = 256, LONGEST // 4
-# Rows of a matrix whose eigenvalues are written out, and numbers that are sorted by comparing each with each: of 20 rows
-# the straight line is long, and the library's method as fast.
+# Rows of a matrix whose eigenvalues are written out, and numbers that are sorted by comparing each with each: of 20
+# rows the straight line is long, and the library's method as fast.
 ROWS = 20
 # Places that a number found in the data may choose among, one comparison each; more are in memory.
 PLACES = 16

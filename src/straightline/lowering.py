@@ -18,8 +18,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from jaxtyping import PyTree
 
-from straightline.graph import MOST, Graph
-from straightline.memory import LONG, InMemory
+from straightline.graph import Graph
+from straightline.limits import MADE, TABLE
+from straightline.memory import InMemory
 from straightline.nodes import TYPES, Buffer, Key, Node, Type, Unsupported
 
 Value = Any  # a NumPy array of nodes or keys, or an array in memory
@@ -34,7 +35,7 @@ IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in me
 class Lowering:
     """Lowering of operations one after another into a graph."""
 
-    def __init__(self, most: int = MOST) -> None:
+    def __init__(self, most: int = MADE) -> None:
         self.graph = Graph(most)
         self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
         self.sizes: dict[Jaxpr, int] = {}  # of programs within loops and branches
@@ -107,7 +108,7 @@ class Lowering:
             return keys_of(self.known(np.asarray(jax.random.key_data(number))))
         array = np.asarray(number)
         type = type_of(array)
-        if array.size > LONG:
+        if array.size > TABLE:
             return InMemory.whole(Buffer("table", type, array.shape, self.graph.top, array))
         return array_of([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 

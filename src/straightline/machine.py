@@ -9,21 +9,13 @@ from threading import Lock, current_thread, main_thread
 import jax
 import llvmlite.binding as llvm
 
+from straightline.limits import LARGE, OFTEN, SMALL
 from straightline.llvm.module import Source
 from straightline.lowering import refusing, say
 from straightline.nodes import Unsupported
 
 Function = Callable[[int, int, int, int, int], None]
 SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-
-# Executions of each operation of a program after which care pays: it takes LLVM 20 to 90 us an operation more, and
-# saves a seventh to a half of its time, 0.03 to 0.3 ns for a block of runs. Of thirteen filters of 180 to 42,000
-# operations, it pays after 160,000 to 1,600,000; of small ones it takes milliseconds, and comes sooner.
-OFTEN, SMALL, LARGE = 500_000, 1_000, 10_000  # executions of programs of LARGE operations; in proportion down to SMALL
-
-# Operations of a step of one plant above which care seldom pays: LLVM takes four to nine times as long (for 300
-# particles of two states, 77,000 operations, 41 s instead of 4) to save a third to half of its 0.25 ms.
-LONG = 20_000
 
 
 @cache

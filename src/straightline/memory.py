@@ -7,10 +7,8 @@ from itertools import product
 import numpy as np
 
 from straightline.graph import Graph
+from straightline.limits import LOADED
 from straightline.nodes import Block, Buffer, Node, Type, Unsupported
-
-LONG = 64  # numbers: a known array that is longer is a table in memory
-LARGE = 4096  # numbers: an array in memory that is longer is not loaded whole
 
 
 class InMemory:
@@ -65,7 +63,7 @@ class InMemory:
     def nodes(self, graph: Graph) -> np.ndarray:
         """Load all numbers."""
         if self.loaded is None or self.loaded[0] not in graph.current.inwards():
-            if self.size > LARGE:
+            if self.size > LOADED:
                 raise Unsupported(f"an array of {self.size} numbers at once")
             self.loaded = graph.current, self._load(graph)
         return self.loaded[1]

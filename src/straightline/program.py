@@ -15,9 +15,10 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
-from straightline.graph import MOST, Graph
+from straightline.graph import Graph
+from straightline.limits import MADE, TABLE
 from straightline.lowering import Lowering, Value, array_of, keys_of, traced, type_of
-from straightline.memory import LONG, InMemory
+from straightline.memory import InMemory
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store
 from straightline.rules import (  # noqa: F401  (they fill the rules)
     calls,
@@ -56,7 +57,7 @@ Known = Mapping[int, tuple[np.ndarray, np.ndarray]]  # number of a leaf -> which
 def lower(
     function: Callable[..., PyTree],
     *examples: PyTree,
-    most: int = MOST,
+    most: int = MADE,
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
@@ -67,7 +68,7 @@ def lower(
 def lower_traced(
     traced: ClosedJaxpr,
     tree: Any,
-    most: int = MOST,
+    most: int = MADE,
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
@@ -94,7 +95,7 @@ def _partly_known(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers:
     """Return an array of which some entries are known: all, or a few of a short one, as constants."""
     if mask.all():
         return lowering.known(numbers.astype(DTYPES[view.type]))
-    if view.size > LONG:
+    if view.size > TABLE:
         return view
     graph, kind = lowering.graph, view.type
     entries = zip(mask.ravel().tolist(), numbers.ravel().tolist(), range(view.size), strict=True)

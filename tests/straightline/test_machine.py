@@ -14,7 +14,8 @@ import pytest
 
 from straightline import compiled
 from straightline.compiled import Alone, compile
-from straightline.machine import LARGE, OFTEN, SMALL, background, often
+from straightline.limits import LARGE, OFTEN, SMALL
+from straightline.machine import background, often
 from straightline.nodes import Node
 from straightline.program import lower
 
@@ -119,7 +120,7 @@ def test_no_code_is_generated_with_care_without_optimizations(code):
 
 def test_a_long_step_in_live_use_is_generated_in_haste(monkeypatch):
     careful = Alone(lower(rotated, STARTS[0]))
-    monkeypatch.setattr(compiled, "LONG", careful.code.operations - 1)
+    monkeypatch.setattr(compiled, "ALONE", careful.code.operations - 1)
     hasty = Alone(lower(rotated, STARTS[0]))
     assert (careful.machine.level, hasty.machine.level) == (1, 0)
     for step in (careful, hasty):

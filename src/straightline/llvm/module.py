@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from straightline.folding import DTYPES
+from straightline.limits import LONGEST, TABLE
 from straightline.llvm.lanes import WIDTH, flushing, gather, lane_numbers, types
 from straightline.llvm.operations import BITS
 from straightline.llvm.prefetch import Rows, longest, share
 from straightline.llvm.text import Slots, Writer, loops_of, turns_of
 from straightline.llvm.transposed import mover, mover_name
 from straightline.lowering import Lowering, Value, refusing
-from straightline.memory import LONG, InMemory, contiguous
+from straightline.memory import InMemory, contiguous
 from straightline.nodes import REAL, Buffer, Loop, Node, Type, Unsupported
 from straightline.program import (
     Program,
@@ -33,7 +34,6 @@ from straightline.rules.loops import copied
 from straightline.rules.random_bits import hash_function
 from straightline.vectors.elementary import functions
 
-LONGEST = 200_000  # operations: at 120,000 LLVM takes half as long as XLA, 0.1 ms each
 LINE = 64  # bytes: where vectors of any width may start
 WIDEST = 8  # runs of a vector of doubles: one register of the widest processors, two of others; more only spill
 SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
@@ -110,7 +110,7 @@ def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemor
     if whole and alone and value.size == buffer.size:
         buffer.shape = value.shape
         return value
-    return _filled(lowering, value) if value.size <= LONG else copied(lowering, value)
+    return _filled(lowering, value) if value.size <= TABLE else copied(lowering, value)
 
 
 def _filled(lowering: Lowering, value: Value) -> InMemory:

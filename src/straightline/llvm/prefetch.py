@@ -8,10 +8,10 @@ Kalman step with four numbers in and four out: 26.7 ns of one core without, 16.6
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+from straightline.limits import LINES
 from straightline.nodes import Loop
 
 LINE = 64  # bytes
-MOST = 16  # lines of an array in a turn: more of them are moved in a loop so short that nothing is hidden beside it
 
 
 class Rows(NamedTuple):
@@ -36,7 +36,7 @@ def longest(items: Iterable[Any]) -> Loop | None:
 def share(bytes: int, width: int, loop: Loop) -> int:
     """Return the lines of rows of W runs that a loop asks for in each of its turns; 0 of too many."""
     lines = -(-bytes * width // ((loop.length or 1) * LINE))
-    return lines if lines <= MOST else 0
+    return lines if lines <= LINES else 0
 
 
 def requests(rows: Rows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from straightline.limits import DEAR, SHARE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, array_of
 from straightline.nodes import Block, Guard, Key, Node
 from straightline.rules.elementwise import select
@@ -54,10 +55,6 @@ def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value])
 IN_MEMORY |= dict.fromkeys(CALLS, _call)
 IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "call_hi_primitive": _expanded}
 RULES |= {"platform_index": _platform_index}
-
-
-DEAR = 100  # nodes: a branch that has fewer is computed in any case,
-SHARE = 4  # and one that is so many times smaller than the dearest, which often has its numbers within
 
 
 def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

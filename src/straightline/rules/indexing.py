@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from straightline.limits import PLACES
 from straightline.lowering import RULES, Lowering, known_integers
 from straightline.memory import contiguous
 from straightline.nodes import Unsupported
 from straightline.rules.elementwise import select
 from straightline.rules.loops import in_memory
 from straightline.rules.places import clamped, fill_of, fills, inside, narrowed, places_of
-from straightline.rules.shapes import FEW, chosen
+from straightline.rules.shapes import chosen
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -64,7 +65,7 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
     column = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
     axis = numbers.start_index_map[column]
     last = x.shape[axis] - sizes[axis]
-    if last >= FEW:
+    if last >= PLACES:
         return _from_memory(lowering, equation, x, indices, column)
     cases = [_clipped(equation, lowering, x, _with(lowering, indices, column, n)) for n in range(last + 1)]
     selected = cases[-1].copy()

@@ -9,12 +9,12 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
+from straightline.limits import WRITTEN_OUT
 from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
 from straightline.memory import InMemory
 from straightline.nodes import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
 from straightline.rules.elementwise import select
 
-WRITTEN_OUT = 2000  # numbers that all turns of a loop compute, written out; of an array that it carries outside memory
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 

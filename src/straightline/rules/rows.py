@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from straightline.limits import FEW_TERMS, LOADED, MANY_TERMS, TABLE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
-from straightline.memory import LARGE, LONG, InMemory
+from straightline.memory import InMemory
 from straightline.nodes import Node
 from straightline.rules.elementwise import ELEMENTWISE
 from straightline.rules.loops import Turn, in_memory, repeated
@@ -24,10 +25,6 @@ OF_ENTRIES = (
 )  # fmt: skip
 
 
-FEW_TERMS = 256  # of a product with a known matrix, which are written out rather than looped over
-MANY_TERMS = 50_000  # of any product: above it a quarter of the longest program would be this product
-
-
 def is_long(inputs: list[Value]) -> bool:
     """Return whether nodes for all entries of an argument would be too many.
 
@@ -35,7 +32,7 @@ def is_long(inputs: list[Value]) -> bool:
     """
     longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
     known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
-    return longest > LARGE or (longest > LONG and not (known and _are_written_out(inputs, longest)))
+    return longest > LOADED or (longest > TABLE and not (known and _are_written_out(inputs, longest)))
 
 
 def _are_written_out(inputs: list[Value], count: int) -> bool:
@@ -93,7 +90,7 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     A sum over all axes is accumulated over the first of them.
     """
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    to_number = not result_shape(equation) and all(x.size <= LARGE for x in inputs)
+    to_number = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
     if to_number or not is_long(inputs) or _has_few_terms(lowering, equation, inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     a, b = (in_memory(lowering, x) for x in inputs)
@@ -164,7 +161,7 @@ def _has_few_terms(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) 
     """Return whether the known zeros of a factor, which leave terms out, leave few of them."""
     terms = math.prod(result_shape(equation))
     terms *= math.prod(inputs[0].shape[d] for d in equation.params["dimension_numbers"][0][0])
-    if any(x.size > LARGE for x in inputs):
+    if any(x.size > LOADED for x in inputs):
         return False
     tables = [x for x in inputs if isinstance(x, InMemory) and x.buffer.kind == "table" and not x.moves]
     shares = [sum(n.value != 0 for n in x.nodes(lowering.graph).ravel().tolist()) / x.size for x in tables if x.size]

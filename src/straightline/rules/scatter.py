@@ -10,12 +10,11 @@ from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
 from straightline.graph import Graph
+from straightline.limits import CHANGED
 from straightline.lowering import RULES, Lowering, Rule, known_integers
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
 from straightline.rules.places import fills, narrowed, places_of
-
-MOST = 500  # entries that updates at places of the data may change, one selection each
 
 
 def _scatter(op: str | None) -> Rule:
@@ -73,7 +72,7 @@ def _by_cases(
     for row in np.ndindex(*indices.shape[:-1]):
         for start, here in _starts(graph, equation, x.shape, sizes, row, indices[row]):
             count += math.prod(sizes)
-            if count > MOST:
+            if count > CHANGED:
                 raise Unsupported(f"{equation.primitive.name} at one of many places that data decide")
             for entry in np.ndindex(*windows.shape[len(row) :]):
                 place = list(start)

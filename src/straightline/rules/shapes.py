@@ -7,10 +7,9 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
+from straightline.limits import PLACES
 from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape
 from straightline.nodes import Node, Unsupported
-
-FEW = 16  # places that a number found in the data may choose among, one comparison each
 
 
 def _moved(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
@@ -94,7 +93,7 @@ def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[n
     for axis, start in enumerate(starts):
         last = x.shape[axis] - update.shape[axis]
         if last and start.op != "constant":
-            if last >= FEW:
+            if last >= PLACES:
                 raise Unsupported(f"one of {last + 1} places that data decide")
             known = [s if a != axis else None for a, s in enumerate(starts)]
             cases = [_updated(lowering, x, update, known, first) for first in range(last + 1)]

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from straightline.limits import PLACES, TABLE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, result_shape
-from straightline.memory import LONG, InMemory, contiguous
+from straightline.memory import InMemory, contiguous
 from straightline.nodes import Buffer, Key, Node
 from straightline.rules.elementwise import PASSED_ON, select
 from straightline.rules.loops import copied, in_memory, repeated
 from straightline.rules.places import clamped, fill_of, fills, inside, narrowed
-from straightline.rules.shapes import FEW, chosen
+from straightline.rules.shapes import chosen
 
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 
@@ -84,7 +85,7 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
     x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.scalar(x) for x in inputs[1:]]
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last = x.shape[axis] - size
-        if start.op != "constant" and last >= FEW:
+        if start.op != "constant" and last >= PLACES:
             return _dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
         x = _window(lowering, x, axis, start, size) if last else x
     return [x]
@@ -105,7 +106,7 @@ def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
     if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
         return x
     flat = x.ravel().tolist()
-    if any(isinstance(n, Key) for n in flat) or not (len(flat) > FEW or all(n.op == "constant" for n in flat)):
+    if any(isinstance(n, Key) for n in flat) or not (len(flat) > PLACES or all(n.op == "constant" for n in flat)):
         return x
     return in_memory(lowering, x)
 
@@ -147,7 +148,7 @@ def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Concatenate along the first axis in new memory, along another axis row by row."""
     shape, axis = result_shape(equation), equation.params["dimension"]
-    if math.prod(shape) <= LONG or not any(isinstance(x, InMemory) for x in inputs):
+    if math.prod(shape) <= TABLE or not any(isinstance(x, InMemory) for x in inputs):
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     if axis != 0:
         parts = [in_memory(lowering, x) for x in inputs]
@@ -182,7 +183,7 @@ def _is_alone(x: InMemory, block: Any) -> bool:
 
 def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
     graph = lowering.graph
-    if x.size <= LONG or not isinstance(x, InMemory):
+    if x.size <= TABLE or not isinstance(x, InMemory):
         for index, node in enumerate(lowering.nodes(x).ravel().tolist()):
             graph.store(buffer, node, start + index, (), ())
     else:

@@ -7,8 +7,9 @@ import jax
 import numpy as np
 
 from straightline.compiled import Compiled
+from straightline.limits import TABLE
 from straightline.lowering import Lowering, traced, type_of
-from straightline.memory import LONG, InMemory
+from straightline.memory import InMemory
 from straightline.nodes import Buffer
 from straightline.program import Program, lower
 from tests.straightline.conformance.case import Case
@@ -48,7 +49,7 @@ def program_of(cases: Sequence[Case], known: Sequence[bool] = (False,) * 4) -> P
         with jax.enable_x64(True):
             for run in range(case.runs):
                 row = [c.row(run) if isinstance(c, InMemory) else lowering.known(c[run]) for c in columns]
-                row = [lowering.nodes(x) if x.size <= LONG else x for x in row]
+                row = [lowering.nodes(x) if x.size <= TABLE else x for x in row]
                 rows.append(lowering.results(made, row))
         outputs += [_stacked(lowering, leaves) for leaves in zip(*rows, strict=True)]
     return Program(lowering.graph, inputs, outputs, jax.tree.structure([0] * len(outputs)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from straightline import compile
-from straightline.rules.loops import WRITTEN_OUT
+from straightline.limits import WRITTEN_OUT
 
 SIDE = 46
 RUNS = 9
