@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from jaxtyping import Float
 
-from heliograph.numerics.types import Array, Float
 from tests.shapes import checked, once_a_kind, where_shaped
 
+Array = jax.Array | np.ndarray
 Pair = tuple[Float[Array, "n n"], Float[Array, " n"] | None]
 
 

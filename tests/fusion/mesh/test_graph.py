@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.fusion.mesh.graph import graph_of, neighbours_of, upstream
+from heliograph.fusion.mesh.graph import graph_of, upstream
+
+
+def neighbours_of(table):
+    """Names by name, as a fusion has them."""
+    return hg.Fusion("f", hg.CovarianceIntersection(), neighbours=table).neighbours
 
 
 class Drawn:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.simulation.description.doubts import doubts_before_data, observability
+from heliograph.simulation.description.doubts import doubts_before_data
 
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.9]], 0.1 * np.eye(2), [0, 0], np.eye(2), states=["position", "speed"])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.1, outputs=["y"])
@@ -64,11 +64,6 @@ def test_a_state_that_no_sensor_shows_is_named_in_any_units():
         kalman = {"own": hg.kalman_filter(hidden, SENSOR)}
         (words,) = words_of(hg.Network(hidden, {"a": hg.Node(SENSOR, hg.perfect(), kalman)}))
         assert words.startswith("unobservable: no sensor shows 'bias',")
-
-
-def test_the_observability_of_a_linear_plant_is_the_matrix_of_the_textbook():
-    expected = np.concatenate([SENSOR.matrix @ np.linalg.matrix_power(PLANT.matrix, k) for k in (1, 2)])
-    np.testing.assert_allclose(observability(PLANT, [SENSOR]), expected, rtol=1e-14)  # rounding of two products
 
 
 def test_a_nonlinear_plant_is_judged_off_its_symmetric_point():
