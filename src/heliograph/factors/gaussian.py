@@ -96,8 +96,8 @@ def given(mean: Array, covariance: Array) -> Gaussian:
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 
-def move(x: Gaussian, matrix: Array, shift: Array, noise: Columns) -> Gaussian:
-    """Move x to F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
+def move(x: Gaussian, matrix: Any, shift: Array, noise: Columns) -> Gaussian:
+    """Move x to F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w. F is a matrix, or has its `@`."""
     return of_columns(jnp.asarray(matrix @ x.mean + shift), join_columns(Columns(matrix @ x.root, x.variances), noise))
 
 

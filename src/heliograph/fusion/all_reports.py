@@ -9,11 +9,12 @@ import numpy as np
 from heliograph.factors.columns import Columns, columns_of, eliminate, join_columns, rounding_of, square_root, unit_of
 from heliograph.factors.gaussian import Gaussian, gain_of, leading, move, of_columns
 from heliograph.filters.gaussian.signal import homogeneous
-from heliograph.fusion.cross_covariance import Errors
+from heliograph.fusion.cross_covariance import ErrorMap, Errors
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fused, Means
+from heliograph.linear.jump_system import propagate
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.types import Array, Bool, Float
 
@@ -87,49 +88,52 @@ def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Report
     """
     nodes, n = errors.bias.shape
     unsent = (0, nodes * n * delays)
-    start = columns_of(errors.covariance)
+    start = columns_of(errors.state_covariance)
     root = jnp.pad(jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1)), (unsent, (0, 0)))
-    mean = jnp.pad(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), unsent)
+    mean = jnp.pad(errors.mean.reshape(-1), unsent)
     shapes = (received, n), (received,), (received, received), (n,)
     past = Past(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
     spill = jnp.zeros((len(mean), len(mean))) if quantized else None
     return ReportsBelief(of_columns(mean, Columns(root, start.weights)), past, spill)
 
 
+class ReportLine(NamedTuple):
+    """Linear map of (zeta, reports sent one step ago, two steps ago, ...): x - e_i goes before them. `F @ columns`."""
+
+    transition: ErrorMap
+
+    def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
+        """Move zeta by its step, and past reports by one place."""
+        nodes, n, _ = self.transition.errors.shape
+        zeta, past = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
+        moved = self.transition @ zeta
+        if not len(past):
+            return moved
+        sent = jnp.concatenate([zeta[:n]] * nodes) - zeta[n:]
+        return jnp.concatenate([moved, sent, past[: -nodes * n]])
+
+
 def propagate_errors(state: ReportsBelief, happened: Happened, links: ReportModel) -> ReportsBelief:
-    """Predict x- = A x + b + w and e+ = T e + G x + g + B w - K nu together; then each node sends x- - e+."""
-    motion, step, noise, _ = happened
-    nodes, n, _ = step.transition.shape
-    size = nodes * n
-    # Transition of (x, e_1, ...): A on top, G and T below.
-    items = jnp.arange(nodes)
-    errors = jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(step.transition).reshape(size, size)
-    plant = jnp.pad(jnp.asarray(motion.matrix), ((0, 0), (0, size)))
-    transition = jnp.concatenate([plant, jnp.concatenate([step.of_state.reshape(size, n), errors], axis=1)])
+    """Predict zeta+ = F zeta + f + B w - K nu; then each node sends x - e_i."""
+    step, errors = happened
+    nodes, n, _ = step.gain.shape
+    length, moved = len(state.gaussian.mean), len(step.shift)
     # Noise: w is common to all, nu enters by each node's gain; estimates are known to the rounding of x.
-    shared = jnp.concatenate([jnp.eye(n), step.of_noise.reshape(size, n)])
-    new = join_columns(
-        columns_of(motion.noise).through(shared),
-        _measurement_noise(step.gain, noise).through(np.eye(n + size, size, -n)),
-        rounding_of(jnp.tile(_square_mean(happened.errors), 1 + nodes)),
+    noise = join_columns(
+        columns_of(step.process).through(step.of_noise),
+        _measurement_noise(step.gain, step.received).through(np.eye(moved, nodes * n, -n)),
+        rounding_of(jnp.tile(_square_mean(errors), 1 + nodes)),
     )
-    drift = jnp.concatenate([jnp.asarray(motion.shift), step.drift.reshape(-1)])
-    later = len(state.gaussian.mean) - n - size
-    # The line of past reports shifts by one step.
-    if later:
-        stored = _make_shift_matrix(nodes, n, later)
-        transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), stored])
-        new, drift = new.through(np.eye(n + size + later, n + size)), jnp.pad(drift, (0, later))
-    return ReportsBelief(
-        move(state.gaussian, transition, drift, new),
-        _prepend_present(state.past, happened, links),
-        None if state.spill is None else symmetric(transition @ state.spill @ transition.T),
-    )
+    # Past reports move on by one place, without a noise.
+    line = ReportLine(step.transition)
+    shift, noise = jnp.pad(step.shift, (0, length - moved)), noise.through(np.eye(length, moved))
+    spill = None if state.spill is None else symmetric(propagate(line, state.spill, 0.0))
+    return ReportsBelief(move(state.gaussian, line, shift, noise), _prepend_present(state.past, errors, links), spill)
 
 
 def _square_mean(errors: Errors) -> Float[jax.Array, " n"]:
     """E[x_i^2] before any data."""
-    return jnp.asarray(errors.mean**2 + jnp.diagonal(errors.covariance))
+    return jnp.asarray(errors.state_mean**2 + jnp.diagonal(errors.state_covariance))
 
 
 class Expected(NamedTuple):
@@ -157,7 +161,7 @@ def receive_reports(state: ReportsBelief, reports: Float[jax.Array, "age node m"
     spill = None
     if state.spill is not None:
         push = _within(gain @ _along_diagonal(past.gain), jnp.ravel(past.error))
-        spill = symmetric(_sum(keep @ state.spill @ keep.T, push))
+        spill = symmetric(_sum(propagate(keep, state.spill, 0.0), push))
     law = Expected(expected, join_columns(Columns(output @ x.root, x.variances), noise).covariance)
     return ReportsBelief(of_columns(x.mean + gain @ unexpected, kept), past, spill), law
 
@@ -183,14 +187,13 @@ def estimate_state(state: ReportsBelief, n: int) -> Fused:
     return x.mean, x.covariance if state.spill is None else _sum(x.covariance, state.spill[:n, :n])
 
 
-def _prepend_present(past: Past, happened: Happened, links: ReportModel) -> Past:
+def _prepend_present(past: Past, errors: Errors, links: ReportModel) -> Past:
     """Put the present reports before those of earlier steps."""
-    errors = happened.errors
-    mean = errors.mean - errors.bias
+    mean = errors.state_mean - errors.bias
     blocks = jnp.einsum("iaib->iab", errors.joint)
     # E m m' of each node's estimate m = x - e, by the covariances of x and e and of both.
     both = errors.with_state + jnp.swapaxes(errors.with_state, 1, 2)
-    second = errors.covariance - both + blocks + mean[:, :, None] * mean[:, None]
+    second = errors.state_covariance - both + blocks + mean[:, :, None] * mean[:, None]
     # Noise of the reports: the spread of the links on what is sent, and the quantizers' error.
     error = jnp.asarray(links.error)
     known = jax.vmap(lambda s, m: homogeneous(s, m, 1.0))(second, mean)
@@ -198,14 +201,6 @@ def _prepend_present(past: Past, happened: Happened, links: ReportModel) -> Past
     noise = jnp.einsum("iabcd,icd->iab", links.spread, known)
     new = Past(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
     return Past(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
-
-
-def _make_shift_matrix(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
-    """Shift matrix of the line: x - e_i becomes the report of one step ago, and so on."""
-    size = nodes * n
-    sent = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size), np.zeros((size, later))], axis=1)
-    shift = np.eye(later - size, n + size + later, n + size)
-    return np.concatenate([sent, shift])
 
 
 def _output(past: Past, length: int) -> Float[jax.Array, "M N"]:

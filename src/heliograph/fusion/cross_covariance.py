@@ -6,6 +6,7 @@ x- = A x + b + w, and the filter receives z = M x- + o + nu. With e = x - m, U =
   e+ = U F e + [U (A - F) - L A] x + [U (b - f) - L b - K (o - c)] + (U - L) w - K nu.
 
 Where the filter's model is the world, the second and third term vanish: e+ = (I - K H)(A e + w) - K nu.
+So zeta = (x, e_1, ..., e_nodes), N = (1 + nodes) n numbers, follows one linear step, zeta+ = F zeta + f + B w - K nu.
 """
 
 from typing import NamedTuple
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import LinearStep
+from heliograph.linear.jump_system import propagate
 from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
@@ -42,51 +44,109 @@ class Observation(NamedTuple):
     noise: Array
 
 
-class Errors(NamedTuple):
-    """Moments of the plant's state x and of the errors e_i = x - m_i, before any data.
+class ErrorMap(NamedTuple):
+    """Linear map of zeta = (x, e_1, ..., e_nodes): x+ = A x and e_i+ = G_i x + T_i e_i. `F @ columns` applies it.
 
-    mean E x and covariance Cov x; bias E e_i; with_state Cov(e_i, x); joint Cov(e_i, e_j).
+    It costs nodes n^2 a column, where a matrix costs N^2. Shapes: plant A (n, n), of_state G and errors T (node, n, n).
     """
 
-    mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
-    bias: Float[jax.Array, "node n"]
-    with_state: Float[jax.Array, "node n n"]
-    joint: Float[jax.Array, "node n node n"]
+    plant: Float[Array, "n n"]
+    of_state: Float[jax.Array, "node n n"]
+    errors: Float[jax.Array, "node n n"]
+
+    def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
+        """F zeta of each column."""
+        nodes, n, _ = self.errors.shape
+        x, e = columns[:n].reshape(n, -1), columns[n:].reshape(nodes, n, -1)
+        after = self.errors @ e + self.of_state @ x
+        return jnp.concatenate([self.plant @ x, after.reshape(nodes * n, -1)]).reshape(columns.shape)
 
 
 class ErrorStep(NamedTuple):
-    """Recursion of the errors, e+ = transition e + of_state x + drift + of_noise w - gain nu, for each node."""
+    """One step of the plant and of the nodes' errors, zeta+ = F zeta + f + B w - K nu, w and nu uncorrelated.
 
-    transition: Float[jax.Array, "node n n"]
-    of_state: Float[jax.Array, "node n n"]
-    drift: Float[jax.Array, "node n"]
-    of_noise: Float[jax.Array, "node n n"]
+    Shapes: transition F, shift f (N,), of_noise B (N, n), process Q = Cov w (n, n), gain K (node, n, m), received
+    E[nu_i nu_j'] (node, m, node, m), or (node, m, m) where nodes share nothing.
+    """
+
+    transition: ErrorMap
+    shift: Float[jax.Array, " N"]
+    of_noise: Float[jax.Array, "N n"]
+    process: Float[Array, "n n"]
     gain: Float[jax.Array, "node n m"]
+    received: Array
+
+    def noise(self) -> Float[jax.Array, "N N"]:
+        """B Q B' + K E[nu nu'] K', the covariance of what the step adds."""
+        nodes, n, _ = self.gain.shape
+        if self.received.ndim == 4:
+            measured = jnp.einsum("iam,imjl,jbl->iajb", self.gain, self.received, self.gain)
+        else:
+            items, blocks = jnp.arange(nodes), symmetrize(propagate(self.gain, self.received, 0.0))
+            measured = jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(blocks)
+        added = jnp.pad(measured.reshape(nodes * n, nodes * n), ((n, 0), (n, 0)))
+        return jnp.asarray(propagate(self.of_noise, self.process, added))
+
+
+class Errors(NamedTuple):
+    """Moments of zeta = (x, e_1, ..., e_nodes), of the plant's state and the errors e_i = x - m_i, before any data.
+
+    Shapes: mean (1 + node, n), covariance (N, N).
+    """
+
+    mean: Float[jax.Array, "nodes1 n"]
+    covariance: Float[jax.Array, "N N"]
+
+    @property
+    def state_mean(self) -> Float[jax.Array, " n"]:
+        """E x."""
+        return self.mean[0]
+
+    @property
+    def state_covariance(self) -> Float[jax.Array, "n n"]:
+        """Cov x."""
+        n = self.mean.shape[1]
+        return self.covariance[:n, :n]
+
+    @property
+    def bias(self) -> Float[jax.Array, "node n"]:
+        """E e_i."""
+        return self.mean[1:]
+
+    @property
+    def with_state(self) -> Float[jax.Array, "node n n"]:
+        """Cov(e_i, x)."""
+        n = self.mean.shape[1]
+        return self.covariance[n:, :n].reshape(-1, n, n)
+
+    @property
+    def joint(self) -> Float[jax.Array, "node n node n"]:
+        """Cov(e_i, e_j)."""
+        nodes, n = self.bias.shape
+        return self.covariance[n:, n:].reshape(nodes, n, nodes, n)
 
 
 def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]) -> Errors:
     """Moments before the first step: every filter starts at a known mean, so all errors are x_0 up to a constant."""
-    mean, covariance, starts = jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(starts)
-    nodes, n = starts.shape
-    values = jnp.broadcast_to(covariance, (nodes, n, n))
-    joint = jnp.broadcast_to(covariance[None, :, None, :], (nodes, n, nodes, n))
-    return Errors(mean, covariance, mean - starts, values, joint)
+    mean, starts = jnp.asarray(mean), jnp.asarray(starts)
+    return Errors(jnp.concatenate([mean[None], mean - starts]), jnp.tile(covariance, (1 + len(starts),) * 2))
 
 
 def error_step(filters: LinearStep, motion: Motion, observation: Observation) -> ErrorStep:
-    """Recursion of the errors of linear filters; `filters` has a leading axis of nodes."""
-    gain, keep = jnp.asarray(filters.gain), filters.keep()
-    astray = gain @ _difference(observation.gain, filters.output)
-    moves = _difference(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
-    shifts = _difference(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
-    drift = _times(keep, shifts) - astray @ jnp.asarray(motion.shift)
+    """Step of the errors of linear filters; `filters` has a leading axis of nodes."""
+    gain, keep, n = jnp.asarray(filters.gain), filters.keep(), len(motion.shift)
+    astray = gain @ _subtract(observation.gain, filters.output)
+    moves = _subtract(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
+    shifts = _subtract(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
+    shift = _apply(keep, shifts) - astray @ jnp.asarray(motion.shift)
+    shift = shift - _apply(gain, _subtract(observation.offset, filters.offset))
     return ErrorStep(
-        transition=keep @ filters.transition,
-        of_state=keep @ moves - astray @ motion.matrix,
-        drift=drift - _times(gain, _difference(observation.offset, filters.offset)),
-        of_noise=keep - astray,
+        transition=ErrorMap(motion.matrix, keep @ moves - astray @ motion.matrix, keep @ filters.transition),
+        shift=jnp.concatenate([jnp.asarray(motion.shift), shift.reshape(-1)]),
+        of_noise=jnp.concatenate([jnp.eye(n), (keep - astray).reshape(-1, n)]),
+        process=motion.noise,
         gain=gain,
+        received=observation.noise,
     )
 
 
@@ -95,112 +155,99 @@ def propagate_state(
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """E x and Cov x after the step."""
     matrix = jnp.asarray(motion.matrix)
-    return matrix @ mean + motion.shift, symmetric(matrix @ covariance @ matrix.T + motion.noise)
+    return matrix @ mean + motion.shift, symmetric(propagate(matrix, covariance, motion.noise))
 
 
-def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Errors:
-    """Propagate all pairs: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', plus the terms of a wrong model."""
-    nodes, n = errors.bias.shape
-    mean, covariance = propagate_state(errors.mean, errors.covariance, motion)
-    bias = _times(step.transition, errors.bias) + step.of_state @ errors.mean + step.drift
-    # Cov(e+, x+): the errors depend on x where a filter's model is wrong.
-    carried = step.transition @ errors.with_state  # Cov(T e, x)
-    of_state = step.of_state @ errors.covariance
-    of_noise = step.of_noise @ motion.noise
-    moved = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
-    # Terms of x and w in Cov(e_i+, e_j+), as one product of all nodes.
-    left = jnp.concatenate([carried + of_state, step.of_state, of_noise], axis=-1).reshape(nodes * n, -1)
-    right = jnp.concatenate([step.of_state, carried, step.of_noise], axis=-1).reshape(nodes * n, -1)
-    # T_i P_ij T_j'.
-    once = jnp.einsum("iab,ibc->iac", step.transition, errors.joint.reshape(nodes, n, -1)).reshape(nodes * n, -1)
-    both = jnp.einsum("iab,ibc->iac", step.transition, once.T.reshape(nodes, n, -1)).reshape(nodes * n, -1)
-    measured = observation_noise(step.gain, noise).reshape(nodes * n, -1)
-    joint = symmetric(both + left @ right.T + measured).reshape(nodes, n, nodes, n)
-    return Errors(mean, covariance, bias, moved, joint)
+def advance(errors: Errors, step: ErrorStep) -> Errors:
+    """Propagate the moments of zeta, of all pairs of nodes: F P F' + B Q B' + K E[nu nu'] K'."""
+    mean = step.transition @ errors.mean.reshape(-1) + step.shift
+    covariance = symmetric(propagate(step.transition, errors.covariance, step.noise()))
+    return Errors(mean.reshape(errors.mean.shape), covariance)
+
+
+class ErrorSources(NamedTuple):
+    """Errors by their sources, e_i = shared_i s + a_i: s is common to all, Cov s = I, and each a_i independent.
+
+    Shapes: shared (node, n, sources), independent Cov a_i (node, n, n).
+    """
+
+    shared: Float[Array, "node n sources"]
+    independent: Float[Array, "node n n"]
+
+    def covariances(self) -> Float[Array, "node n n"]:
+        """Cov e_i of each."""
+        return self.shared @ self.shared.swapaxes(-1, -2) + self.independent
+
+    def joint(self) -> Float[Array, "node n node n"]:
+        """Cov(e_i, e_j) of all pairs."""
+        count, n, _ = self.shared.shape
+        flat = self.shared.reshape(count * n, -1)
+        blocks = np.eye(count)[:, None, :, None] * self.independent[:, :, None]
+        return (flat @ flat.T).reshape(count, n, count, n) + blocks
+
+    def weigh(self, weights: Float[Array, "n node n"]) -> tuple[Float[Array, "n sources"], Float[Array, "n n"]]:
+        """Sources of the sum W e, and the covariance of its independent part."""
+        xp = library(weights, *self)
+        independent = xp.einsum("aib,ibc,dic->ad", weights, self.independent, weights)
+        return xp.tensordot(weights, self.shared, axes=2), independent
 
 
 class Factors(NamedTuple):
-    """Moments of the errors by their sources: x = E x + state s, e_i = E e_i + shared_i s + a_i, Cov s = I.
+    """Moments of zeta by their sources: zeta = E zeta + roots s + (0, a_1, ..., a_nodes), Cov s = I.
 
     s are x_0 and the process noise of each step, and the channels' noise where nodes share it; a_i is independent, of
-    covariance independent_i. So Cov(e_i, e_j) = shared_i shared_j' + (independent_i if i is j): a step costs in
-    proportion to the nodes, not to pairs of them.
+    covariance independent_i. A step costs in proportion to the nodes, not to pairs of them.
+
+    Shapes: mean (1 + node, n), roots (N, sources), independent (node, n, n).
     """
 
-    mean: Float[jax.Array, " n"]
-    state: Float[jax.Array, "n sources"]
-    bias: Float[jax.Array, "node n"]
-    shared: Float[jax.Array, "node n sources"]
+    mean: Float[jax.Array, "nodes1 n"]
+    roots: Float[jax.Array, "N sources"]
     independent: Float[jax.Array, "node n n"]
+
+    @property
+    def state(self) -> Float[Array, "n sources"]:
+        """Deviation of x by sources."""
+        return self.roots[: self.mean.shape[1]]
+
+    @property
+    def errors(self) -> ErrorSources:
+        """Errors by their sources, without their means."""
+        n = self.mean.shape[1]
+        return ErrorSources(self.roots[n:].reshape(-1, n, self.roots.shape[1]), self.independent)
 
 
 def initial_factors(errors: Errors, sources: int) -> Factors:
     """Factors before the first step, with room for `sources` more: all is the deviation of x_0."""
     nodes, n = errors.bias.shape
-    state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.covariance))
-    shared = jnp.broadcast_to(state, (nodes, *state.shape))
-    return Factors(errors.mean, state, errors.bias, shared, jnp.zeros((nodes, n, n)))
+    state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))
+    return Factors(errors.mean, jnp.tile(state, (1 + nodes, 1)), jnp.zeros((nodes, n, n)))
 
 
-def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Array, k: jax.Array) -> Factors:
+def advance_factors(factors: Factors, step: ErrorStep, k: jax.Array) -> Factors:
     """Propagate over step k: s gets the process noise, and the measurement noise where nodes share it."""
-    nodes, n = factors.bias.shape
-    # x+ and e+ in terms of the sources so far.
-    root = cholesky(jnp.asarray(motion.noise))
-    state = jnp.asarray(motion.matrix) @ factors.state
-    shared = step.transition @ factors.shared + step.of_state @ factors.state
-    bias = _times(step.transition, factors.bias) + step.of_state @ factors.mean + step.drift
-    moved = step.transition @ factors.independent @ jnp.swapaxes(step.transition, 1, 2)
-    new = step.of_noise @ root
+    nodes, n, m = step.gain.shape
+    new, added = step.of_noise @ cholesky(jnp.asarray(step.process)), jnp.zeros(())
     # Shared measurement noise is a source, independent noise stays the node's.
-    if noise.ndim == 4:
-        m = noise.shape[1]
-        received = cholesky(jnp.asarray(noise).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
-        new = jnp.concatenate([new, -step.gain @ received], axis=-1)
-        root = jnp.pad(root, ((0, 0), (0, nodes * m)))
+    if step.received.ndim == 4:
+        root = cholesky(jnp.asarray(step.received).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
+        sources = (-step.gain @ root).reshape(nodes * n, -1)
+        new = jnp.concatenate([new, jnp.pad(sources, ((n, 0), (0, 0)))], axis=1)
     else:
-        moved = symmetrize(moved + step.gain @ noise @ jnp.swapaxes(step.gain, 1, 2))
+        added = propagate(step.gain, step.received, 0.0)
     # The new sources of step k go to columns of their own.
-    column = n + new.shape[-1] * k
-    return Factors(
-        jnp.asarray(motion.matrix) @ factors.mean + motion.shift,
-        jax.lax.dynamic_update_slice(state, root, (0, column)),
-        bias,
-        jax.lax.dynamic_update_slice(shared, new, (0, 0, column)),
-        moved,
-    )
+    mean = step.transition @ factors.mean.reshape(-1) + step.shift
+    roots = jax.lax.dynamic_update_slice(step.transition @ factors.roots, new, (0, n + new.shape[1] * k))
+    independent = symmetrize(propagate(step.transition.errors, factors.independent, added))
+    return Factors(mean.reshape(factors.mean.shape), roots, independent)
 
 
-def joint_of(shared: Array, independent: Array) -> Float[Array, "node n node n"]:
-    """Cov(e_i, e_j) of all pairs, of errors e_i = shared_i s + a_i."""
-    count, n, _ = shared.shape
-    flat = shared.reshape(count * n, -1)
-    apart = np.eye(count)[:, None, :, None] * independent[:, :, None]
-    return (flat @ flat.T).reshape(count, n, count, n) + apart
-
-
-def weigh_sources(weights: Array, shared: Array, independent: Array) -> tuple[Array, Array]:
-    """Sources (n, sources) of a weighted sum of the errors, and the covariance (n, n) of its independent part."""
-    jnp = library(weights, shared, independent)
-    return jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, independent, weights)
-
-
-def observation_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Float[jax.Array, "node n node n"]:
-    """K_i S_ij K_j', zero between nodes that share nothing."""
-    if noise.ndim == 4:
-        return jnp.einsum("iam,imjl,jbl->iajb", gain, noise, gain)
-    nodes, n, _ = gain.shape
-    items = jnp.arange(nodes)
-    blocks = symmetrize(gain @ noise @ jnp.swapaxes(gain, 1, 2))
-    return jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(blocks)
-
-
-def _difference(a: Array, b: Array) -> jax.Array:
+def _subtract(a: Array, b: Array) -> jax.Array:
     """a - b, zero where it is rounding, so that a filter with the right model has no error that depends on x."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     return jnp.where(jnp.abs(a - b) <= rounding(SAME, a) * (jnp.abs(a) + jnp.abs(b)), 0.0, a - b)
 
 
-def _times(matrix: Array, vector: Array) -> jax.Array:
+def _apply(matrix: Array, vector: Array) -> jax.Array:
     """Product of matrix and vector for each node."""
     return jnp.einsum("iab,ib->ia", matrix, vector)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
+from heliograph.fusion.cross_covariance import Errors, ErrorStep
 from heliograph.fusion.mesh.gains import Believed, Weights
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import (
@@ -30,11 +30,9 @@ Joint = Float[jax.Array, "node n node n"]
 
 
 class Happened(NamedTuple):
-    """One step as the fusion centre knows it: motion of plant and errors, E[nu nu'], and their moments after it."""
+    """One step as the fusion centre knows it: of plant and errors, and their moments after it."""
 
-    motion: Motion
     step: ErrorStep
-    noise: Array
     errors: Errors
 
 
@@ -109,19 +107,14 @@ class AbstractWeights(AbstractInformedFusion):
         errors = happened.errors
         unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
-            unbiased = jnp.concatenate([unbiased, errors.mean[None]])
-            joint = append_mean_error(errors)
+            # x - E x, the error of the plant's mean, behind those of the nodes.
+            unbiased = jnp.concatenate([unbiased, errors.state_mean[None]])
+            count, n = unbiased.shape
+            joint = jnp.roll(errors.covariance, (-n, -n), (0, 1)).reshape(count, n, count, n)
         chosen = self.weights(joint)
         # W sums to I: of differences, since digits that W lacks would count against the size of the means.
         mean = unbiased[0] + jnp.einsum("aib,ib->a", chosen, unbiased - unbiased[0])
         return state, (mean, weigh_covariance(chosen, joint))
-
-
-def append_mean_error(errors: Errors) -> Joint:
-    """Joint covariance of the errors and of x - E x, the error of the plant's mean."""
-    column = errors.with_state[:, :, None, :]
-    last = jnp.concatenate([jnp.moveaxis(errors.with_state, 2, 0), errors.covariance[:, None, :]], axis=1)
-    return jnp.concatenate([jnp.concatenate([errors.joint, column], axis=2), last[None]], axis=0)
 
 
 class MatrixWeights(AbstractWeights):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import LinearStep
-from heliograph.fusion.cross_covariance import Factors, initial_factors, joint_of, weigh_sources
+from heliograph.fusion.cross_covariance import ErrorSources, Factors, initial_factors
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import matrix_weights, solve_factored_weights
@@ -54,7 +54,7 @@ class CrossCovariances:
     @property
     def joint(self) -> Float[np.ndarray, "node n node n"]:
         """Cov(e_i, e_j) of all pairs."""
-        return np.asarray(joint_of(self.shared, self.independent))
+        return np.asarray(self._sources.joint())
 
     @property
     def of_state(self) -> Float[np.ndarray, "node n n"]:
@@ -68,9 +68,13 @@ class CrossCovariances:
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """Best unbiased weights W and the covariance W P W' of their error; linear in nodes where P allows it."""
-        weights = _weights(self.shared, self.independent)
-        shared, independent = weigh_sources(weights, self.shared, self.independent)
+        weights = _weights(self._sources)
+        shared, independent = self._sources.weigh(weights)
         return weights, np.asarray(shared @ shared.T + independent)
+
+    @property
+    def _sources(self) -> ErrorSources:
+        return ErrorSources(self.shared, self.independent)
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
         """Moments at relays that forward the matrix-weighted estimate of their nodes, as the nodes of the next level.
@@ -82,33 +86,31 @@ class CrossCovariances:
         Raises:
             ValueError: no relays, a relay without nodes, unknown nodes, a node that two relays receive.
         """
-        received = [name for names in relays.values() for name in names]
-        unknown = sorted(set(received) - set(self.nodes))
+        listed = [name for names in relays.values() for name in names]
+        unknown = sorted(set(listed) - set(self.nodes))
         if not relays or unknown or not all(relays.values()):
             raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
-        if len(set(received)) < len(received):
+        if len(set(listed)) < len(listed):
             raise fail(
-                "nodes", "one relay for each", f"several for {sorted({n for n in received if received.count(n) > 1})}"
+                "nodes", "one relay for each", f"several for {sorted({n for n in listed if listed.count(n) > 1})}"
             )
         # Weights of each relay's nodes, and the moments of its error.
         index = {name: i for i, name in enumerate(self.nodes)}
         parts = []
         for names in relays.values():
             mine = [index[name] for name in names]
-            shared, independent = self.shared[mine], self.independent[mine]
-            parts.append(weigh_sources(_weights(shared, independent), shared, independent))
+            received = ErrorSources(self.shared[mine], self.independent[mine])
+            parts.append(received.weigh(_weights(received)))
         shared, independent = (np.stack(leaves) for leaves in zip(*parts, strict=True))
         bias = np.zeros((len(relays), len(self.mean)))
         return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, independent)
 
 
-def _weights(shared: np.ndarray, apart: np.ndarray) -> Float[np.ndarray, "n node n"]:
-    scale = np.sqrt(np.einsum("iaa->ia", apart) + np.einsum("ias,ias->ia", shared, shared))
+def _weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
+    scale = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
     scale = np.where(scale > 0, scale, 1.0)
-    least = np.linalg.eigvalsh(apart / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-    return np.asarray(
-        solve_factored_weights(shared, apart) if least > REGULAR else matrix_weights(joint_of(shared, apart))
-    )
+    least = np.linalg.eigvalsh(errors.independent / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+    return np.asarray(solve_factored_weights(*errors) if least > REGULAR else matrix_weights(errors.joint()))
 
 
 def cross_covariances(
@@ -136,7 +138,7 @@ def cross_covariances(
     filters, u = _plan_filters(alone, horizon, inputs)
     with jax.enable_x64(True):
         factors: Factors = to_numpy(_factors(filters, u))
-    parts = factors.mean, factors.state, factors.bias, factors.shared, factors.independent
+    parts = factors.mean[0], factors.state, factors.mean[1:], *factors.errors
     return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
 
 

@@ -143,17 +143,17 @@ class Centre(Module):
 
     def moved(self, errors: Errors, filters: LinearStep, u: jax.Array, k: jax.Array) -> Happened:
         """Propagate the errors of filters with these matrices over step k, in the order of the nodes."""
-        motion, step, noise = self.moves(errors.mean, errors.covariance, filters, u, k)
-        return Happened(motion, step, noise, advance(errors, step, motion, noise))
+        step = self.error_step(errors.state_mean, errors.state_covariance, filters, u, k)
+        return Happened(step, advance(errors, step))
 
-    def moves(
+    def error_step(
         self, mean: jax.Array, covariance: jax.Array, filters: LinearStep, u: jax.Array, k: jax.Array
-    ) -> tuple[Motion, ErrorStep, Array]:
-        """Motion of plant and errors at step k, and the measurement noise, for a plant with these moments."""
+    ) -> ErrorStep:
+        """Step k of the errors, for a plant with these moments before it."""
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
-        return motion, error_step(filters, motion, observation), observation.noise
+        return error_step(filters, motion, observation)
 
     def factors(
         self,
@@ -171,9 +171,9 @@ class Centre(Module):
             carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[PyTree, Factors], None]:
             (states, factors), (k, u_k) = carry, row
-            spread = factors.state @ factors.state.T
-            motion, step, noise = self.moves(factors.mean, spread, matrices(states, u_k, k), u_k, k)
-            return (follow(states, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+            spread = jnp.asarray(factors.state @ factors.state.T)
+            step = self.error_step(factors.mean[0], spread, matrices(states, u_k, k), u_k, k)
+            return (follow(states, u_k, k), advance_factors(factors, step, k)), None
 
         factors: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
         return factors

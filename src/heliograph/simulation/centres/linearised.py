@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.filters.linear.plan import Linearised, linearise_step
 from heliograph.fusion.all_reports import AllReports, ReportsBelief
-from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, advance, initial_errors
+from heliograph.fusion.cross_covariance import ErrorMap, Errors, ErrorStep, Motion, advance, initial_errors
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
@@ -74,20 +74,35 @@ class LinearisedCentre(Module):
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors; the rule weights the reports by them.
-            step = _make_shared_step(matrix, keep, linear.gain)
-            after = advance(before.errors, step, motion, linear.noise)
-            errors = before.errors._replace(bias=after.bias, joint=after.joint)  # the plant's moments are not known
+            step = _make_shared_step(motion, keep, linear)
+            errors = _keep_plant_moments(before.errors, advance(before.errors, step))
             if isinstance(rule, AllReports):
-                step = step._replace(drift=_drift(before.rule, matrix, moved, keep, linear))
-            known, (mean, covariance) = rule.use(before.rule, Happened(motion, step, linear.noise, errors), reports)
+                drift = _drift(before.rule, matrix, moved, keep, linear)
+                step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
+            known, (mean, covariance) = rule.use(before.rule, Happened(step, errors), reports)
             following[name], results[name] = Followed(errors, mean, known), Estimate(mean, covariance, self.claim)
         return following, results
 
 
-def _make_shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorStep:
+def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
     """e+ = F_i (A e + w) - K_i nu: errors of mean zero keep it."""
-    nothing = jnp.zeros_like(keep)
-    return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)
+    nodes, n, _ = keep.shape
+    return ErrorStep(
+        transition=ErrorMap(motion.matrix, jnp.zeros_like(keep), keep @ motion.matrix),
+        shift=jnp.pad(motion.shift, (0, nodes * n)),
+        of_noise=jnp.concatenate([jnp.eye(n), keep.reshape(nodes * n, n)]),
+        process=motion.noise,
+        gain=linear.gain,
+        received=linear.noise,
+    )
+
+
+def _keep_plant_moments(before: Errors, after: Errors) -> Errors:
+    """Moments of the errors `after` a step and those of the plant `before` it, which nobody knows along estimates."""
+    n = before.mean.shape[1]
+    of_errors = np.arange(len(before.covariance)) >= n
+    covariance = jnp.where(np.outer(of_errors, of_errors), after.covariance, before.covariance)
+    return Errors(jnp.concatenate([before.mean[:1], after.bias]), covariance)
 
 
 def _drift(state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:

@@ -2,14 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.cross_covariance import initial_factors, joint_of, weigh_sources
+from heliograph.fusion.cross_covariance import ErrorSources, initial_factors
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import matrix_weights
@@ -117,9 +116,9 @@ def relay_tree(
         block_results = [to_numpy(_propagate_leaves((plant, name, node, degree), block, u)) for block in blocks]
         covariances, weights, level = (list(leaves) for leaves in zip(*block_results, strict=True))
         level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _join_levels(level)
-        # Level by level up to the root.
+        # ErrorSources by level up to the root.
         while True:
-            level_covariances.append(np.asarray(_spread(shared)))
+            level_covariances.append(np.asarray(shared.covariances()))
             if len(level_covariances[-1]) == 1:
                 return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(level_covariances), tuple(used))
             groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(level_covariances[-1]), degree)]
@@ -128,17 +127,10 @@ def relay_tree(
             shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(relay for _, relay in outputs))
 
 
-class Level(NamedTuple):
-    """Errors of one level by their sources, e_i = shared_i s + a_i, s white, Cov a_i = independent_i."""
-
-    shared: Float[Array, "node n sources"]
-    independent: Float[Array, "node n n"]
-
-
 @quickly_compiled
 def _propagate_leaves(
     leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
-) -> tuple[Array, Array, Level]:
+) -> tuple[Array, Array, ErrorSources]:
     """Propagate the leaves of one block: covariances of their errors, weights of the relays above, and these."""
     plant, name, node, degree = leaf
     # All leaves of the block from their numbers.
@@ -161,7 +153,7 @@ def _propagate_leaves(
         lambda states, u_k, k: alike.step(states, quiet, u_k, k)[0],
         u,
     )
-    level = Level(factors.shared, factors.independent)
+    level = factors.errors
     # Full relays at once, then the last one.
     full = count - count % degree
     weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), level))
@@ -170,28 +162,23 @@ def _propagate_leaves(
         last = jnp.pad(last, ((0, 0), (0, degree - last.shape[1]), (0, 0)))
         weights = jnp.concatenate([weights, last[None]])
         above = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), above, rest)
-    return _spread(level), weights, above
+    return level.covariances(), weights, above
 
 
 @quickly_compiled
-def _relay(children: Level) -> tuple[jax.Array, Level]:
+def _relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
     """Weights of a relay for its children, and the error of its estimate."""
     return _fuse(children)
 
 
-def _fuse(children: Level) -> tuple[jax.Array, Level]:
-    shared, independent = jnp.asarray(children.shared), jnp.asarray(children.independent)
-    weights = matrix_weights(joint_of(shared, independent))
-    return weights, Level(*weigh_sources(weights, shared, independent))
+def _fuse(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
+    children = ErrorSources(*map(jnp.asarray, children))
+    weights = matrix_weights(children.joint())
+    return weights, ErrorSources(*children.weigh(weights))
 
 
-def _spread(level: Level) -> Array:
-    """Covariance of each error."""
-    return level.shared @ level.shared.swapaxes(-1, -2) + level.independent
-
-
-def _join_levels(levels: list[Level]) -> Level:
-    return Level(*(np.concatenate(leaves) for leaves in zip(*levels, strict=True)))
+def _join_levels(levels: list[ErrorSources]) -> ErrorSources:
+    return ErrorSources(*(np.concatenate(leaves) for leaves in zip(*levels, strict=True)))
 
 
 def _pad_to_degree(weights: np.ndarray, degree: int) -> np.ndarray:
