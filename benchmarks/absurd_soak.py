@@ -57,9 +57,9 @@ class Outcome(NamedTuple):
 
 def outcome(network: Any, sent: list[Sent], batch: int) -> Outcome:
     """Of a service that receives these messages."""
-    from heliograph.serving import Fleet, InMemoryStore, Lanes, Options, Service
+    from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 
-    service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore())
     final: list[bytes] = []
     of_good: list[bytes] = []
     refused: Counter[str] = Counter()

@@ -20,7 +20,7 @@ from alone import show
 from timeline import readme_network
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.serving.message import read_messages
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
@@ -53,7 +53,7 @@ def rounds(plants: int, stored: bool) -> Taken:
     """Least seconds of all messages, of each kind."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        lanes = Lanes(readme_network())
+        lanes = NetworkProgram(readme_network())
     sent = lines(plants)
     Service(Fleet(lanes, Options(WINDOW)), InMemoryStore()).take(sent[:1])  # compiled
     results = []

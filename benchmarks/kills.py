@@ -20,8 +20,8 @@ from typing import Any
 
 from heliograph.files.network_file import load_network
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
-from heliograph.live.stored.plant_codec import plant_bytes, plant_from
+from heliograph.live.lanes import NetworkProgram
+from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
@@ -120,14 +120,14 @@ def killed(count: int, seed: int, folder: Path) -> dict[str, Any]:
 
 def compared(network: Path, store: Path, sent: list[bytes], known: dict[int, dict[str, Any]]) -> dict[str, Any]:
     """The store against that of a service that was never disturbed, and what was read against the journal."""
-    fleet = Fleet(Lanes(load_network(str(network))), Options(WINDOW, AHEAD))
+    fleet = Fleet(NetworkProgram(load_network(str(network))), Options(WINDOW, AHEAD))
     mine = identity(fleet)
     calm = Service(fleet, Store(str(store.with_name("calm.db")), mine))
     calm.take(sent)
     names, both = [f"p{i}" for i in range(PLANTS)], []
     for place in (calm.store, Store(str(store), mine)):
         assert isinstance(place, Store)
-        plants = {name: plant_from(name, item.body, fleet) for name, item in place.load(names).items()}
+        plants = {name: unpack_plant(name, item.body, fleet) for name, item in place.load(names).items()}
         for plant in plants.values():
             plant.links = {}  # what came again was counted
         rows = {entry.number: json.loads(entry.body) for entry in place.entries()}
@@ -135,7 +135,7 @@ def compared(network: Path, store: Path, sent: list[bytes], known: dict[int, dic
             (row["plant"], row["time"], row["estimates"]) for row in rows.values() if row["kind"] == "final"
         )
         place.close()
-        both.append(({name: plant_bytes(plant, fleet) for name, plant in plants.items()}, finals))
+        both.append(({name: pack_plant(plant, fleet) for name, plant in plants.items()}, finals))
     (states, finals), (killed_states, killed_finals) = both
     moments = [(plant, time) for plant, time, _ in killed_finals]
     return {

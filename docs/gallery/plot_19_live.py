@@ -16,7 +16,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import heliograph as hg
-from heliograph.serving import Fleet, InMemoryStore, Lanes, Link, Options, Service, lines, recorded, through
+from heliograph.serving import (
+    Fleet,
+    InMemoryStore,
+    Link,
+    NetworkProgram,
+    Options,
+    Service,
+    encode_messages,
+    recorded,
+    simulate_link,
+)
 
 turn = 0.15 * np.array([[0.0, 1.0], [-1.0, 0.0]])  # an oscillation of some forty steps
 plant = hg.LinearPlant(np.eye(2) + turn, np.diag([0.01, 0.4]), [0.0, 3.0], 0.1 * np.eye(2), states=["x", "v"])
@@ -30,10 +40,10 @@ file = Path(tempfile.mkdtemp()) / "recording.csv"
 rows = np.column_stack([np.arange(60.0), recording.measurements["radio"][0]])
 np.savetxt(file, rows, delimiter=",", header="time,place", comments="")
 sent, origin = recorded(file, network)
-received = through(sent, Link(loss=0.1, delay=2.0, duplicates=0.1), seed=0)
-service = Service(Fleet(Lanes(network), Options(window=5.0)), InMemoryStore())
+received = simulate_link(sent, Link(loss=0.1, delay=2.0, duplicates=0.1), seed=0)
+service = Service(Fleet(NetworkProgram(network), Options(window=5.0)), InMemoryStore())
 known = []  # what comes out, with the moment at which it does
-for arrival, message in lines(received, plant="", origin=origin):
+for arrival, message in encode_messages(received, plant="", origin=origin):
     known += [(arrival, json.loads(output.body)) for output in service.take([message.encode()])]
 known += [(received[-1].arrival, json.loads(output.body)) for output in service.finish(ended=True)]
 

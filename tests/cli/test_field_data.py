@@ -9,7 +9,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.files.network_file import load_module
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
@@ -26,7 +26,7 @@ def served(folder, lines):
     """Kinds, times and estimates that a service publishes for lines of a pipe."""
     network, module = load_module(str(folder / "net.py"))
     reads = Translator(module["sources"], network)
-    service = Service(Fleet(Lanes(network), Options(window=60.0, ahead=0.1)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(network), Options(window=60.0, ahead=0.1)), InMemoryStore())
     payloads = [payload for line in lines for payload in reads.line(line.encode())]
     return [json.loads(output.body) for output in [*service.take(payloads), *service.finish(True)]]
 

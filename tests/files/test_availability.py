@@ -10,7 +10,7 @@ from heliograph import cli
 from heliograph.files.sources import Sources
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.storage.store import Store
-from heliograph.serving.words import KeepingWords
+from heliograph.serving.words import LastWordsService
 
 json_field, Available = hg.files.json_field, hg.files.Available
 NETWORK = """
@@ -156,7 +156,7 @@ def test_a_word_is_kept_over_a_restart(network, tmp_path):
 
     def begun():
         translator = Translator(table(here[0]) | {"other/+": table(here[1:])["zigbee2mqtt/+"]}, network)
-        return translator, KeepingWords(Silent(), translator.sources.words, store)
+        return translator, LastWordsService(Silent(), translator.sources.words, store)
 
     identity = {"states": "temperature", "description": "{}"}
     value = b'{"temperature": 1}'

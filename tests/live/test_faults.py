@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.serving import Fleet, InMemoryStore, Lanes, Options, Service
+from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 
 
 def network(by_time):
@@ -49,7 +49,7 @@ def test_limits_say_why():
 
 
 def test_a_service_names_it_in_the_refusal():
-    service = Service(Fleet(Lanes(network(False)), Options(0.0, 0.1)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(network(False)), Options(0.0, 0.1)), InMemoryStore())
     for k, value in enumerate((5.0, 0.1)):
         message = {"plant": "p", "node": "a", "sequence": k, "time": k, "values": [value]}
         outputs = service.take([json.dumps(message).encode()])
@@ -82,7 +82,7 @@ def test_an_angle_that_becomes_too_wide_is_said_once(turning):
 
 def test_a_service_says_it_once(turning):
     said = []
-    service = Service(Fleet(Lanes(turning), Options(0.0, 0.1)), InMemoryStore(), said.append)
+    service = Service(Fleet(NetworkProgram(turning), Options(0.0, 0.1)), InMemoryStore(), said.append)
     for k in range(4):
         batch = [{"plant": p, "node": "a", "sequence": k, "time": k, "values": [None]} for p in ("first", "second")]
         service.take([json.dumps(message).encode() for message in batch])

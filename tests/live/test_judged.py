@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.serving import Fleet, InMemoryStore, Lanes, Options, Service
+from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 from tests.serving.worlds import lines
 
 PLANT, SENSOR = hg.LinearPlant([[1.0]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
@@ -67,7 +67,7 @@ def fused():
 @pytest.mark.slow
 def test_an_implausible_value_in_a_fused_filter_is_its_nodes_and_costs_that_value_alone():
     network = fused()
-    service = Service(Fleet(Lanes(network), Options(window=5.0)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(network), Options(window=5.0)), InMemoryStore())
     clean = hg.Timeline(network, window=5)
     sent = [{"node": name, "sequence": 0, "time": 0, "values": [0.1 * i]} for i, name in enumerate("abc")]
     bad = [{"node": name, "sequence": 1, "time": 1, "values": [value]}

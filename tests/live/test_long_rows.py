@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 
 
 @pytest.mark.slow
@@ -16,7 +16,7 @@ def test_a_long_row_costs_little_more_than_a_row_alone(monkeypatch):
     plant, link = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.erasure(hg.perfect(), arrival=0.9)
     sensor, rule = hg.LinearSensor([[1.0]], 0.01), hg.SendOnDelta(0.6, heartbeat=240, losses="numbered")
     node = hg.Node(sensor, link, {"event": hg.event_filter(plant, sensor, link, rule)}, trigger=rule)
-    step = Lanes(hg.Network(plant, {"a": node})).step_rows
+    step = NetworkProgram(hg.Network(plant, {"a": node})).step_rows
     assert step.state.size > 10_000
     row = np.concatenate([step.start, np.full(node.received, np.nan), [0.0]])[None]
     alone, among = step(row, alone=True), step(row)  # compiled

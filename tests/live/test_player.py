@@ -6,7 +6,7 @@ import jax
 import pytest
 
 import heliograph as hg
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.simulation.side_by_side import StackedFilters
 from tests.live import worlds
 
@@ -31,5 +31,5 @@ def test_a_step_is_traced_once_for_its_outputs_its_code_and_its_text(monkeypatch
     monkeypatch.setattr(StackedFilters, "step", lambda filters, *data: calls.append(data) or step(filters, *data))
     plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5, states=["traced here alone"])
     item = hg.kalman_filter(plant, worlds.SENSOR)
-    made = Lanes(hg.Network(plant, {"a": hg.Node(worlds.SENSOR, hg.perfect(), {"f": item})})).step_rows
+    made = NetworkProgram(hg.Network(plant, {"a": hg.Node(worlds.SENSOR, hg.perfect(), {"f": item})})).step_rows
     assert made.program and len(calls) == 1

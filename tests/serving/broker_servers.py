@@ -14,8 +14,8 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.serving.brokers.nats import Nats
-from heliograph.serving.brokers.transport import Part, Transport, word
-from heliograph.serving.brokers.url import Address, address
+from heliograph.serving.brokers.transport import Part, Transport, encode_name
+from heliograph.serving.brokers.url import Address, parse_address
 from heliograph_studies.live.server import Server
 
 KINDS = [pytest.param(kind, marks=pytest.mark.real(part)) for kind, part in (("nats", "NATS"), ("mqtt", "MQTT"))]
@@ -30,7 +30,7 @@ def running(folder: Path) -> Iterator[Server]:
 
 
 def at(server: Server, kind: str, topic: str) -> Address:
-    return address(f"{kind}://127.0.0.1:{getattr(server, kind)}/{topic}", {})
+    return parse_address(f"{kind}://127.0.0.1:{getattr(server, kind)}/{topic}", {})
 
 
 async def received(transport: Transport, count: int, acknowledge: bool = True) -> list[bytes]:
@@ -57,7 +57,9 @@ async def sent(where: Address, bodies: list[bytes], plant: str = "a") -> None:
     client = await nats.connect(f"nats://{where.host}:{where.port}")
     stream = client.jetstream(timeout=60)
     try:
-        await asyncio.gather(*[await stream.publish_async(f"{where.topic}.in.{word(plant)}", body) for body in bodies])
+        await asyncio.gather(
+            *[await stream.publish_async(f"{where.topic}.in.{encode_name(plant)}", body) for body in bodies]
+        )
     finally:
         await client.close()
 

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.numerics.dates import horizons_in
-from heliograph.serving import Fleet, InMemoryStore, Lanes, Options, Service
+from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 from heliograph.serving.output import Estimates
 
 BEGUN = datetime(2026, 11, 25, 12, 0, 0, tzinfo=UTC)
@@ -22,7 +22,7 @@ def network():
 
 @pytest.fixture(scope="module")
 def lanes():
-    return Lanes(network())
+    return NetworkProgram(network())
 
 
 def service(lanes, forecast):

@@ -6,23 +6,25 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.serving.estimate_writer import HEAD, EstimateWriter, line
 from tests.losing import Losing
 from tests.serving.worlds import fleet, stepping
 
 
-def stepped() -> Lanes:
+def stepped() -> NetworkProgram:
     return fleet(stepping()).lanes
 
 
-def weighed() -> Lanes:
+def weighed() -> NetworkProgram:
     """A filter that weighs its two numbers, one that claims nothing, and names full of signs."""
     plant = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
     both, position = hg.LinearSensor(np.eye(2), 0.1), hg.LinearSensor([[1.0, 0.0]], 0.1)
     robust = hg.robust_filter(plant, both, hg.perfect(2), hg.filters.Gate(30.0))
     nodes = {'a "%d"': hg.Node(both, hg.perfect(2), {"100 %b": robust})}
-    return Lanes(hg.Network(plant, nodes | {"b": hg.Node(position, hg.perfect(), {"level": Losing(claim="none")})}))
+    return NetworkProgram(
+        hg.Network(plant, nodes | {"b": hg.Node(position, hg.perfect(), {"level": Losing(claim="none")})})
+    )
 
 
 @pytest.mark.parametrize("lanes", [stepped, pytest.param(weighed, marks=pytest.mark.slow)])
@@ -42,6 +44,6 @@ def test_a_line_from_the_template_is_that_of_its_row(lanes):
     written = writer.lines(b"final", rows, outputs)
     for (plant, moment), row, body in zip(rows, outputs.tolist(), written, strict=True):
         head = HEAD % (b"final", line(plant), line(moment))
-        assert body == head + line(writer._estimates(row)) + b"}"
+        assert body == head + line(writer._write_estimates(row)) + b"}"
         assert json.loads(body)["plant"] == plant
     assert writer.lines(b"final", [], outputs[:0]) == []

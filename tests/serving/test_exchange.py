@@ -16,11 +16,11 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.url import address
+from heliograph.serving.brokers.url import parse_address
 from heliograph.serving.message import Message
-from heliograph.serving.running import ServiceSettings, of_node
+from heliograph.serving.running import ServiceSettings, settings_of_node
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph.simulation.centres.node_filter import node_network
@@ -38,7 +38,7 @@ NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
 @cache
 def services(quantized: bool = False, step: float | None = None) -> dict[str, Fleet]:
     network = chain(link=LOSSY, quantizer=QUANTIZER if quantized else None)
-    return {name: Fleet(Lanes(node_network(network, name)), Options(step=step)) for name in "abc"}
+    return {name: Fleet(NetworkProgram(node_network(network, name)), Options(step=step)) for name in "abc"}
 
 
 def in_steps(node: str, k: int, values: list[float]) -> bytes | Message | str:
@@ -140,11 +140,13 @@ def test_each_node_reads_its_sensor_at_topics_of_others_and_a_node_without_one_c
         "garden/a": hg.files.json_field("t", node="a", time="at", scale=0.1, step=60.0),
         "garden/c": [hg.files.json_field("t", node="c", time="at", step=60.0)],
     }
-    settings = ServiceSettings(chain(link=LOSSY), Options(), sources=sources, broker=address("mqtt://hub/rooms", {}))
-    alone = {name: of_node(settings, name) for name in "abc"}
+    settings = ServiceSettings(
+        chain(link=LOSSY), Options(), sources=sources, broker=parse_address("mqtt://hub/rooms", {})
+    )
+    alone = {name: settings_of_node(settings, name) for name in "abc"}
     assert [sorted(item.sources or {}) for item in alone.values()] == [["garden/a"], [], ["garden/c"]]
     assert {item.options.step for item in alone.values()} == {60.0}
-    fleets = {name: Fleet(Lanes(item.network), item.options) for name, item in alone.items()}
+    fleets = {name: Fleet(NetworkProgram(item.network), item.options) for name, item in alone.items()}
     readers = {name: Translator(alone[name].sources, alone[name].network) for name in "ac"}
 
     def from_topic(node: str, k: int, values: list[float]) -> Message | str:
@@ -203,8 +205,10 @@ def test_a_node_named_by_a_topic_or_a_field_is_read_by_its_own_process_alone():
         "garden/+/t": hg.files.json_field("t", node=hg.files.Level(1), time="at", step=60.0),
         "house": hg.files.json_field("t", node=hg.files.Field("who", {"7": "c"}), time="at", step=60.0),
     }
-    settings = ServiceSettings(chain(link=LOSSY), Options(), sources=sources, broker=address("mqtt://hub/rooms", {}))
-    alone = {name: of_node(settings, name) for name in "abc"}
+    settings = ServiceSettings(
+        chain(link=LOSSY), Options(), sources=sources, broker=parse_address("mqtt://hub/rooms", {})
+    )
+    alone = {name: settings_of_node(settings, name) for name in "abc"}
     assert [sorted(item.sources or {}) for item in alone.values()] == [list(sources), [], list(sources)]
     for name, other in ("ac", "ca"):
         reads = Translator(alone[name].sources, alone[name].network, alone[name].others)
@@ -220,11 +224,11 @@ def test_a_node_named_by_a_topic_or_a_field_is_read_by_its_own_process_alone():
 def test_bad_input_no_node_no_broker():
     settings = ServiceSettings(chain(), Options())
     with pytest.raises(ValueError, match=r"--node: expected a broker between the nodes .* got none"):
-        of_node(settings, "a")
-    settings = replace(settings, broker=address("mqtt://hub/rooms", {}))
+        settings_of_node(settings, "a")
+    settings = replace(settings, broker=parse_address("mqtt://hub/rooms", {}))
     with pytest.raises(ValueError, match="node: expected one of fusion 'mesh': a, b, c, got 'd'"):
-        of_node(settings, "d")
-    assert str(of_node(settings, "b").broker) == "mqtt://hub:1883/rooms/b"
+        settings_of_node(settings, "d")
+    assert str(settings_of_node(settings, "b").broker) == "mqtt://hub:1883/rooms/b"
 
 
 class Process:

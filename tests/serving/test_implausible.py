@@ -75,9 +75,9 @@ def test_limits_hold_here_too_and_it_is_said_once():
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, {"f": item}, limits=(-5, 5), invalid=-999)})
     said = []
     from heliograph.live.fleet import Fleet, Options
-    from heliograph.live.lanes import Lanes
+    from heliograph.live.lanes import NetworkProgram
 
-    service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore(), said.append)
+    service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore(), said.append)
     sent = [{"node": "a", "sequence": k, "time": k, "values": [v]} for k, v in enumerate([0.3, -999, 6.0, 1e20, 0.4])]
     outputs = [json.loads(single.body) for single in service.take(lines(sent))]
     details = [single["detail"] for single in outputs if single["kind"] == "refused"]
@@ -98,9 +98,9 @@ def test_a_filter_that_alone_leaves_a_value_out_says_so():
     filters = {"lost": lost, "fine": hg.linear_filter(plant, SENSOR, HOP)}
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, filters)})
     from heliograph.live.fleet import Fleet, Options
-    from heliograph.live.lanes import Lanes
+    from heliograph.live.lanes import NetworkProgram
 
-    service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore())
     (known,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))
     result = json.loads(known.body)["estimates"]["a"]
     assert result["lost"]["mean"] == [0.0] and result["lost"]["nis"] is None and result["lost"]["received"] == 0

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 import heliograph as hg
-from heliograph.serving import Fleet, InMemoryStore, Lanes, Options, Service
+from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 
 PLANT, SENSOR = hg.LinearPlant([[1.0]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
 NOW = datetime.now(UTC)
@@ -16,7 +16,7 @@ NEVER, SOON = timedelta(days=20_000), timedelta(seconds=1)
 @pytest.fixture(scope="module")
 def lanes():
     node = hg.Node(SENSOR, hg.perfect(), {"k": hg.kalman_filter(PLANT, SENSOR)})
-    return Lanes(hg.Network(PLANT, {"a": node, "b": node}))
+    return NetworkProgram(hg.Network(PLANT, {"a": node, "b": node}))
 
 
 def taken(service, messages):

@@ -9,8 +9,8 @@ from pydantic_core import to_json
 
 from heliograph.live.plant import LinkCounts
 from heliograph.serving.output import Output
-from heliograph.serving.page import Door, door, shown
-from heliograph.serving.running_nis import used_nis
+from heliograph.serving.page import PageAddress, parse_page_address, shown
+from heliograph.serving.running_nis import read_nis
 from heliograph.serving.watch import Watch
 from tests.serving.test_page import TOKEN, got
 from tests.serving.watched import Scripted
@@ -23,14 +23,14 @@ def fleet(count, wrong=3, dead=5):
         status = {"last": 3, "silent": 9, "provisional": 0, "missed": 3, "chance": 1e-9, "dead": True}
         senders = {"<b>node": status} if i == dead else {}
         service = Scripted(16.0 if i == wrong else 1.0, f"p{i}", senders=senders)
-        watch.over(service).take([str(k).encode() for k in range(150)])
+        watch.wrap(service).take([str(k).encode() for k in range(150)])
         services.append(service)
     return watch, services
 
 
 def looked(watch, look, at=None):
     async def work():
-        async with shown(watch, at or Door("127.0.0.1", 0, None)) as port:
+        async with shown(watch, at or PageAddress("127.0.0.1", 0, None)) as port:
             await look(f"http://127.0.0.1:{port}")
 
     asyncio.run(work())
@@ -99,18 +99,22 @@ def test_health_is_said_to_everybody_and_metrics_are_there_while_a_batch_is_long
             status, text, _ = await got(f"{url}/healthz")
             assert status == 503 and "a batch has been taken for" in text
 
-    looked(watch, look, Door("127.0.0.1", 0, TOKEN))
+    looked(watch, look, PageAddress("127.0.0.1", 0, TOKEN))
 
 
 def test_a_token_holds_wherever_it_is_set_and_hosts_are_a_setting():
     environment = {"HELIOGRAPH_PAGE_TOKEN": TOKEN}
-    assert door("8000", environment).token == door("localhost:8000", environment).token == TOKEN
+    assert (
+        parse_page_address("8000", environment).token
+        == parse_page_address("localhost:8000", environment).token
+        == TOKEN
+    )
     with pytest.raises(ValueError, match="a token of 16 characters at least in HELIOGRAPH_PAGE_TOKEN, got one of 5"):
-        door("8000", {"HELIOGRAPH_PAGE_TOKEN": "short"})
+        parse_page_address("8000", {"HELIOGRAPH_PAGE_TOKEN": "short"})
     for wrong in ("http://a", "a:80", "", "a b"):
         with pytest.raises(ValueError, match="a name without scheme and port"):
-            door("8000", {}, [wrong])
-    at = door("0", {}, ["pages.example.org"])
+            parse_page_address("8000", {}, [wrong])
+    at = parse_page_address("0", {}, ["pages.example.org"])
 
     async def look(url):
         assert (await got(url, Host="pages.example.org"))[0] == (await got(url, Host="localhost:80"))[0] == 200
@@ -132,4 +136,4 @@ def test_what_a_gate_left_out_does_not_count_against_it():
         watch.note([Output(k, "p", "final", body)], None)
     assert watch.tests("p")["a", "gate"].doubt() is None and not watch.worst()
     none = {"nis": 100.0, "received": 1, "outputs": {"value": [10.0], "variance": [1.0], "weight": [0.0]}}
-    assert used_nis(none) == (None, 0) and used_nis({"nis": 2.0, "received": 2}) == (2.0, 2)
+    assert read_nis(none) == (None, 0) and read_nis({"nis": 2.0, "received": 2}) == (2.0, 2)

@@ -9,9 +9,9 @@ import time
 
 import pytest
 
-from heliograph.serving.patience import Patient, patiently
+from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
-from heliograph.serving.storage.owner import name_of_process, owned
+from heliograph.serving.storage.owner import name_of_process, own_store
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import AwayError, identity
 from tests.postgres import Postgres
@@ -19,8 +19,8 @@ from tests.serving.worlds import fleet, lines, messages, stepping
 
 HOLDS = """
 import sys, time
-from heliograph.serving.storage.owner import owned
-with owned(sys.argv[1], ""):
+from heliograph.serving.storage.owner import own_store
+with own_store(sys.argv[1], ""):
     print("mine", flush=True)
     time.sleep(60)
 """
@@ -32,16 +32,16 @@ def held_elsewhere(location):
     try:
         assert other.stdout.readline() == "mine\n"
         said = rf"one that no other service has, got that of .* {other.pid}\b.*--store"
-        with pytest.raises(ValueError, match=said), owned(location, ""):
+        with pytest.raises(ValueError, match=said), own_store(location, ""):
             pass
-        with owned(location, "named"):  # shares it by its name
+        with own_store(location, "named"):  # shares it by its name
             pass
     finally:
         other.kill()
         other.communicate()
     for _ in range(100):
         try:
-            with owned(location, ""):
+            with own_store(location, ""):
                 return
         except ValueError:  # a server notices a moment later
             time.sleep(0.05)
@@ -52,7 +52,7 @@ def held_elsewhere(location):
 def test_a_file_has_one_owner_who_is_named(tmp_path):
     location = str(tmp_path / "a.db")
     held_elsewhere(location)
-    with owned(location, ""):
+    with own_store(location, ""):
         assert name_of_process() in (tmp_path / "a.db.lock").read_text()
 
 
@@ -81,12 +81,12 @@ class Away:
 def test_a_store_that_is_away_is_waited_for(monkeypatch, caplog):
     monkeypatch.setattr("heliograph.serving.patience.FIRST", 0.01)
     service, stop = Away(2), asyncio.Event()
-    patient = Patient(service, stop)
+    patient = WaitingService(service, stop)
     assert patient.take(["a"]) == ["told late", "a"] and patient.take(["b"]) == ["b"]
     assert service.taken == [["a"], ["b"]] and caplog.text.count("trying again") == 2
     stop.set()  # then it ends with the line
     with pytest.raises(AwayError, match="a server that answers"):
-        Patient(Away(1), stop).finish(False)
+        WaitingService(Away(1), stop).finish(False)
 
 
 @pytest.mark.real("PostgreSQL")
@@ -104,7 +104,7 @@ def test_a_server_that_is_gone_for_a_while_loses_and_doubles_nothing(tmp_path, m
     expected = [output.body for begin in range(0, len(sent), 5) for output in alone.take(sent[begin : begin + 5])]
     with Postgres() as server:
         store = Store(server.database(), mine)
-        service = Patient(Service(fleet(network), store), asyncio.Event())
+        service = WaitingService(Service(fleet(network), store), asyncio.Event())
         for begin in range(0, len(sent), 5):
             if begin == 10:
                 server.stop()
@@ -115,5 +115,5 @@ def test_a_server_that_is_gone_for_a_while_loses_and_doubles_nothing(tmp_path, m
     with pytest.raises(AwayError, match="a server that answers"):
         stop = asyncio.Event()
         stop.set()
-        patiently(lambda: Store("postgresql://me@/none?host=/nowhere", mine), stop)
+        retry_while_away(lambda: Store("postgresql://me@/none?host=/nowhere", mine), stop)
     assert all(json.loads(body) for body in results)

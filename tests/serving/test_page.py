@@ -17,7 +17,7 @@ import heliograph as hg
 pytest.importorskip("uvicorn")
 from heliograph.files.sources import Sources
 from heliograph.live.plant import LinkCounts
-from heliograph.serving.page import Door, Tallies, door, shown
+from heliograph.serving.page import PageAddress, Tallies, parse_page_address, shown
 from heliograph.serving.running_nis import RunningNis
 from heliograph.serving.watch import Watch, watch_of
 from tests.serving.watched import Scripted
@@ -39,7 +39,7 @@ def looked(
     watch.over(service).take([str(i).encode() for i in range(rows)])
 
     async def work() -> None:
-        async with shown(watch, Door("127.0.0.1", 0, token)) as port:
+        async with shown(watch, PageAddress("127.0.0.1", 0, token)) as port:
             await look(f"http://127.0.0.1:{port}")
 
     asyncio.run(work())
@@ -91,14 +91,17 @@ def test_an_honest_filter_stays_in_its_band_and_a_wrong_one_does_not():
 
 
 def test_a_door_that_others_reach_needs_a_token():
-    assert door("8000", {}) == Door("127.0.0.1", 8000, None) and door("[::1]:80", {}).token is None
-    assert door("0.0.0.0:8000", {"HELIOGRAPH_PAGE_TOKEN": TOKEN}) == Door("0.0.0.0", 8000, TOKEN)
+    assert (
+        parse_page_address("8000", {}) == PageAddress("127.0.0.1", 8000, None)
+        and parse_page_address("[::1]:80", {}).token is None
+    )
+    assert parse_page_address("0.0.0.0:8000", {"HELIOGRAPH_PAGE_TOKEN": TOKEN}) == PageAddress("0.0.0.0", 8000, TOKEN)
     for place in ("0.0.0.0:8000", "[::]:8000", "example.org:80"):
         with pytest.raises(ValueError, match="a token of 16 characters"):
-            door(place, {"HELIOGRAPH_PAGE_TOKEN": "short"})
+            parse_page_address(place, {"HELIOGRAPH_PAGE_TOKEN": "short"})
     for place in ("http://a", "a:b", "", "70000"):
         with pytest.raises(ValueError, match="a port, or address:port"):
-            door(place, {})
+            parse_page_address(place, {})
 
 
 def test_the_page_shows_what_was_said_and_brings_all_it_needs():

@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.serving.output import Estimates
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
@@ -21,7 +21,7 @@ def test_a_silent_sender_is_reported_and_one_that_misses_its_heartbeat_is_dead()
     item = hg.event_filter(PLANT, SENSOR, LINK, trigger)
     deciding, plain = hg.Node(SENSOR, LINK, {"f": item}, trigger=trigger), {"f": hg.kalman_filter(PLANT, SENSOR)}
     network = hg.Network(PLANT, {"a": deciding, "b": hg.Node(SENSOR, LINK, plain)})
-    service = Service(Fleet(Lanes(network), Options(window=2.0)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(network), Options(window=2.0)), InMemoryStore())
 
     def status(node, time):
         message = {"plant": "p", "node": node, "sequence": time, "time": time, "values": [0.2]}
@@ -46,7 +46,7 @@ def test_dates_are_steps_and_a_sender_that_falls_silent_is_dead_once_the_clock_s
     trigger = hg.SendOnDelta(0.6, heartbeat=5)
     item = hg.event_filter(PLANT, SENSOR, LINK, trigger)
     network = hg.Network(PLANT, {"a": hg.Node(SENSOR, LINK, {"f": item}, trigger=trigger)})
-    service = Service(Fleet(Lanes(network), Options(window=2.0, step=0.5)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(network), Options(window=2.0, step=0.5)), InMemoryStore())
     begun = datetime(2026, 11, 25, 12, 0, 0, tzinfo=UTC)
 
     def taken(payloads):

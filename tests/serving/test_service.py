@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.live.plant import LinkCounts
 from heliograph.serving.output import AnyOutput
 from heliograph.serving.page import Tallies
@@ -62,7 +62,7 @@ def test_an_output_claims_nothing_where_covariances_are_no_numbers_and_refuses_w
     )  # fmt: skip
     for network, values, expected in cases:
         sent = [{"node": "a", "sequence": k, "time": k, "values": [z]} for k, z in enumerate(values)]
-        service = Service(Fleet(Lanes(network), Options(WINDOW)), InMemoryStore())
+        service = Service(Fleet(NetworkProgram(network), Options(WINDOW)), InMemoryStore())
         outputs = [json.loads(item.body) for item in [*service.take(lines(sent)), *service.finish(ended=True)]]
         claims = {item["time"]: item["estimates"]["a"]["f"]["claim"] for item in outputs if item["kind"] == "final"}
         assert claims == expected
@@ -189,7 +189,7 @@ def test_robust_and_adaptive_filters_say_what_they_made_of_each_number():
     z[::4, 0] += 15.0
     z[5, 1] = np.nan
     watch = watch_of(network, "tank")
-    service = watch.over(Service(Fleet(Lanes(network), Options(WINDOW)), InMemoryStore()))
+    service = watch.wrap(Service(Fleet(NetworkProgram(network), Options(WINDOW)), InMemoryStore()))
     values = [[None if np.isnan(x) else x for x in row] for row in z.tolist()]
     sent = [{"node": "radio", "sequence": k, "time": k, "values": row} for k, row in enumerate(values)]
     outputs = service.take(lines(sent))

@@ -19,7 +19,7 @@ import nats
 from sqlalchemy import Engine, update
 
 import heliograph
-from heliograph.serving.brokers.transport import word
+from heliograph.serving.brokers.transport import encode_name
 from heliograph.serving.service import Service
 from heliograph.serving.storage import leases
 from heliograph.serving.storage.database import engine_at
@@ -106,11 +106,11 @@ def test_three_processes_of_which_one_is_killed_tell_what_one_would(server: Serv
         stream = client.jetstream(timeout=60)
         await until(lambda: owners(tmp_path) == {"one": 2, "two": 2, "three": 2})
         for message in result[: len(result) // 2]:
-            await stream.publish(f"fleet.in.{word(str(message['plant']))}", json.dumps(message).encode())
+            await stream.publish(f"fleet.in.{encode_name(str(message['plant']))}", json.dumps(message).encode())
         await until_stopped(client, count // 4)
         processes[0].process.kill()
         for message in result[len(result) // 2 :]:
-            await stream.publish(f"fleet.in.{word(str(message['plant']))}", json.dumps(message).encode())
+            await stream.publish(f"fleet.in.{encode_name(str(message['plant']))}", json.dumps(message).encode())
         await until_stopped(client, count)
         known = finals(await everything(client))
         await client.close()

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import heliograph as hg
-from heliograph.live.stored.plant_codec import plant_bytes, plant_from
-from heliograph.serving import Fleet, Lanes, Options, Service
+from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
+from heliograph.serving import Fleet, NetworkProgram, Options, Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
 
@@ -31,7 +31,7 @@ def lanes():
     plant, sensor = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
     trigger = hg.SendOnDelta(0.6, heartbeat=600)
     filters = {"event": hg.event_filter(plant, sensor, hg.perfect(), trigger, known=1, lost=1)}
-    return Lanes(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), filters, trigger=trigger)}))
+    return NetworkProgram(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), filters, trigger=trigger)}))
 
 
 @pytest.fixture
@@ -102,8 +102,8 @@ def test_four_thermometers_that_only_say_that_they_live_write_less_than_ten_mega
     # The state is that of a value that came: of 600 ages one has a probability.
     (row, *_) = service.plants["p0"].rows.held
     numbers = service.fleet.pool.table[row.slot]
-    assert len(plant_bytes(service.plants["p0"], service.fleet)) < numbers.nbytes / 4
-    restored = plant_from("p0", plant_bytes(service.plants["p0"], service.fleet), service.fleet)
+    assert len(pack_plant(service.plants["p0"], service.fleet)) < numbers.nbytes / 4
+    restored = unpack_plant("p0", pack_plant(service.plants["p0"], service.fleet), service.fleet)
     (again, *_) = restored.rows.held
     assert service.fleet.pool.table[again.slot].tobytes() == numbers.tobytes()
 

@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
 HOP = hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), 0.05)
@@ -37,8 +37,8 @@ def fleet(network: hg.Network, window: float = WINDOW, **options: float) -> Flee
 
 
 @cache
-def _lanes(which: int) -> Lanes:
-    return Lanes(next(network for network in (moving(), stepping()) if id(network) == which))
+def _lanes(which: int) -> NetworkProgram:
+    return NetworkProgram(next(network for network in (moving(), stepping()) if id(network) == which))
 
 
 def messages(plants: int, count: int, seed: int, whole: bool, longest: float = 3.0) -> list[dict[str, object]]:

@@ -57,10 +57,10 @@ def _topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
     with progress(2) as advance:
         if "://" in recording:
             from heliograph.serving.brokers.listening import listen
-            from heliograph.serving.brokers.url import address
+            from heliograph.serving.brokers.url import parse_address
 
             advance(f"listening for {seconds:g} s")
-            return listen(address(recording), seconds), ""
+            return listen(parse_address(recording), seconds), ""
         path = Path(recording)
         if path.is_file() and kind_of(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")

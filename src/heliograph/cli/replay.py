@@ -41,7 +41,7 @@ def replay(
     from time import monotonic, sleep
 
     from heliograph.numerics.check import TINY, check_seed, fail, scalar
-    from heliograph.serving.brokers.replay import Link, along, lines, through
+    from heliograph.serving.brokers.replay import Link, delay_as_traced, encode_messages, simulate_link
 
     # Check the options; a trace replaces the model of a link.
     if speed is not None:
@@ -53,8 +53,8 @@ def replay(
     # Events of each plant of the recording, and those that arrive through the link.
     sent = []
     for i, (name, events, origin) in enumerate(_read_events(recording, network, strict)):
-        received = through(events, link, seed + i) if trace is None else along(events, trace)
-        sent.append(lines(received, name if plant is None else plant, origin))
+        received = simulate_link(events, link, seed + i) if trace is None else delay_as_traced(events, trace)
+        sent.append(encode_messages(received, name if plant is None else plant, origin))
     # Wait for each arrival on the clock, speeded up.
     begun, first = monotonic(), None
     try:

@@ -61,10 +61,10 @@ class ServeOptions:
         from heliograph.files.network_file import load_module
         from heliograph.live.fleet import Options
         from heliograph.numerics.dates import horizons_in
-        from heliograph.serving.brokers.url import address
-        from heliograph.serving.running import ServiceSettings, name_of, of_node, store_of
+        from heliograph.serving.brokers.url import parse_address
+        from heliograph.serving.running import ServiceSettings, name_of, settings_of_node, store_of
 
-        broker = None if self.broker is None else address(self.broker)
+        broker = None if self.broker is None else parse_address(self.broker)
         options = Options(self.window, self.ahead, self.leap)
         store = store_of(reference, self.store, self.parts, self.node)
         network, module = load_module(reference)
@@ -85,7 +85,7 @@ class ServeOptions:
             every=self.every,
             forecast=horizons_in(self.forecast) if self.forecast else None,
         )
-        return settings if self.node is None else of_node(settings, self.node)
+        return settings if self.node is None else settings_of_node(settings, self.node)
 
 
 def serve(network: str | None = None, /, *, options: ServeOptions | None = None) -> None:

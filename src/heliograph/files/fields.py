@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from heliograph.live.event import whole
+from heliograph.live.event import check_63_bits
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.dates import UNITS, dates, instant
 
@@ -187,7 +187,7 @@ def count(value: Any, name: str, quoted: bool = False) -> int:
         value = parse_number(value)
     if isinstance(value, float) and value.is_integer():
         value = int(value)
-    return whole(name, value)
+    return check_63_bits(name, value)
 
 
 def name_of(value: Any, name: str) -> str:

@@ -12,7 +12,7 @@ from heliograph.files.fields import name_of
 from heliograph.files.message_files import FileMessage, parquet_names
 from heliograph.files.sources import Reading
 from heliograph.files.table import csv_header, kind_of
-from heliograph.live.event import INPUTS, OF_STEPS, whole
+from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.dates import looks_like_date, moment_of
@@ -185,10 +185,10 @@ def _items(cell: Any) -> list[Any]:
 def _whole(cell: Any, name: str) -> int:
     """Return a count with every digit; a float is accepted if it is an exact integer."""
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
-        return whole(name, int(cell))
+        return check_63_bits(name, int(cell))
     if not isinstance(cell, int):
         _number(cell, name)
-    return whole(name, cell)
+    return check_63_bits(name, cell)
 
 
 def _number(cell: Any, name: str, empty: bool = False, text: bool = False) -> float:

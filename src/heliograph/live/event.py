@@ -51,7 +51,7 @@ class Known(NamedTuple):
         return self.node_index, self.sequence, self.time
 
 
-def whole(name: str, value: object) -> int:
+def check_63_bits(name: str, value: object) -> int:
     """Check a count: an integer from 0 of 63 bits."""
     if not is_whole(value) or not 0 <= int(value) < 2**63:
         raise fail(name, WHOLE, show_value(value))

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.plant import PlantState, Withdrawn
-from heliograph.live.pool import Pool, legs_of, rounds_of
+from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.model.over_time import steps_covered
@@ -65,8 +65,8 @@ class Fleet:
         alone: single rows are stepped, not those of many plants at once.
     """
 
-    def __init__(self, lanes: Lanes, options: Options, alone: bool = False):
-        instance("lanes", lanes, Lanes, "Lanes")
+    def __init__(self, lanes: NetworkProgram, options: Options, alone: bool = False):
+        instance("lanes", lanes, NetworkProgram, "NetworkProgram")
         instance("options", options, Options, "Options")
         network = self.network = lanes.network
         self.options, self.lanes = _check_options(options), lanes
@@ -244,7 +244,7 @@ class Fleet:
         """Advance the time of a plant by a clock; a leap that contradicts it is withdrawn."""
         leap, most = plant.leap, self.options.leap
         if leap is not None and (found := find_leap(leap, plant.now, now, most)) is not None and found[0].now > -inf:
-            plant.take_back(found[0], most, self._names)
+            plant.undo_leap(found[0], most, self._names)
         elif leap is not None and now >= leap.time - most:
             plant.leap = None
         plant.now = max(plant.now, now)
@@ -258,7 +258,7 @@ class Fleet:
         """Step what is due, and let what is older than the window, or all, become final."""
         plants = list(touched)
         self.step(plants)
-        withdrawn, window, leap = [plant.withdraw() for plant in plants], self.options.window, self.options.leap
+        withdrawn, window, leap = [plant.take_withdrawn() for plant in plants], self.options.window, self.options.leap
         ends = [plant.finalise(plant.now + np.inf if all_ else plant.confirmed - window, leap) for plant in plants]
         return [Finalised(plant, final, plant.rows.held[-1], left + slots, events)
                 for plant, (final, left), (events, slots) in zip(plants, ends, withdrawn, strict=True)]  # fmt: skip
@@ -273,10 +273,10 @@ class Fleet:
 
     def _run(self, chains: Sequence[list[HeldRow]]) -> None:
         """Step along chains of rows, whose numbers stand in the table, from the first of each."""
-        walks = [legs_of(chain, self.lanes.dt is None, self.end_step == np.inf) for chain in chains]
+        walks = [cut_into_legs(chain, self.lanes.dt is None, self.end_step == np.inf) for chain in chains]
         # All chains up to their first long gap at once, over these one by one, and so on.
         while walks:
-            for steps in rounds_of(legs[0].steps for legs in walks):
+            for steps in group_by_turn(legs[0].steps for legs in walks):
                 self.pool.step(*map(np.array, zip(*steps, strict=True)))
             for legs in walks:
                 if len(legs) > 1:

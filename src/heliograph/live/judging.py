@@ -33,14 +33,16 @@ class Judges:
 
     def __init__(self, fleet: Fleet):
         self.fleet, places = fleet, fleet.lanes.places
-        central = _columns([output for output in places if output.node == Network.FUSED])
-        self._columns, self._central = {}, set[int]()  # nodes without a filter of their own
+        central = _judgement_columns([output for output in places if output.node == Network.FUSED])
+        self._judgement_columns, self._central = {}, set[int]()  # nodes without a filter of their own
         for index, name in enumerate(fleet.network.names):
-            of_node = _columns([output for output in places if output.node == name and _listens(fleet, output)])
-            self._columns[index] = of_node if len(of_node) else central
+            of_node = _judgement_columns(
+                [output for output in places if output.node == name and _has_sender(fleet, output)]
+            )
+            self._judgement_columns[index] = of_node if len(of_node) else central
             if not len(of_node):
                 self._central.add(index)
-        self._every = _columns(places)
+        self._every = _judgement_columns(places)
         self._faults: dict[tuple[str, str], tuple[int, str]] = {}  # by node and filter: how often tried, what was found
 
     def implausible_inputs(
@@ -73,23 +75,29 @@ class Judges:
         for i in np.flatnonzero(flagged).tolist():
             (_, plant, event, _), outputs = taken[i], pool.table[slots[i], pool.outputs]
             if event.node_index >= 0:
-                why = Judgement.why_values(outputs[self._columns[event.node_index]]) if _size(event) >= 0 else None
+                why = (
+                    Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
+                    if _largest_number(event) >= 0
+                    else None
+                )
             elif why := self.why_inputs(outputs):
                 first = spoilt.setdefault(plant.name, i)
                 spoilt[plant.name] = min(first, i, key=lambda j: taken[j][-1].key)
             if why:
                 reasons[i] = why
-        self._blame(taken, reasons)
+        self._pick_blamed(taken, reasons)
         # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
             _, _, event, row = taken[i]
             node_of_row = row.slot, event.node_index
-            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _size(taken[j][2]))
+            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _largest_number(taken[j][2]))
         first_of_plant = {i: why for i, why in reasons.items() if spoilt.get(taken[i][1].name, i) == i}
-        return {i: why + self._fault(taken[i]) for i, why in first_of_plant.items() if i in largest.values()}
+        return {
+            i: why + self._name_faulty_function(taken[i]) for i, why in first_of_plant.items() if i in largest.values()
+        }
 
-    def _fault(self, candidate: Candidate) -> str:
+    def _name_faulty_function(self, candidate: Candidate) -> str:
         """Name the function of a filter that returned no number in a row, after a semicolon; "" where none did.
 
         What was found of a filter is said again, and none is tried more than TRIES times: a plant may send for ever.
@@ -121,7 +129,7 @@ class Judges:
                 return f"; {said}"
         return ""
 
-    def _blame(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
+    def _pick_blamed(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
         """Leave of the events of several nodes in one row, which a central filter judged together, the one to blame.
 
         That is the first, from the largest on, without which the row is plausible; the largest if there is none.
@@ -133,7 +141,7 @@ class Judges:
         for those in rows.values():
             if len({taken[i][2].node_index for i in those}) > 1:
                 one = Judgement.find_culprit(
-                    those, lambda i: _size(taken[i][2]), lambda i: self._plausible_without(taken[i])
+                    those, lambda i: _largest_number(taken[i][2]), lambda i: self._plausible_without(taken[i])
                 )
                 for i in those:
                     if i != one:
@@ -148,17 +156,20 @@ class Judges:
         at = rows.places[event.node_index]
         there.numbers[at] = [nan] * (at.stop - at.start)
         self.fleet.step_row(rows.held[rows.index(row.key) - 1], there)
-        plausible = Judgement.why_values(pool.table[there.slot, pool.outputs][self._columns[event.node_index]]) is None
+        plausible = (
+            Judgement.why_values(pool.table[there.slot, pool.outputs][self._judgement_columns[event.node_index]])
+            is None
+        )
         pool.give([there.slot])
         return plausible
 
 
-def _size(event: Known) -> float:
+def _largest_number(event: Known) -> float:
     """Return the largest absolute number of an event, -1 if it has none."""
     return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 
 
-def _columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
+def _judgement_columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
     """Return the columns of the judgements of these filters, of shape (filter, part)."""
     results = [list(output.judgement) for output in outputs if output.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
@@ -197,6 +208,7 @@ def filter_of(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:
     return fleet.network.nodes[output.node].filters.get(output.filter)
 
 
-def _listens(fleet: Fleet, output: FilterColumns) -> bool:
+def _has_sender(fleet: Fleet, output: FilterColumns) -> bool:
+    """Test whether the filter of these columns knows a sender that decides when to send."""
     filter = fleet.network.nodes[output.node].filters.get(output.filter)  # a fusion between neighbours is none
     return filter is not None and bool(filter.received)

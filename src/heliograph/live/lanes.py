@@ -44,7 +44,7 @@ def time_input(network: Network) -> int | None:
     return network.inputs.index(TIME_STEP)
 
 
-def uneven(plant: AbstractPlant, dt: int) -> str:
+def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
     """Explain how a plant's prediction over an interval differs from that over its parts; "" if it does not.
 
     f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
@@ -92,7 +92,7 @@ def _integrate_parts(
     return moved
 
 
-class Lanes:
+class NetworkProgram:
     """A network's step on rows, `step_rows`, one for each plant; plants come and go without compilation.
 
     `places` gives the columns of each filter's estimate and judgement among its outputs.
@@ -112,7 +112,7 @@ class Lanes:
         self.network, self.claims, self.dt = network, network.claims(), time_input(network)
         if not any(self.claims.values()):
             raise fail("network", "at least one filter to run", "none")
-        self.uneven = "" if self.dt is None else uneven(first(network.plant), self.dt)
+        self.uneven = "" if self.dt is None else explain_unevenness(first(network.plant), self.dt)
         # Sizes of a row: measurements of all nodes, and inputs other than dt.
         self.received = sum(node.received for node in network.nodes.values())
         self.given = len(network.inputs) - (self.dt is not None)
@@ -134,4 +134,4 @@ class Lanes:
         return network_identity(self.network, self.step_rows.program, {})
 
 
-shared_lanes = share_by_object(Lanes)  # of a network, made at the first call
+shared_lanes = share_by_object(NetworkProgram)  # of a network, made at the first call

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.factors.columns import unit_lower
-from heliograph.live.stored.layout import LOWER, VARIANCES, factors, parts_of
+from heliograph.live.stored.layout import LOWER, VARIANCES, factorise, split_by_path
 from heliograph.numerics.types import Float, PyTree
 
 Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row state"]]
@@ -31,7 +31,7 @@ class Factors(NamedTuple):
 
 def factors_in(places: PyTree) -> list[Factors]:
     """Return the places of all factors in a row, from the tree of a state whose leaves are their own places."""
-    parts = {path: part.astype(int) for path, part in parts_of(places).items()}
+    parts = {path: part.astype(int) for path, part in split_by_path(places).items()}
     stems = [path.removesuffix(VARIANCES) for path in parts if path.endswith(VARIANCES)]
     return [Factors(parts[stem + LOWER], parts[stem + VARIANCES]) for stem in stems if stem + LOWER in parts]
 
@@ -60,7 +60,7 @@ def convert_to_factors(
         below = np.tril_indices(n, -1)
         covariance[..., *below] = covariance[..., *below[::-1]] = rows[:, lower]
         covariance[..., np.arange(n), np.arange(n)] = rows[:, variances]
-        rows[:, lower], rows[:, variances] = factors(covariance)
+        rows[:, lower], rows[:, variances] = factorise(covariance)
     return rows
 
 
@@ -84,13 +84,14 @@ def states_after(step: Step, start: Float[np.ndarray, " state"], state: Float[np
         count: number of steps, at least 0.
         places: of the factors of covariances in a state.
     """
-    after = _states_after(step, state, at, count, places)
+    after = _pass_silent_steps(step, state, at, count, places)
     return after if np.isfinite(after[np.isfinite(state)]).all() else start
 
 
-def _states_after(
+def _pass_silent_steps(
     step: Step, state: Float[np.ndarray, " state"], at: int, count: int, places: Sequence[Factors]
 ) -> Float[np.ndarray, " state"]:
+    """Take a few probes of real steps; where they end at rest or follow an affine map, jump, else extrapolate them."""
     passed = [state]
 
     def seen(states: Sequence[Float[np.ndarray, " state"]]) -> Sequence[Float[np.ndarray, " state"]]:
@@ -100,21 +101,21 @@ def _states_after(
         return convert_to_covariances(step(convert_to_factors(states, places), k), places)
 
     for i in range(min(PROBES, count // PROBED)):
-        passed.append(_walk(step, passed[-1], at + i * PROBED, PROBED))
-        if not (moving := _moving(*seen(passed[-2:]))).any():
+        passed.append(_step_through(step, passed[-1], at + i * PROBED, PROBED))
+        if not (moving := _find_moving(*seen(passed[-2:]))).any():
             return passed[-1]
         if i & (i + 1) == 0:  # after 1, 2, 4, ... probes
-            jumped = _jump(by_covariances, seen(passed[-2:]), moving, at + i * PROBED, count - i * PROBED)
+            jumped = _jump_by_affine_map(by_covariances, seen(passed[-2:]), moving, at + i * PROBED, count - i * PROBED)
             if jumped is not None:
-                return _alone(jumped, places)
+                return _restore_factors(jumped, places)
     done = PROBED * (len(passed) - 1)
     if count - done < PROBED:
-        return _walk(step, passed[-1], at + done, count - done)
-    return _alone(_extrapolate(seen(passed), count - done), places)
+        return _step_through(step, passed[-1], at + done, count - done)
+    return _restore_factors(_extrapolate(seen(passed), count - done), places)
 
 
-def _alone(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Float[np.ndarray, " state"]:
-    """Return one state by factors of one by covariances."""
+def _restore_factors(state: Float[np.ndarray, " state"], places: Sequence[Factors]) -> Float[np.ndarray, " state"]:
+    """Return one state with factors in the places of covariances."""
     alone: Float[np.ndarray, " state"] = convert_to_factors(state[None], places)[0]
     return alone
 
@@ -125,14 +126,14 @@ def _extrapolate(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> F
     end, middle, begin = (passed[-1 - i * quarter] for i in range(3))
     with np.errstate(invalid="ignore"):
         now, before = end - middle, middle - begin
-        steady = np.isfinite(end) & (np.abs(now - before) <= STEADY * np.abs(before)) & _moving(middle, end)
+        steady = np.isfinite(end) & (np.abs(now - before) <= STEADY * np.abs(before)) & _find_moving(middle, end)
     moved = end.copy()
     moved[steady] += now[steady] * (count / (quarter * PROBED))
     return moved
 
 
-def _walk(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -> Float[np.ndarray, " state"]:
-    """Take steps one by one."""
+def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -> Float[np.ndarray, " state"]:
+    """Take `count` steps one by one."""
     states = state[None]
     for k in range(at + 1, at + count + 1):
         states = step(states, k)
@@ -140,7 +141,7 @@ def _walk(step: Step, state: Float[np.ndarray, " state"], at: int, count: int) -
     return walked
 
 
-def _moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:
+def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:
     """Mask of the numbers that changed by more than rounding."""
     with np.errstate(invalid="ignore"):
         close = np.abs(after - before) <= SETTLED * np.maximum(np.abs(before), np.abs(after))
@@ -148,7 +149,7 @@ def _moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " stat
     return moving
 
 
-def _jump(step: Step, probe: Sequence[Float[np.ndarray, " state"]], moving: np.ndarray,
+def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]], moving: np.ndarray,
             at: int, count: int) -> Float[np.ndarray, " state"] | None:  # fmt: skip
     """Return the state `count` steps after the begin of a probe by the affine map there; None if the step is none."""
     state, probed = probe
@@ -168,18 +169,20 @@ def _jump(step: Step, probe: Sequence[Float[np.ndarray, " state"]], moving: np.n
     matrix = np.round(matrix / units / LEAST) * LEAST * units
     # It has to predict the probe.
     with np.errstate(over="ignore", invalid="ignore"):
-        expected = _power(matrix, moved, PROBED)
+        expected = _iterate_affine_map(matrix, moved, PROBED)
         scale = np.abs(probed - state)[columns] + AGREES * np.abs(state)[columns]
         if not (
             np.abs(expected - (probed - state)[columns]) <= AGREES * scale + SETTLED * np.abs(probed)[columns]
         ).all():
             return None
         jumped = state.copy()
-        jumped[columns] += _power(matrix, moved, count)
+        jumped[columns] += _iterate_affine_map(matrix, moved, count)
     return jumped
 
 
-def _power(matrix: Float[np.ndarray, "m m"], moved: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " m"]:
+def _iterate_affine_map(
+    matrix: Float[np.ndarray, "m m"], moved: Float[np.ndarray, " m"], count: int
+) -> Float[np.ndarray, " m"]:
     """Return d after `count` steps d' = A d + c from d = 0, by squaring the map."""
     total = np.zeros_like(moved)
     while count:

@@ -92,7 +92,7 @@ class LinkCounts:
             return self.newest + ahead if ahead <= GAP else sequence
         return self.newest - behind if behind <= min(GAP, self.newest) else sequence
 
-    def withdraw(self, count: int, before: Moments | None) -> None:
+    def take_withdrawn(self, count: int, before: Moments | None) -> None:
         """Count messages of a wrong clock, which were used, as ones from the future; `before`: the moments before."""
         self.at, self.latest = before or (0.0, -1.0)
         self.used, self.future = max(self.used - count, 0), self.future + count
@@ -110,21 +110,21 @@ class Withdrawn(NamedTuple):
 Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
 
 
-class Kept(NamedTuple):
-    """The newest row before a leap, and the newest arrival before it."""
+class BeforeLeap(NamedTuple):
+    """The newest row before a leap in time, and the newest arrival before it."""
 
     row: HeldRow
     now: float
 
 
-class Aside(NamedTuple):
+class RowsOfLeap(NamedTuple):
     """Rows that a leap took with it: what was held and kept before, after how many changes, and what goes.
 
     `rows` are those that go of which no estimate is final.
     """
 
     held: list[HeldRow]
-    kept: Kept | None
+    kept: BeforeLeap | None
     changes: int
     gone: list[HeldRow]
     rows: list[HeldRow]
@@ -161,8 +161,8 @@ class PlantState:
     changes: list[Change] = field(default_factory=list)
     leap: Leap | None = None
     silence: HeldRow | None = None
-    kept: Kept | None = None
-    aside: list[Aside] = field(default_factory=list)
+    kept: BeforeLeap | None = None
+    aside: list[RowsOfLeap] = field(default_factory=list)
 
     @property
     def confirmed(self) -> float:
@@ -194,7 +194,7 @@ class PlantState:
             return
         leap, newest = found
         if sure or leap.taken_back_by(clock, time, newest):
-            self.take_back(leap, most, names)
+            self.undo_leap(leap, most, names)
         elif clock == leap.clock:
             self.leap = self.leap.with_back(leap, time)
 
@@ -231,8 +231,8 @@ class PlantState:
             return leap  # which another node is there to confirm
         return leap.as_believed()
 
-    def take_back(self, leap: Leap, most: float, names: Sequence[str]) -> bool:
-        """Go back to before a leap: its rows go with the next finalisation, and time is what it was.
+    def undo_leap(self, leap: Leap, most: float, names: Sequence[str]) -> bool:
+        """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
 
         Returns False, and changes nothing, if the row before it is not known any more.
         """
@@ -245,8 +245,8 @@ class PlantState:
             for node, _, _ in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
-            self.link(name).withdraw(count, leap.moments.get(name))
-        self.aside.append(Aside(held, self.kept, len(self.changes), held[cut:], rows))
+            self.link(name).take_withdrawn(count, leap.moments.get(name))
+        self.aside.append(RowsOfLeap(held, self.kept, len(self.changes), held[cut:], rows))
         self.rows.hold([self.kept.row] if cut == 0 and self.kept is not None else held[:cut])
         self.kept = self.kept if cut else None
         self.dirty = None if self.dirty is None or self.dirty >= len(self.rows.held) else self.dirty
@@ -257,7 +257,7 @@ class PlantState:
         """Return whether a row from before a leap is held after which a time comes."""
         return self.rows.first_from(leap.time - most) > 0 and time > self.rows.keys[0][0]
 
-    def withdraw(self) -> tuple[list[Withdrawn], list[int]]:
+    def take_withdrawn(self) -> tuple[list[Withdrawn], list[int]]:
         """Return the events of leaps that were taken back since the last call, and the slots of their rows."""
         aside, self.aside = self.aside, []
         events = [Withdrawn(*name) for one in aside for row in one.rows for name in row.events]
@@ -343,7 +343,7 @@ class PlantState:
         if leap is not None and self.kept is None and left:
             before = [row for row in left if row.key[0] < leap.time - most]
             if before and self.rows.held[0].key[0] >= leap.time - most:
-                self.kept = Kept(before[-1], leap.now)
+                self.kept = BeforeLeap(before[-1], leap.now)
                 left = [row for row in left if row is not before[-1]]
         return final, [row.slot for row in left]
 

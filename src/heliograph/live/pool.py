@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.live.long_gap import LONG, TAIL, factors_in, states_after
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
@@ -23,7 +23,7 @@ class Pool:
     last three, as in the rows of a timeline. `alone`: single rows are stepped, not many at once.
     """
 
-    def __init__(self, lanes: Lanes, alone: bool = False):
+    def __init__(self, lanes: NetworkProgram, alone: bool = False):
         self.lanes, self.step_rows, self._alone = lanes, lanes.step_rows, alone
         sizes = self.step_rows.state.size, self.step_rows.outputs.size
         ends = np.cumsum([*sizes, lanes.given, 1, lanes.received + lanes.given + 1])
@@ -139,7 +139,7 @@ class Leg(NamedTuple):
     jump: int = 0
 
 
-def legs_of(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[Leg]:
+def cut_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[Leg]:
     """Cut the steps of a chain where a gap is too long to step through one by one.
 
     Args:
@@ -161,7 +161,7 @@ def legs_of(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[Leg]:
     return legs
 
 
-def rounds_of(walks: Iterable[list[Single]]) -> list[list[Single]]:
+def group_by_turn(walks: Iterable[list[Single]]) -> list[list[Single]]:
     """Group the steps of all chains by turn, so that each group has at most one step of each chain."""
     rounds: list[list[Single]] = []
     for steps in walks:

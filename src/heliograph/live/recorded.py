@@ -61,7 +61,7 @@ def play(
         raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
     timeline = Timeline(network, window, start, ahead, capacity)
     # Order of arrival; without an arrival time an event arrives when it is measured.
-    coming = sorted(events, key=_arrival) if isinstance(events, Sequence) else events
+    coming = sorted(events, key=_arrival_of) if isinstance(events, Sequence) else events
     finals: list[Record] = []
     lagged: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
     waiting: list[float] = []  # moments of which the lag has not passed
@@ -78,7 +78,7 @@ def play(
     # Final estimates are collected before the timeline would drop any.
     count = 0
     for count, event in enumerate(coming, 1):
-        look(_arrival(event))
+        look(_arrival_of(event))
         if timeline.push(*event) == "used" and event.node != INPUTS and timeline.now <= event.time + (lag or 0.0):
             heappush(waiting, event.time)
         if count % timeline.capacity == 0:
@@ -89,15 +89,17 @@ def play(
     # The rest becomes final.
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
-    late = None if lag is None else _record(network, lagged)
+    late = None if lag is None else _make_record(network, lagged)
     return Played(_join_records(finals), late, timeline.counts, timeline.forced)
 
 
-def _arrival(event: Event) -> float:
+def _arrival_of(event: Event) -> float:
+    """Return when an event arrived."""
     return event.time if event.arrival is None else event.arrival
 
 
 def _join_records(parts: Sequence[Record]) -> Record:
+    """Join records one after another in time."""
     estimates = {
         node: {
             name: _stack_estimates([record.estimates[node][name] for record in parts], np.concatenate)
@@ -108,7 +110,8 @@ def _join_records(parts: Sequence[Record]) -> Record:
     return Record(np.concatenate([record.time for record in parts]), parts[0].states, None, {}, estimates)
 
 
-def _record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
+def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
+    """Make a record of estimates by node and filter at one time after another."""
     results = [estimates for _, estimates in parts]
     estimates = {
         node: {
@@ -121,5 +124,6 @@ def _record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[
 
 
 def _stack_estimates(parts: Sequence[Estimate], how: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
+    """Join estimates of several times by `how`, `np.stack` or `np.concatenate`, with the weakest of their claims."""
     mean, covariance = (how([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
     return Estimate(mean, covariance, parts[0].claim)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.model.estimate import Estimate, lower_unsound_claim
 from heliograph.model.origin import Origin
 
@@ -24,7 +24,7 @@ def row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
     return Origin(lanes.network, state, int(row[pool.at.start]) + 1, inputs, time, spacing, estimates)
 
 
-def estimates_by_name(lanes: Lanes, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+def estimates_by_name(lanes: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
     """Arrange the outputs of a row, or of rows, by node and filter."""
     n = len(lanes.network.states)
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in lanes.claims}

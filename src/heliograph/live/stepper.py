@@ -106,7 +106,7 @@ def _judge_step(
 
 
 @lru_cache
-def by_xla(static: Static) -> Any:
+def compile_xla_step(static: Static) -> Any:
     """Compile (numbers, state, z, u, k) to (judgement, whether to refuse, leaves of the state, of the estimate)."""
 
     def step(*data: PyTree) -> PyTree:
@@ -115,7 +115,7 @@ def by_xla(static: Static) -> Any:
     return jax.jit(step, compiler_options=understood())
 
 
-def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
+def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
     """Compile native code with arguments (numbers, state, z, u, k), flattened; None if XLA has to step the filter."""
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))

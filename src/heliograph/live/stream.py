@@ -11,8 +11,8 @@ from scipy.stats import chi2
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
-from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
-from heliograph.live.stored.layout import describe_old_layout, fits, parts_of, relocate_parts
+from heliograph.live.stepper import NativeStepper, XlaStepper, compile_native_step, compile_xla_step
+from heliograph.live.stored.layout import can_read, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim
@@ -93,10 +93,10 @@ class Stream:
         """
         placed, k, stepper = self._placed, self.steps, self._stepper
         # Arrays of doubles of the right size pass at once; everything else is checked and converted.
-        z, outside = _row(measurement, placed.received), None
+        z, outside = _as_doubles(measurement, placed.received), None
         if z is None or self.limits is not None:
             z = np.asarray(self.filter.check_measurement(measurement))
-        u = _row(inputs, placed.given)
+        u = _as_doubles(inputs, placed.given)
         if u is None:
             u = np.asarray(self.filter.check_input(inputs))
         if self.limits is not None:
@@ -115,7 +115,7 @@ class Stream:
             self.dropped += outside
         nis, arrived = stepper.judgement[:2].tolist()
         if arrived and nis == nis:
-            self._judge(nis > placed.rare[int(arrived)])
+            self._count_unexpected(nis > placed.rare[int(arrived)])
         if self._angles.states:
             for _, line in self._angles.said_of(np.diagonal(stepper.estimate[1])[None]):
                 warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
@@ -129,7 +129,7 @@ class Stream:
         time, spacing = float(self.steps - 1), float("nan") if "dt" in self.filter.inputs else 1.0
         return Origin(self.filter, state, self.steps, np.array(self._inputs), time, spacing)
 
-    def _judge(self, beyond: bool) -> None:
+    def _count_unexpected(self, beyond: bool) -> None:
         """Count measurements in a row that were not expected, and warn once of many."""
         self._beyond = self._beyond + 1 if beyond else 0
         if self._beyond == BEYOND:
@@ -147,14 +147,18 @@ class Stream:
             without = Judgement.why_inputs(stepper.judgement[None])
             stepper.put(state)
             if not without:
-                raise fail(f"inputs of step {self.steps}", "plausible ones", f"{u.tolist()}: {why}{self._fault(u)}")
+                raise fail(
+                    f"inputs of step {self.steps}",
+                    "plausible ones",
+                    f"{u.tolist()}: {why}{self._name_faulty_function(u)}",
+                )
         if reason > 0:
-            why = Judgement.describe(reason, distance) + self._fault(u)
+            why = Judgement.describe(reason, distance) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         stepper.step(z, u, self.steps)  # anew, if inputs were tried without
         stepper.accept()
 
-    def _fault(self, u: np.ndarray) -> str:
+    def _name_faulty_function(self, u: np.ndarray) -> str:
         """Name the function of the filter's model that returned no number, after a semicolon; "" where none did."""
         before = self.filter.estimate(self._placed.state.unflatten(self._stepper.state))
         fault = function_fault(self.filter, before, u, self.steps)
@@ -219,7 +223,7 @@ class Stream:
         paths = head.get("paths", list(describe_old_layout(layout)))
         leaves = [arrays[f"state.{i}"] for i in range(sum(name.startswith("state.") for name in arrays))]
         old = dict(zip(paths, leaves, strict=False))
-        if len(paths) != len(leaves) or not fits({path: leaf.shape for path, leaf in old.items()}, layout):
+        if len(paths) != len(leaves) or not can_read({path: leaf.shape for path, leaf in old.items()}, layout):
             expected = f"a state with the parts of {other['filter']} as it is here: {', '.join(layout)}"
             raise fail("snapshot", expected, ", ".join(f"{path} {list(leaf.shape)}" for path, leaf in old.items()))
         new._stepper.put(list(relocate_parts(old, layout).values()))
@@ -255,7 +259,7 @@ def _sender_of(filter: AbstractFilter) -> _Sender | None:
     return _Sender(world.trigger, world.channel, len(first(world.sensor).outputs))
 
 
-def _row(value: object, length: int) -> np.ndarray | None:
+def _as_doubles(value: object, length: int) -> np.ndarray | None:
     """Return an array or list as `length` doubles; None for anything else, which needs a slower check."""
     if type(value) is not np.ndarray and (type(value) is not list or any(part is np.ma.masked for part in value)):
         return None
@@ -280,16 +284,16 @@ class _Placed:
             self.numbers, self._static = cast(filter)
             self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
         self.state: PyTree = jax.tree.structure(self._start)
-        self.layout = {path: part.shape for path, part in parts_of(self._start).items()}
+        self.layout = {path: part.shape for path, part in split_by_path(self._start).items()}
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
         self.estimate: PyTree = jax.tree.structure(JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, 0.0, 0))
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def stepper(self) -> NativeStepper | XlaStepper:
         """Return a stepper at the prior."""
-        code = natively(self._static, self.numbers, self._start, self._data)
+        code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:
-            return XlaStepper(by_xla(self._static), self.numbers, self._start)
+            return XlaStepper(compile_xla_step(self._static), self.numbers, self._start)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self._start)]
         return NativeStepper(code, [np.asarray(leaf) for leaf in self.numbers], leaves)
 
@@ -297,7 +301,7 @@ class _Placed:
     def identity(self) -> Identity:
         """Return versions, names, numbers and a hash of the step's program, whichever engine runs it."""
         with jax.enable_x64(True):
-            text = text_of(by_xla(self._static).trace(self.numbers, self._start, *self._data).jaxpr)
+            text = text_of(compile_xla_step(self._static).trace(self.numbers, self._start, *self._data).jaxpr)
         filter = self.filter
         return {
             **versions(),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
+from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, moment, numbers
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import FleetAngles, Judges
 from heliograph.live.lanes import shared_lanes
@@ -17,8 +17,8 @@ from heliograph.live.plant import LinkCounts
 from heliograph.live.row_origin import estimates_by_name, row_origin
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.senders import SenderStatus
-from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, description
-from heliograph.live.stored.plant_codec import plant_bytes, plant_from
+from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, describe_network
+from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same, pack, unpack
 from heliograph.model.estimate import Estimate, JudgedEstimate
 from heliograph.model.origin import Origin
@@ -113,7 +113,7 @@ class Timeline:
 
     def __getstate__(self) -> dict[str, object]:
         """Return the whole state, in double precision; compiled programs are left out."""
-        head, arrays = self._state()
+        head, arrays = self._pack_state()
         return {"network": self.network, "saved": pack(head, arrays)}
 
     def __setstate__(self, stored: dict[str, Any]) -> None:
@@ -162,7 +162,7 @@ class Timeline:
         verdict = self._fleet.take(plant, event, arrival is not None)
         if verdict == "used":
             nothing = dropped and np.isnan(event.values).all()
-            why = beyond if nothing else self._refuses(event, plant.changes[-1][0])
+            why = beyond if nothing else self._why_implausible(event, plant.changes[-1][0])
             if why is not None:
                 # As if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
@@ -178,7 +178,7 @@ class Timeline:
             link.dropped += dropped
         return verdict
 
-    def _refuses(self, event: Known, row: HeldRow) -> str | None:
+    def _why_implausible(self, event: Known, row: HeldRow) -> str | None:
         """Step what an event changed; return why it is implausible, None if it is not.
 
         Inputs are also judged over one unit of time after them.
@@ -201,7 +201,7 @@ class Timeline:
 
         Each says what its filter made of what arrived at `now`: `nis`, `received` and `refused` of `JudgedEstimate`.
         """
-        return self._arrange_judgements(self._outputs(self._slot_now()[0]))
+        return self._arrange_judgements(self._outputs_after(self._slot_now()[0]))
 
     @property
     def origin(self) -> Origin:
@@ -228,7 +228,7 @@ class Timeline:
             raise fail("senders", "a node with a trigger", list(self.network.names))
         return self._fleet.senders(self._plant)
 
-    def _outputs(self, slots: int | list[int]) -> np.ndarray:
+    def _outputs_after(self, slots: int | list[int]) -> np.ndarray:
         """Return the outputs after the row in a slot, or after several."""
         pool = self._fleet.pool
         return pool.table[slots, pool.outputs].copy()
@@ -261,18 +261,19 @@ class Timeline:
 
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
-        head, arrays = self._state()
-        return pack(head | {"of": self._lanes.identity, DESCRIPTION: self._description}, arrays)
+        head, arrays = self._pack_state()
+        return pack(head | {"of": self._lanes.identity, DESCRIPTION: self._describe_network}, arrays)
 
     @cached_property
-    def _description(self) -> str:
-        return description(self._fleet)
+    def _describe_network(self) -> str:
+        """Describe the network's numbers and columns, for a later version or network that carries the state on."""
+        return describe_network(self._fleet)
 
-    def _state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
+    def _pack_state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
         """Return the whole state: options, the plant, and what is final."""
         time, outputs = self._finals.take()
         self._finals.add(time, outputs)
-        plant = np.frombuffer(plant_bytes(self._plant, self._fleet), np.uint8)
+        plant = np.frombuffer(pack_plant(self._plant, self._fleet), np.uint8)
         arrays = {"plant": plant, "final.time": time, "final": outputs}
         return {"options": [self.window, self.ahead, self.capacity]}, arrays
 
@@ -303,11 +304,11 @@ class Timeline:
         """Return the bytes of a plant that another network or version saved, as this one would."""
         window, ahead, capacity = head["options"]
         fleet = Fleet(shared_lanes(network), Options(window, ahead, capacity=capacity), alone=True)
-        mine, other = fleet.lanes.identity | {DESCRIPTION: description(fleet)}, head["of"]
+        mine, other = fleet.lanes.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
         # A version before 0.3.0 did not write where states stand: it is known for the same nodes and filters.
         if DESCRIPTION not in head:
             check_same("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
-        there = other | {DESCRIPTION: head.get(DESCRIPTION) or description(fleet, covariances=True)}
+        there = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
         carrier = Carrier(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
         carrier.begin("snapshot", there)
         try:
@@ -323,7 +324,7 @@ class Timeline:
             warnings.simplefilter("ignore")
             new = cls(network, window, ahead=ahead, capacity=capacity)
         new._fleet.end(new._plant)
-        new._plant = plant_from("", arrays["plant"].tobytes(), new._fleet)
+        new._plant = unpack_plant("", arrays["plant"].tobytes(), new._fleet)
         new._finals.add(arrays["final.time"], arrays["final"])
         return new
 
@@ -338,14 +339,14 @@ class Timeline:
         came = max(self._plant.confirmed, at) if arrival is None else moment(f"{name}, arrival", arrival)
         given = numbers(name, values, size, self._fleet.values_of(node))
         known = self._fleet.with_losses(node, given.tolist())
-        return Known(index, whole(f"{name}, sequence", sequence), at, known, came)
+        return Known(index, check_63_bits(f"{name}, sequence", sequence), at, known, came)
 
     def _finalise(self) -> None:
         """Move the base up to the watermark, and read the outputs of the rows that are final by it."""
         results = self._fleet.finalise([self._plant])
         read = [row for row in results[0].final if row.has_data()]
         if read:
-            self._finals.add(np.array([row.key[0] for row in read]), self._outputs([row.slot for row in read]))
+            self._finals.add(np.array([row.key[0] for row in read]), self._outputs_after([row.slot for row in read]))
         self._fleet.forget(results)
 
     def _arrange_judgements(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:

@@ -2,7 +2,7 @@
 
 from .service import (
     Fleet as Fleet,
-    Lanes as Lanes,
+    NetworkProgram as NetworkProgram,
     Options as Options,
     Service as Service,
 )
@@ -26,21 +26,21 @@ from .storage.store import (
     Store as Store,
 )
 from .running import (
-    connected as connected,
+    make_transport as make_transport,
 )
 from .brokers.transport import (
     Batch as Batch,
     Transport as Transport,
     Part as Part,
     part_of as part_of,
-    word as word,
+    encode_name as encode_name,
 )
 from .brokers.pipe import (
     Pipe as Pipe,
 )
 from .brokers.url import (
     Address as Address,
-    address as address,
+    parse_address as parse_address,
 )
 from .loop import (
     keep_running as keep_running,
@@ -52,7 +52,7 @@ from .brokers.contract import (
 )
 from .brokers.replay import (
     Link as Link,
-    lines as lines,
+    encode_messages as encode_messages,
     recorded as recorded,
-    through as through,
+    simulate_link as simulate_link,
 )

@@ -17,13 +17,13 @@ SECOND = np.timedelta64(1, "s")
 
 
 @dataclass(frozen=True)
-class Start:
+class ForecastStart:
     """A row as `heliograph.forecast` takes it."""
 
     origin: Origin
 
 
-class Ahead:
+class ForecastPublisher:
     """Forecasts of a fleet's plants at fixed horizons, with inputs held.
 
     Args:
@@ -61,7 +61,7 @@ class Ahead:
     def forecasts(self, row: HeldRow) -> list[tuple[float, dict[str, dict[str, object]]]]:
         """Return the time of each horizon behind a row, and what each filter says; nothing behind the last step."""
         now = float(row.key[0])
-        start = Start(row_origin(self._fleet, row.slot, now))
+        start = ForecastStart(row_origin(self._fleet, row.slot, now))
         if not self._continuous and start.origin.step + max(self.horizons) - 1 > self._fleet.end_step:
             return []
         found = heliograph.forecast(start, self.horizons, inputs="held")
@@ -69,13 +69,13 @@ class Ahead:
         return [
             (
                 now + distance,
-                {node: {name: _body(f, i) for name, f in filters.items()} for node, filters in found.items()},
+                {node: {name: _write_forecast(f, i) for name, f in filters.items()} for node, filters in found.items()},
             )
             for i, distance in enumerate(self.horizons)
         ]
 
 
-def _body(forecast: "heliograph.forecasting.Forecast", i: int) -> dict[str, object]:
+def _write_forecast(forecast: "heliograph.forecasting.Forecast", i: int) -> dict[str, object]:
     """What one filter says of one horizon, as it is published."""
     states, outputs = forecast.states, forecast.outputs
     body: dict[str, object] = {

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.numerics.types import Float
 from heliograph.simulation.rows.columns import FilterColumns
 
@@ -29,7 +29,7 @@ class EstimateWriter:
     the line of a row that holds column numbers. Any other row is written filter by filter.
     """
 
-    def __init__(self, lanes: Lanes):
+    def __init__(self, lanes: NetworkProgram):
         self._n, n = len(lanes.network.states), len(lanes.network.states)
         self._nodes: dict[str, list[FilterColumns]] = {}
         for columns in lanes.places:
@@ -44,7 +44,7 @@ class EstimateWriter:
         # The template, the columns that fill it, and which of these are whole numbers.
         numbered = FIRST + np.arange(float(lanes.step_rows.outputs.size))
         numbered[self._reasons] = 0.0
-        written = line(self._estimates(numbered.tolist()))
+        written = line(self._write_estimates(numbered.tolist()))
         filled = COLUMN.findall(written)
         form = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", written.replace(b"%", b"%%"))
         self._template = HEAD + form + b"}"
@@ -60,25 +60,27 @@ class EstimateWriter:
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
         # All numbers as texts, those of one row after those of another.
-        width, numbers = len(self._order), _texts(outputs[:, self._order].ravel().tolist())
+        width, numbers = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
         columns: list[Sequence[bytes | int]] = [numbers[i::width] for i in range(width)]
         for i in self._whole:
             columns[i] = outputs[:, self._order[i]].astype(int).tolist()
         names = {plant: line(plant) for plant in {plant for plant, _ in rows}}
-        head = [kind] * len(rows), [names[plant] for plant, _ in rows], _texts([moment for _, moment in rows])
+        head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
         lines = [*map(self._template.__mod__, zip(*head, *columns, strict=True))]
         for i in np.flatnonzero(~fits).tolist():
-            estimates = self._estimates(outputs[i].tolist())
+            estimates = self._write_estimates(outputs[i].tolist())
             lines[i] = HEAD % tuple(column[i] for column in head) + line(estimates) + b"}"
         return lines
 
-    def _estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
+    def _write_estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
+        """All filters' estimates after a row, by node and filter."""
         return {
-            node: {columns.filter: self._filter(columns, outputs) for columns in places}
+            node: {columns.filter: self._write_filter(columns, outputs) for columns in places}
             for node, places in self._nodes.items()
         }
 
-    def _filter(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
+    def _write_filter(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
+        """One filter's estimate, what it made of what arrived, and its claim, as the parts of a JSON object."""
         n, mean, begin, judged = self._n, columns.mean, columns.covariance, columns.judgement
         # Estimate, without a claim where it is no number.
         covariance = None if columns.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
@@ -101,6 +103,6 @@ class EstimateWriter:
         return results | {"nis": outputs[judged.distance], "received": int(outputs[judged.arrived])}
 
 
-def _texts(numbers: Sequence[float | str]) -> list[bytes]:
+def _write_numbers(numbers: Sequence[float | str]) -> list[bytes]:
     """Return numbers, and texts without a comma, as JSON has them."""
     return line(numbers)[1:-1].split(b",")

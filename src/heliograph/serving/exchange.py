@@ -40,9 +40,11 @@ class Exchange:
         """Return the messages that the events taken since the last finalisation make due, after their steps."""
         if self._node is None:
             return []
-        return [output for plant in plants for row in self._due(plant) for output in self._send_row(plant, row)]
+        return [
+            output for plant in plants for row in self._find_due_rows(plant) for output in self._send_row(plant, row)
+        ]
 
-    def _due(self, plant: PlantState) -> list[HeldRow]:
+    def _find_due_rows(self, plant: PlantState) -> list[HeldRow]:
         """Return rows that are whole now and were not before: measured, or with a row after them."""
         assert self._node is not None
         before: dict[int, bool] = {}  # of each row with changes whether it was measured; of new ones none
@@ -64,6 +66,7 @@ class Exchange:
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
     def _send_row(self, plant: PlantState, row: HeldRow) -> list[Output]:
+        """The message of a row to each receiver: the estimate before the step, its covariance, and the measurement."""
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])

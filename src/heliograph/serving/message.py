@@ -108,11 +108,11 @@ def read_messages(payloads: Sequence[Payload]) -> list[Read]:
                 raise msgspec.DecodeError
             results.append(_FAST.decode(payload))
         except (msgspec.DecodeError, UnicodeDecodeError):
-            results.append(_read(payload))
+            results.append(_read_or_explain(payload))
     return results
 
 
-def _read(payload: bytes) -> Message | UnreadMessage | str:
+def _read_or_explain(payload: bytes) -> Message | UnreadMessage | str:
     """Parse a message, or return in words why it cannot be read, with what names it if it has that."""
     try:
         return read_message(payload)
@@ -145,12 +145,12 @@ def read_message(payload: bytes) -> Message:
         field = str(first["loc"][0]) if first["loc"] else ""
         if field not in EXPECTED:  # no JSON object, or one with a field more
             fields = f"a JSON object with no fields but {', '.join(EXPECTED)}"
-            raise fail("message", fields, show_value(field) if field else _what(payload)) from None
+            raise fail("message", fields, show_value(field) if field else _describe_payload(payload)) from None
         came = "no such field" if first["type"] == "missing" else show_value(first["input"])
         raise fail(f"message, {field}", EXPECTED[field], came) from None
 
 
-def _what(payload: bytes) -> str:
+def _describe_payload(payload: bytes) -> str:
     """Return what came in place of a JSON object."""
     try:
         return f"{show_value(json.loads(payload))}, which is no object"

@@ -41,7 +41,7 @@ class Wrong(NamedTuple):
         return len(self.dead), max((doubt.size for doubt in self.doubts), default=0.0), bool(self.refused)
 
     @property
-    def said(self) -> list[str]:
+    def describe(self) -> list[str]:
         """Return it in words, a line each."""
         lines = [f"{node}: its sender is dead" for node in self.dead]
         lines += [f"{d.node}/{d.filter}: squared innovations {d.ratio:.2g} times what its covariance says "
@@ -70,7 +70,7 @@ class Overview:
         for plant in self.touched:
             doubts = tuple(doubts_of(tests.get(plant, {})))
             wrong = Wrong(plant, tuple(dead.get(plant, ())), doubts, refused.get(plant, ""))
-            if wrong.said:
+            if wrong.describe:
                 self._wrong[plant] = wrong
             else:
                 self._wrong.pop(plant, None)
@@ -116,7 +116,7 @@ that were refused.{more}</p></header>
 def page_of(title: str, plants: Collection[str], wrong: Sequence[Wrong], most: int) -> str:
     """Return the page of all plants, at most so many rows."""
     named = {item.plant for item in wrong}
-    rows = [(item.plant, "<br>".join(escape(said) for said in item.said), "doubt") for item in wrong]
+    rows = [(item.plant, "<br>".join(escape(line) for line in item.describe), "doubt") for item in wrong]
     rows += [(plant, "nothing", "fine") for plant in sorted(plants) if plant not in named]
     lines = [
         f'<tr><th scope="row"><a href="./?plant={quote(plant, safe="")}">{escape(plant) or "(no name)"}</a></th>'

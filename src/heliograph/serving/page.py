@@ -41,12 +41,12 @@ class Tallies(Collector):
 
     def collect(self) -> Iterable[Metric]:
         """Yield the current metrics."""
-        yield from _links(self.watch)
-        yield from _nis(self.watch)
-        yield from _outputs(self.watch)
+        yield from _collect_links(self.watch)
+        yield from _collect_nis(self.watch)
+        yield from _collect_outputs(self.watch)
         yield from _yield_plant_metrics(self.watch)
         yield _count_doubted_fused(self.watch)
-        yield _dead(self.watch)
+        yield _collect_dead_senders(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
         malformed = sum(service.malformed for service in self.watch.services)
         yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
@@ -82,7 +82,8 @@ def _yield_plant_metrics(watch: Watch) -> Iterable[Metric]:
     return wrong, *families, dead
 
 
-def _links(watch: Watch) -> Iterable[Metric]:
+def _collect_links(watch: Watch) -> Iterable[Metric]:
+    """Metrics of the nodes' messages: by verdict, lost, and values beyond limits."""
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
     what = "Values beyond a node's limits, or codes, which count as not arrived."
@@ -96,7 +97,8 @@ def _links(watch: Watch) -> Iterable[Metric]:
     return messages, lost, dropped
 
 
-def _dead(watch: Watch) -> Metric:
+def _collect_dead_senders(watch: Watch) -> Metric:
+    """Metric of the dead senders, by node."""
     what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance."
     dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
     for node, count in watch.dead_senders().items():
@@ -112,7 +114,8 @@ def _count_doubted_fused(watch: Watch) -> Metric:
     return doubted
 
 
-def _nis(watch: Watch) -> Iterable[Metric]:
+def _collect_nis(watch: Watch) -> Iterable[Metric]:
+    """Metrics of each filter's NIS over its expectation, with the band in which it should be."""
     labels = ["node", "filter"]
     ratio = GaugeMetricFamily(
         "heliograph_nis", "Normalised innovation squared over its expectation, of the last rows; 1.", labels=labels
@@ -125,7 +128,8 @@ def _nis(watch: Watch) -> Iterable[Metric]:
     return ratio, low, high
 
 
-def _outputs(watch: Watch) -> Iterable[Metric]:
+def _collect_outputs(watch: Watch) -> Iterable[Metric]:
+    """Metrics of each output of filters that weigh: weight, share down-weighted, bias and size of its innovations."""
     what = {
         "weight": "Mean weight of an output's values, of the last rows of a filter that weighs; 1 counts in full.",
         "share": "Share of an output's values that were down-weighted, below a weight of 1/2.",
@@ -170,7 +174,7 @@ POLICY = {
 }
 
 
-class Door(NamedTuple):
+class PageAddress(NamedTuple):
     """Address of the page, the token that is required there, and the names by which it is asked for.
 
     Without a token only this machine can reach it. `hosts`: names besides those of this machine, such as a proxy's.
@@ -182,7 +186,9 @@ class Door(NamedTuple):
     hosts: tuple[str, ...] = ()
 
 
-def door(address: str, environment: Mapping[str, str] | None = None, hosts: Sequence[str] = ()) -> Door:
+def parse_page_address(
+    address: str, environment: Mapping[str, str] | None = None, hosts: Sequence[str] = ()
+) -> PageAddress:
     """`PORT`, of this machine alone, or `ADDRESS:PORT`; a token in HELIOGRAPH_PAGE_TOKEN holds at either.
 
     Args:
@@ -203,10 +209,10 @@ def door(address: str, environment: Mapping[str, str] | None = None, hosts: Sequ
             raise fail("page, host", "a name without scheme and port, such as pages.example.org", repr(name))
     token = (os.environ if environment is None else environment).get(TOKEN, "")
     if _is_loopback(host) and not token:
-        return Door(host, int(port), None, tuple(hosts))
+        return PageAddress(host, int(port), None, tuple(hosts))
     if len(token) < 16:
         raise fail(f"page at {host}", f"a token of 16 characters at least in {TOKEN}", f"one of {len(token)}")
-    return Door(host, int(port), token, tuple(hosts))
+    return PageAddress(host, int(port), token, tuple(hosts))
 
 
 def _is_loopback(host: str) -> bool:
@@ -228,7 +234,7 @@ def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: 
         first = json.dumps(watch.view(request.query_params.get("plant"))).replace(
             "<", "\\u003c"
         )  # no name ends the element that it stands in
-        return Response(_text("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
+        return Response(_read_page_file("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 
     def metrics(_: Request) -> Response:
         return Response(tallies.text(), media_type=CONTENT_TYPE_LATEST)
@@ -249,7 +255,7 @@ def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: 
         return PlainTextResponse("ok")
 
     # The token is checked for every other route.
-    middleware = [Middleware(Guarded, token)]
+    middleware = [Middleware(TokenMiddleware, token)]
     if token is None or hosts:  # a page of elsewhere that names itself 127.0.0.1 does not get in
         allowed = [*LOOPBACK, *hosts]
         middleware.insert(0, Middleware(TrustedHostMiddleware, allowed_hosts=allowed, www_redirect=False))
@@ -258,14 +264,15 @@ def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: 
     return Starlette(routes=[*routes, *(Route(f"/{name}", file) for name in KINDS)], middleware=middleware)
 
 
-def _text(name: str) -> str:
+def _read_page_file(name: str) -> str:
+    """Return a file of the page as text."""
     return (files("heliograph.serving") / "browser" / name).read_text("utf-8")
 
 
 def file(request: Request) -> Response:
     """Serve a file of the page."""
     name = request.url.path.removeprefix("/")
-    return Response(_text(name), media_type=KINDS[name], headers=POLICY)
+    return Response(_read_page_file(name), media_type=KINDS[name], headers=POLICY)
 
 
 async def _events(watch: Watch, request: Request, stopped: asyncio.Event) -> AsyncIterator[str]:
@@ -281,7 +288,7 @@ async def _events(watch: Watch, request: Request, stopped: asyncio.Event) -> Asy
             await asyncio.wait_for(stopped.wait(), EVERY)
 
 
-class Guarded:
+class TokenMiddleware:
     """Middleware that requires the token: as `Authorization: Bearer`, or once as ?token=, then kept as a cookie."""
 
     def __init__(self, app: ASGIApp, token: str | None):
@@ -292,20 +299,24 @@ class Guarded:
             await self.app(scope, receive, send)
             return
         requested = HTTPConnection(scope)
-        if self._is(requested.query_params.get("token", "")):
+        if self._matches_token(requested.query_params.get("token", "")):
             answer: Response = RedirectResponse("/", 303)
             answer.set_cookie("heliograph", self.token, httponly=True, samesite="strict")
             await answer(scope, receive, send)
-        elif self._is(requested.cookies.get("heliograph", "")) or self._is(_bearer(requested)):
+        elif self._matches_token(requested.cookies.get("heliograph", "")) or self._matches_token(
+            _read_bearer_token(requested)
+        ):
             await self.app(scope, receive, send)
         else:
             await PlainTextResponse("a token is needed: ?token=", 401)(scope, receive, send)
 
-    def _is(self, given: str) -> bool:
+    def _matches_token(self, given: str) -> bool:
+        """Test whether what was given is the token, in a time that says nothing of where it differs."""
         return hmac.compare_digest(given.encode(), str(self.token).encode())
 
 
-def _bearer(requested: HTTPConnection) -> str:
+def _read_bearer_token(requested: HTTPConnection) -> str:
+    """Return the token of the header `Authorization: Bearer`, or ""."""
     kind, _, token = requested.headers.get("authorization", "").partition(" ")
     return token if kind.lower() == "bearer" else ""
 
@@ -320,14 +331,14 @@ class _Page(uvicorn.Server):
 
 
 @asynccontextmanager
-async def shown(watch: Watch, at: Door) -> AsyncIterator[int]:
+async def shown(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
     """Serve the page for the duration of a block, which receives its port.
 
     Raises:
         ValueError: an address that is taken, or not this machine's.
     """
     try:
-        listener = socket.create_server((at.host, at.port), family=_family(at.host))
+        listener = socket.create_server((at.host, at.port), family=_address_family(at.host))
     except OSError as error:
         why = str(error.strerror).split(" (")[0]  # without the address again
         raise fail("page", "a free port of this machine", f"{at.host}:{at.port}, {why}") from None
@@ -348,5 +359,6 @@ async def shown(watch: Watch, at: Door) -> AsyncIterator[int]:
         await serving
 
 
-def _family(host: str) -> socket.AddressFamily:
+def _address_family(host: str) -> socket.AddressFamily:
+    """Return the family of sockets for a host: IPv6 where its address has a colon."""
     return socket.AF_INET6 if ":" in host else socket.AF_INET

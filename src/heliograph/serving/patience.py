@@ -16,7 +16,7 @@ T = TypeVar("T")
 LOOK = 0.1  # seconds between looks at whether to stop
 
 
-def patiently(act: Callable[[], T], stop: asyncio.Event) -> T:
+def retry_while_away(act: Callable[[], T], stop: asyncio.Event) -> T:
     """Do something with a store, and do it again for as long as the store is away.
 
     Raises:
@@ -41,7 +41,7 @@ def patiently(act: Callable[[], T], stop: asyncio.Event) -> T:
             return done
 
 
-class Patient:
+class WaitingService:
     """A service that waits for its store: nothing is acknowledged before it is committed.
 
     After a failed commit it is not known whether it was one: what the store has and nobody was told is published first.
@@ -52,13 +52,14 @@ class Patient:
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
-        return patiently(self.service.unpublished, self._stop)
+        return retry_while_away(self.service.unpublished, self._stop)
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Let the service take a batch, once its store is there."""
-        return patiently(lambda: self._take(payloads), self._stop)
+        return retry_while_away(lambda: self._take_and_recall(payloads), self._stop)
 
-    def _take(self, payloads: Sequence[Payload]) -> list[Output]:
+    def _take_and_recall(self, payloads: Sequence[Payload]) -> list[Output]:
+        """Take a batch, and return also what was committed when the store went away and may not have been published."""
         before = self.service.unpublished() if self._failed else []
         try:
             outputs = self.service.take(payloads)
@@ -74,4 +75,4 @@ class Patient:
 
     def finish(self, ended: bool) -> list[Output]:
         """Let the service commit everything."""
-        return patiently(lambda: self.service.finish(ended), self._stop)
+        return retry_while_away(lambda: self.service.finish(ended), self._stop)

@@ -14,25 +14,25 @@ from typing import Protocol
 from heliograph.files.json_field import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.serving.ahead import Spans
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, word
+from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, encode_name
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.loop import Takes, serve_until, signals
-from heliograph.serving.patience import Patient, patiently
+from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import AwayError, Damage, InMemoryStore, StoreProtocol, identity
-from heliograph.serving.words import KeepingWords
+from heliograph.serving.words import LastWordsService
 from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
 
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
 
 
-def connected(address: Address, part: Part = WHOLE, translator: Translator | None = None) -> Transport:
+def make_transport(address: Address, part: Part = WHOLE, translator: Translator | None = None) -> Transport:
     """Return the transport for one part of the plants through the broker at this address.
 
     Args:
@@ -211,10 +211,10 @@ def store_of(network: str, given: str | None, parts: int | None, node: str | Non
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
-    return f"{name_of(network)}{'' if node is None else f'-{word(node)}'}.db"
+    return f"{name_of(network)}{'' if node is None else f'-{encode_name(node)}'}.db"
 
 
-def of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
+def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
     """Return the settings of one node of a fusion between neighbours, at the topic of its name below the broker's.
 
     Raises:
@@ -237,7 +237,7 @@ def of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
         settings,
         network=node_network(settings.network, node),
         options=settings.options._replace(step=step),
-        broker=replace(settings.broker, topic=f"{settings.broker.topic}/{word(node)}"),
+        broker=replace(settings.broker, topic=f"{settings.broker.topic}/{encode_name(node)}"),
         sources=table,
         others=tuple(name for name in settings.network.names if name != node),
         name=f"{settings.name} {node}",
@@ -256,7 +256,7 @@ async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     _log_to_stderr()
     async with _watched(settings) as look:
-        lanes = Lanes(settings.network)
+        lanes = NetworkProgram(settings.network)
         if lanes.uneven:
             what = f"predictions depend on when others are asked for: {lanes.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
@@ -285,17 +285,17 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
         yield lambda service: service
         return
     from heliograph.files.sources import Sources
-    from heliograph.serving.page import door, shown
+    from heliograph.serving.page import parse_page_address, shown
     from heliograph.serving.watch import watch_of
 
     table = settings.sources
     uncounted = set() if table is None else Sources(table, settings.network).uncounted
     watch = watch_of(settings.network, settings.name, uncounted)
-    async with shown(watch, door(settings.page, hosts=settings.hosts)):
-        yield watch.over
+    async with shown(watch, parse_page_address(settings.page, hosts=settings.hosts)):
+        yield watch.wrap
 
 
-async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
+async def _alone(settings: ServiceSettings, lanes: NetworkProgram, look: Look) -> None:
     """Serve all messages in one process."""
     stop = asyncio.Event()
     reads = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
@@ -304,15 +304,15 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     fleet.periods = {} if reads is None else reads.sources.periods
     with signals(stop), contextlib.ExitStack() as owning:
         # The store first, whose state the service goes on from.
-        store = await asyncio.to_thread(patiently, lambda: _open_store(settings, fleet, owning), stop)
+        store = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet, owning), stop)
         resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every, settings.forecast)
         try:
             service.resume()
             broker = settings.broker
-            transport = Pipe(translator=reads) if broker is None else connected(broker, translator=reads)
+            transport = Pipe(translator=reads) if broker is None else make_transport(broker, translator=reads)
             patience = None if step is None else max(step, SHORTEST)
-            looked = look(service) if reads is None else KeepingWords(look(service), reads.sources.words, store)
-            await serve_until(stop, Patient(looked, stop), transport, patience)
+            looked = look(service) if reads is None else LastWordsService(look(service), reads.sources.words, store)
+            await serve_until(stop, WaitingService(looked, stop), transport, patience)
         finally:
             store.close()
     # What was not used, in words.
@@ -331,9 +331,9 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
     if settings.store is None:
         return InMemoryStore()
     if owning is not None:
-        from heliograph.serving.storage.owner import owned
+        from heliograph.serving.storage.owner import own_store
 
-        owning.enter_context(owned(settings.store, settings.process))
+        owning.enter_context(own_store(settings.store, settings.process))
     from heliograph.live.stored.carrier import Carrier
     from heliograph.serving.storage.store import Store
 
@@ -365,7 +365,7 @@ def _say(what: str) -> None:
     print(f"heliograph: {what}", file=sys.stderr)
 
 
-async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: int) -> None:
+async def _shared(settings: ServiceSettings, lanes: NetworkProgram, look: Look, parts: int) -> None:
     """One process of several: the parts that it leases."""
     from heliograph.serving.storage.database import engine_at
     from heliograph.serving.storage.leases import Leases
@@ -376,7 +376,7 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
     assert broker is not None  # as Wanted checked
     fleet = Fleet(lanes, settings.options)
     # Check the store once, before any part is served.
-    first = await asyncio.to_thread(patiently, lambda: _open_store(settings, fleet), asyncio.Event())
+    first = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet), asyncio.Event())
     assert isinstance(first, Store)  # as Wanted checked
     first.close()
     mine = identity(fleet)
@@ -386,7 +386,7 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
         store = Store(store_name, mine, f"part {number} of {parts}", opened=first)
         try:
             service = look(Service(Fleet(lanes, settings.options), store, _say))
-            await serve_until(stop, Patient(service, stop), connected(broker, Part(number, parts)))
+            await serve_until(stop, WaitingService(service, stop), make_transport(broker, Part(number, parts)))
         finally:
             store.close()
 

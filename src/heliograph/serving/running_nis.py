@@ -63,7 +63,7 @@ class RunningNis:
         return None
 
 
-def used_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
+def read_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
     """Return the squared innovation of what a filter used, and of how many numbers it is.
 
     Of a filter that weighs these are the numbers of weight 1/2 or more, each over its variance: outliers that it left

@@ -13,13 +13,13 @@ from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
 from heliograph.live.judging import FleetAngles
-from heliograph.live.lanes import Lanes as Lanes
+from heliograph.live.lanes import NetworkProgram as NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.rows import HeldRow
-from heliograph.live.stored.plant_codec import plant_bytes, plant_from
+from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.collector import no_collector
-from heliograph.serving.ahead import Ahead, Spans
+from heliograph.serving.ahead import ForecastPublisher, Spans
 from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
@@ -41,7 +41,7 @@ WHY: dict[Verdict, str] = {
 LEAPT = "a leap in time that no other message confirms: a clock is wrong; it had been used, and is taken back"
 
 
-class Taken(NamedTuple):
+class BatchStatistics(NamedTuple):
     """Statistics of the last batch: numbers of messages and outputs, and the seconds in all and for the commit.
 
     `lag`: age in seconds of the oldest message, where messages carry dates; else the seconds that the batch took.
@@ -82,11 +82,11 @@ class Service:
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
-        self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
+        self.malformed, self.known, self.last = 0, 0, BatchStatistics(0, 0, 0.0, 0.0, 0.0)
         self._writer, self._using = EstimateWriter(fleet.lanes), Using(fleet, self.plants)
-        self._exchange, self._silence = Exchange(fleet, self._moment), Silence(fleet, every)
+        self._exchange, self._silence = Exchange(fleet, self._time_in_messages), Silence(fleet, every)
         self._angles, self._doubt = FleetAngles(fleet), say
-        self._ahead = None if forecast is None else Ahead(fleet, forecast)
+        self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast)
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
@@ -98,7 +98,7 @@ class Service:
         Without messages, time has passed: plants whose senders decide when to send are stepped to the present.
         """
         with no_collector():  # a batch makes many objects and no cycles, and a search would take a third of its time
-            outputs = self._take(payloads) if payloads else self._nothing_came(datetime.now(UTC))
+            outputs = self._take_batch(payloads) if payloads else self._take_silence(datetime.now(UTC))
             # What a large batch made counts as old, and is searched for garbage once in a million messages.
             if len(payloads) > LARGE:
                 gc.freeze()
@@ -118,21 +118,21 @@ class Service:
                     self._load(names[i : i + LARGE])
             self._silence.resume(self.plants)
 
-    def _nothing_came(self, now: datetime) -> list[Output]:
-        """Let time pass; what becomes final by that is committed, and silence itself, which the clock says, is not."""
+    def _take_silence(self, now: datetime) -> list[Output]:
+        """Advance the clock where no message came: commit what is final by it; silence is published, not committed."""
         if self._exchange.sends:  # each of its steps is a message to the neighbours
-            steps = self._steps(now)
-            return self._take(steps) if steps else []
+            steps = self._make_step_messages(now)
+            return self._take_batch(steps) if steps else []
         due = self._silence.due(self.plants.values(), now)
         for plant, step in due:
             self.fleet.advance(plant, step)
         finalised = self.fleet.finalise(plant for plant, _ in due)
         changed = {row_set.plant.name: row_set.plant for row_set in finalised if row_set.left}
-        entries = [entry for row_set in finalised for entry in self._withdrawn(row_set.plant, row_set.withdrawn)]
-        entries += self._finals(finalised)
+        entries = [entry for row_set in finalised for entry in self._write_withdrawn(row_set.plant, row_set.withdrawn)]
+        entries += self._write_finals(finalised)
         self.fleet.pass_silence(due)
         rows = [(plant, plant.silence) for plant, _ in due if plant.silence is not None]
-        provisional = self._provisional(self._silence.worth_telling(rows)) if rows else []
+        provisional = self._write_provisional(self._silence.select_for_publication(rows)) if rows else []
         self.fleet.forget(finalised)
         try:
             return (self._commit(changed, entries, 0) if changed else []) + provisional
@@ -140,7 +140,7 @@ class Service:
             self._load(changed)
             return []
 
-    def _steps(self, now: datetime) -> list[Message]:
+    def _make_step_messages(self, now: datetime) -> list[Message]:
         """Return a message of inputs that all stay as they were for each plant of which another step has begun."""
         nothing: list[float | None] = [None] * self.fleet.lanes.given
         return [
@@ -150,7 +150,8 @@ class Service:
             for plant, step in self._silence.due(self.plants.values(), now)
         ]
 
-    def _take(self, payloads: Sequence[Payload]) -> list[Output]:
+    def _take_batch(self, payloads: Sequence[Payload]) -> list[Output]:
+        """Read and use a batch, and again from the store's plants if another process has committed one of them."""
         begun = perf_counter()
         messages = read_messages(payloads)
         names = {name for message in messages if (name := plant_of(message)) is not None}
@@ -168,7 +169,7 @@ class Service:
             message.time for message in messages if isinstance(message, Message) and isinstance(message.time, datetime)
         ]
         lag = (datetime.now(UTC) - min(dates)).total_seconds() if dates else took
-        self.last = Taken(len(payloads), len(outputs), took, committed, lag)
+        self.last = BatchStatistics(len(payloads), len(outputs), took, committed, lag)
         return outputs
 
     def dead_senders(self) -> dict[str, int]:
@@ -198,7 +199,7 @@ class Service:
         """Commit everything. Without a store, and if there will be no more messages, all rows become final."""
         last = list(self.plants.values()) if ended and not self.store.keeps else []
         finalised = self.fleet.finalise(last, all_=True)
-        entries = self._finals(finalised)
+        entries = self._write_finals(finalised)
         self.fleet.forget(finalised)
         return self._commit({}, entries, 0)
 
@@ -216,28 +217,28 @@ class Service:
             message, payload, (_, verdict, why, notes) = messages[i], payloads[i], outcomes[i]
             # Of a damaged plant, or not read.
             if (damage := self._damage.get(plant_of(message) or "")) and not isinstance(message, str):
-                entries.append(_refusal(message, "damaged", damage))
+                entries.append(_refuse(message, "damaged", damage))
                 continue
             if isinstance(message, str | UnreadMessage) or verdict is None:
                 malformed += 1
                 said = why if isinstance(payload, str | UnreadMessage) else f"{why}: {show_value(payload)}"
-                entries.append(_refusal(message, "malformed", said))
+                entries.append(_refuse(message, "malformed", said))
                 continue
             # Used but for some of it, known already, or refused with the reason.
             if verdict != "used":
                 known += verdict in ("duplicate", "late")
-                entries.append(_refusal(message, verdict, why or WHY[verdict]))
-            entries += [_refusal(message, "implausible", note) for note in notes]
+                entries.append(_refuse(message, verdict, why or WHY[verdict]))
+            entries += [_refuse(message, "implausible", note) for note in notes]
             if verdict == "implausible" or notes:
                 self._warn(message, why or notes[0])
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.messages(touched.values())
         finalised = self.fleet.finalise(touched.values())
         withdrawn = [*self._using.replaced, *((row_set.plant, row_set.withdrawn) for row_set in finalised)]
-        entries += [entry for plant, events in withdrawn for entry in self._withdrawn(plant, events)]
-        entries += self._finals(finalised)
+        entries += [entry for plant, events in withdrawn for entry in self._write_withdrawn(plant, events)]
+        entries += self._write_finals(finalised)
         newest = [(row_set.plant, row_set.newest) for row_set in finalised if row_set.plant.name in used]
-        provisional = self._provisional(newest)
+        provisional = self._write_provisional(newest)
         self.fleet.forget(finalised)
         begun = perf_counter()
         outputs = self._commit(touched, entries, malformed)
@@ -259,13 +260,13 @@ class Service:
         stored = {}
         if self.store.keeps:
             stored = {
-                name: StoredPlant(plant.version, plant_bytes(plant, self.fleet)) for name, plant in touched.items()
+                name: StoredPlant(plant.version, pack_plant(plant, self.fleet)) for name, plant in touched.items()
             }
         try:
             outputs = self.store.commit(stored, entries, malformed, self._published)
         except BaseException:
             for name in touched:
-                self._leave(name)
+                self._forget_plant(name)
             raise
         # After the commit: count versions, and let the plants with the oldest messages leave memory.
         self._published = None
@@ -273,10 +274,10 @@ class Service:
             plant.version += 1
             self.plants.move_to_end(name)
         while self.store.keeps and self.fleet.pool.used > ROWS:
-            self._leave(next(iter(self.plants)))
+            self._forget_plant(next(iter(self.plants)))
         return outputs
 
-    def _leave(self, name: str) -> None:
+    def _forget_plant(self, name: str) -> None:
         """Let a plant leave the memory."""
         self.fleet.end(self.plants.pop(name))
         self._silence.forget(name)
@@ -288,29 +289,29 @@ class Service:
             if stored.damage:
                 self._damage[name] = stored.damage
                 continue
-            plant = self.plants[name] = plant_from(name, stored.body, self.fleet)
+            plant = self.plants[name] = unpack_plant(name, stored.body, self.fleet)
             plant.version = stored.version
 
-    def _finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
+    def _write_finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
         rows = [(row_set.plant, row) for row_set in finalised for row in row_set.final if row.has_data()]
         names = (plant.name for plant, _ in rows)
-        return [*map(Entry._make, zip(names, repeat("final"), self._lines(b"final", rows)))]
+        return [*map(Entry._make, zip(names, repeat("final"), self._write_estimates(b"final", rows)))]
 
-    def _withdrawn(self, plant: PlantState, events: Iterable[Withdrawn]) -> Iterator[Entry]:
+    def _write_withdrawn(self, plant: PlantState, events: Iterable[Withdrawn]) -> Iterator[Entry]:
         """Yield a refusal of each event that was used before its clock turned out wrong."""
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
-            parts = {"node": name, "sequence": sequence, "time": self._moment(plant, time)}
+            parts = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
             yield _write_refusal(plant.name, parts, "future", LEAPT)
 
-    def _provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
+    def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return the provisional estimates after these rows, and what the senders' silence means."""
         outputs = []
-        self._silence.told(rows)
-        for (plant, row), body in zip(rows, self._lines(b"provisional", rows), strict=True):
+        self._silence.note_published(rows)
+        for (plant, row), body in zip(rows, self._write_estimates(b"provisional", rows), strict=True):
             if self._ahead is not None:
-                ahead = [{"time": self._moment(plant, time), "estimates": estimates}
+                ahead = [{"time": self._time_in_messages(plant, time), "estimates": estimates}
                          for time, estimates in self._ahead.forecasts(row)]  # fmt: skip
                 body = b'%b,"forecast":%b}' % (body[:-1], line(ahead))
             if self.fleet.deciding:
@@ -320,18 +321,19 @@ class Service:
             outputs.append(Output(None, plant.name, "provisional", body))
         return outputs
 
-    def _lines(self, kind: bytes, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[bytes]:
-        moments = [(plant.name, row.key[0] if plant.origin is None else self._moment(plant, row.key[0]))
+    def _write_estimates(self, kind: bytes, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[bytes]:
+        """Write the estimates of these rows, a line each."""
+        moments = [(plant.name, row.key[0] if plant.origin is None else self._time_in_messages(plant, row.key[0]))
                    for plant, row in rows]  # fmt: skip
         return self._writer.lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
 
-    def _moment(self, plant: PlantState, at: float) -> float | str:
+    def _time_in_messages(self, plant: PlantState, at: float) -> float | str:
         """Return the time of a row as messages have it."""
         unit = self.fleet.options.step or 1.0
         return at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()
 
 
-def _refusal(message: Read, why: str, detail: str) -> Entry:
+def _refuse(message: Read, why: str, detail: str) -> Entry:
     """Return the refusal of a message, with what names it as far as it was read."""
     if isinstance(message, str):
         return _write_refusal(None, {}, why, detail)

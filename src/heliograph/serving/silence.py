@@ -54,26 +54,27 @@ class Silence:
                     due.append((plant, float(passed)))
         return due
 
-    def told(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
-        """Note that the estimates after these rows were told."""
+    def note_published(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
+        """Note that the estimates after these rows were published."""
         if self.fleet.options.step is not None and self.fleet.deciding:
             outputs = self.fleet.outputs([row.slot for _, row in rows])
             for (plant, row), output in zip(rows, outputs, strict=True):
-                self._told[plant.name] = output, self._dead(plant), row.key[0]
+                self._told[plant.name] = output, self._dead_senders(plant), row.key[0]
                 self._resumed.discard(plant.name)
 
     def forget(self, name: str) -> None:
         """Forget a plant that leaves the memory."""
         self._told.pop(name, None)
 
-    def worth_telling(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[tuple[PlantState, HeldRow]]:
-        """Return the rows whose estimates differ from what was told, or which are due again."""
+    def select_for_publication(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[tuple[PlantState, HeldRow]]:
+        """Return the rows whose estimates differ from what was published, or which are due again."""
         outputs = self.fleet.outputs([row.slot for _, row in rows])
-        return [pair for pair, output in zip(rows, outputs, strict=True) if self._differs(*pair, output)]
+        return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_news(*pair, output)]
 
-    def _differs(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
+    def _is_news(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
+        """Test whether a row is news: a sender died, `every` is over, or a mean or deviation has moved visibly."""
         told = self._told.get(plant.name)
-        if told is None or told[1] != self._dead(plant):
+        if told is None or told[1] != self._dead_senders(plant):
             return True
         step = self.fleet.options.step or 1.0
         if self.every is not None and (row.key[0] - told[2]) * step >= self.every:
@@ -83,7 +84,8 @@ class Silence:
         moved = np.abs(output[self._means] - told[0][self._means]) > MOVED * before
         return bool((moved | (np.abs(now - before) > MOVED * before)).any())
 
-    def _dead(self, plant: PlantState) -> tuple[str, ...]:
+    def _dead_senders(self, plant: PlantState) -> tuple[str, ...]:
+        """The dead senders of a plant."""
         return tuple(name for name, status in self.fleet.senders(plant).items() if status.dead)
 
 

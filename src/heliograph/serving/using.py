@@ -47,7 +47,7 @@ class Using:
         `wall` is the time by this machine's clock. Afterwards the plants are as if the messages refused as implausible
         had never arrived.
         """
-        self._refused, self._anew, self.replaced = self._implausible_inputs(messages), {}, []
+        self._refused, self._anew, self.replaced = self._find_implausible_inputs(messages), {}, []
         outcomes = [NOTHING] * len(messages)
         # One plant after another, so that its memory is near; the messages of a plant in their order.
         by_plant: dict[str, list[int]] = {}
@@ -66,7 +66,7 @@ class Using:
                     elif isinstance(message, UnreadMessage):
                         outcomes[i] = self._count_unread(message.read), None, message.why, ()
                     else:
-                        outcomes[i] = self._use(i, message, wall)
+                        outcomes[i] = self._use_message(i, message, wall)
                 except InputError as error:  # of another kind than its plant expects
                     assert not isinstance(message, str | UnreadMessage)
                     outcomes[i] = self._count_unread(message), None, str(error), ()
@@ -79,12 +79,12 @@ class Using:
                 self._refused[number, event.node_index < 0] = why
                 spoilt.add(plant.name)
             for name in spoilt:
-                self._undo(name)
+                self._restore_plant(name)
             left = [i for i in left if plant_of(messages[i]) in spoilt]
         self._taken = []
         return outcomes
 
-    def _implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
+    def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
         """Return the inputs that lead to no valid prediction from the state before the batch."""
         given = [(i, m, values) for i, m in enumerate(messages) if not isinstance(m, str | UnreadMessage)
                  and (values := m.values if m.node == INPUTS else m.inputs)
@@ -94,17 +94,19 @@ class Using:
         why = self._judges.implausible_inputs(plants, numbers)
         return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}
 
-    def _use(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
+    def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
         """Give a message to its plant; the outcome has none if the plant would begin with a refused message."""
-        plant = self._going_on(message, wall)
+        plant = self._find_plant(message, wall)
         # A new plant begins with a message that is plausible and of a right clock.
-        origin = self._origin(message) if plant is None else plant.origin
+        origin = self._choose_origin(message) if plant is None else plant.origin
         at = message.time
         if origin is not None or not isinstance(at, float):
-            at = self._number(at, origin, message.plant)
+            at = self._time_as_number(at, origin, message.plant)
         now = at if plant is None else plant.confirmed
-        arrival = max(now, at) if message.arrival is None else self._number(message.arrival, origin, message.plant)
-        clock = None if origin is None else self._number(wall, origin, message.plant)
+        arrival = (
+            max(now, at) if message.arrival is None else self._time_as_number(message.arrival, origin, message.plant)
+        )
+        clock = None if origin is None else self._time_as_number(wall, origin, message.plant)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
         inputs = None
         if message.inputs is not None:
@@ -121,18 +123,20 @@ class Using:
             return None, "implausible", why, ()
         given = message.arrival is not None
         if plant is None:
-            plant = self._begin(
+            plant = self._begin_plant(
                 message.plant, at, origin, beginning(*((arrival, ARRIVAL) if given else (at, message.node)))
             )
         plant = self._remember(plant, at)
         # Inputs and measurement are used or refused independently.
         notes: list[str] = []
         if inputs is not None and spoilt is None:
-            self._take(number, plant, inputs, given, clock, message.node)
+            self._give_to_plant(number, plant, inputs, given, clock, message.node)
         elif spoilt is not None:
             plant.link(INPUTS).implausible += 1
             notes.append(f"inputs {message.inputs}: {spoilt}; the rest is used")
-        verdict: Verdict = "implausible" if why else self._take(number, plant, event, given, clock, message.node)
+        verdict: Verdict = (
+            "implausible" if why else self._give_to_plant(number, plant, event, given, clock, message.node)
+        )
         link = plant.link(message.node)
         link.count(verdict, message.sequence, at, self.fleet.periods.get(message.node, 0))
         if dropped and verdict in ("used", "implausible"):
@@ -147,7 +151,7 @@ class Using:
         if plant is None or (node != INPUTS and node not in self.fleet.network.names):
             return None
         try:
-            at = self._number(message.time, plant.origin, plant.name)
+            at = self._time_as_number(message.time, plant.origin, plant.name)
         except InputError:  # a time of another kind
             return None
         link = self._remember(plant, at).link(node)
@@ -164,12 +168,12 @@ class Using:
             self._before[plant.name] = Before(True, plant.clock, links)
         return plant
 
-    def _number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
+    def _time_as_number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
         """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""
         at, step = seconds(moment, origin, plant), self.fleet.options.step
         return at if origin is None or step is None else floor(at / step + 0.5)
 
-    def _going_on(self, message: AnyMessage, wall: datetime) -> PlantState | None:
+    def _find_plant(self, message: AnyMessage, wall: datetime) -> PlantState | None:
         """Return the plant of a message; None if it has to begin, or to begin anew since its first clock was wrong.
 
         That is so where the message goes on from before the leap with which the plant began, and where that is in the
@@ -178,21 +182,21 @@ class Using:
         plant, leap = self.plants.get(message.plant), self.fleet.options.leap
         if plant is None or isinstance(message.time, datetime) != (plant.origin is not None):
             return plant
-        at = self._number(message.time, plant.origin, plant.name)
-        said = self._number(message.arrival, plant.origin, plant.name) if message.arrival is not None else at
+        at = self._time_as_number(message.time, plant.origin, plant.name)
+        said = self._time_as_number(message.arrival, plant.origin, plant.name) if message.arrival is not None else at
         first, newest = find_leap(plant.leap, plant.now, said, leap) or (None, at)
         begins = first is not None and first.now == -inf and not plant.holds(first, at, leap)
         clock = message.node if message.arrival is None else ARRIVAL
         if first is not None and begins and first.taken_back_by(clock, said, newest):
             return None
         if plant.origin is not None:
-            now = self._number(wall, plant.origin, plant.name)
+            now = self._time_as_number(wall, plant.origin, plant.name)
             if plant.confirmed > now + leap and abs(at - now) <= leap:
                 return None
         return plant
 
-    def _begin(self, name: str, at: float, origin: datetime | None, leap: Leap) -> PlantState:
-        """Begin a plant, whose first moment is not sure yet; one that begins anew is withdrawn."""
+    def _begin_plant(self, name: str, at: float, origin: datetime | None, leap: Leap) -> PlantState:
+        """Begin a plant, whose first moment may still turn out wrong; one that begins anew is withdrawn first."""
         plant, old = self.fleet.begin(name, at, origin), self.plants.pop(name, None)
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
         if old is not None:
@@ -206,15 +210,16 @@ class Using:
             self.fleet.end(old)
         return plant
 
-    def _take(
+    def _give_to_plant(
         self, number: int, plant: PlantState, event: Known, given: bool, wall: float | None, clock: str
     ) -> Verdict:
+        """Let the plant judge an event, and note what it changed."""
         verdict = self.fleet.take(plant, event, given, wall, clock)
         if verdict == "used":
             self._taken.append((number, plant, event, plant.changes[-1][0]))
         return verdict
 
-    def _undo(self, name: str) -> None:
+    def _restore_plant(self, name: str) -> None:
         """Restore a plant to its state before the batch."""
         plant, (known, clock, links) = self.plants[name], self._before[name]
         if known:
@@ -223,7 +228,7 @@ class Using:
         else:
             self.fleet.end(self.plants.pop(name))
 
-    def _origin(self, message: AnyMessage) -> datetime | None:
+    def _choose_origin(self, message: AnyMessage) -> datetime | None:
         """Return midnight, UTC, before a plant's first message, or the date of step 0; None where times are numbers."""
         if not isinstance(message.time, datetime):
             return None

@@ -22,7 +22,7 @@ from heliograph.serving.loop import Takes
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.overview import Overview, Wrong
-from heliograph.serving.running_nis import MEMORY, RunningNis, used_nis
+from heliograph.serving.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.totals import LinkTotals, Totals
 from heliograph.simulation.network import Network
 
@@ -141,10 +141,10 @@ class Watch:
         self.lag = Histogram("heliograph_lag_seconds", what, buckets=LAGS, registry=self.registry)
         self.committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=self.registry)
 
-    def over(self, service: Serves) -> "Watched":
+    def wrap(self, service: Serves) -> "ObservedService":
         """Wrap a service so that its batches are observed."""
         self.services.append(service)
-        return Watched(service, self)
+        return ObservedService(service, self)
 
     @contextmanager
     def taking(self) -> Iterator[None]:
@@ -170,16 +170,17 @@ class Watch:
         for output in outputs:
             if output.kind in ("provisional", "final"):
                 message = from_json(output.body)
-                self._keep(output.plant, message)
+                self._keep_point(output.plant, message)
                 if output.kind == "final":
-                    self._test(output.plant, message["estimates"])
+                    self._test_claims(output.plant, message["estimates"])
 
-    def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        of_plant = _newest(self._tests, plant, dict, TESTED)
-        recent = self.outputs, _newest(self._outputs, plant, lambda: RecentOutputs(MEMORY, self.outputs.names))
+    def _test_claims(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
+        """Add the NIS of a plant's newest estimates to the running tests, and outputs to those that are weighed."""
+        of_plant = _move_to_newest(self._tests, plant, dict, TESTED)
+        recent = self.outputs, _move_to_newest(self._outputs, plant, lambda: RecentOutputs(MEMORY, self.outputs.names))
         for node, filters in estimates.items():
             for name, message in filters.items():
-                squared, received = used_nis(message)
+                squared, received = read_nis(message)
                 if squared is not None:
                     for tests in (self.nis, of_plant):
                         single = tests.setdefault((node, name), RunningNis(message["claim"]))
@@ -188,16 +189,17 @@ class Watch:
                     for outputs in recent:
                         outputs.add(node, name, message["outputs"])
 
-    def _keep(self, plant: str, message: Mapping[str, Any]) -> None:
+    def _keep_point(self, plant: str, message: Mapping[str, Any]) -> None:
+        """Keep a plant's newest estimates as a point of its chart."""
         self._count += 1
         estimates = {
-            node: {name: _band(points) for name, points in filters.items()}
+            node: {name: _means_and_deviations(points) for name, points in filters.items()}
             for node, filters in message["estimates"].items()
         }
-        points = _newest(self._points, plant, lambda: deque(maxlen=POINTS))
+        points = _move_to_newest(self._points, plant, lambda: deque(maxlen=POINTS))
         points.append(Point(self._count, message["time"], message["kind"] == "final", estimates))
         if message.get("senders"):
-            _newest(self._senders, plant, dict).update(message["senders"])
+            _move_to_newest(self._senders, plant, dict).update(message["senders"])
             self._dead[plant] = [node for node, sender in message["senders"].items() if sender["dead"]]
             if not self._dead[plant]:
                 del self._dead[plant]
@@ -270,9 +272,9 @@ class Watch:
                 "points": [point._asdict() for point in points],
                 "links": self._hide_uncounted(_add_counts(results)),
                 "senders": senders,
-                "tests": [_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
+                "tests": [_make_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
                 "outputs": [output_row(output) for output in health],
-                "warnings": list(self._warnings(results, tests, senders))[:WARNINGS],
+                "warnings": list(self._yield_warnings(results, tests, senders))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
                 "all": self.links(),
                 "wrong": len(self.worst()),
@@ -290,12 +292,13 @@ class Watch:
                 rows.append({"node": Network.FUSED, "filter": name, "claim": claim, **numbers, **judged})
         return rows
 
-    def _warnings(
+    def _yield_warnings(
         self,
         plants: Sequence[WatchedPlant],
         tests: Mapping[tuple[str, str], RunningNis],
         senders: Mapping[str, Mapping[str, Any]],
     ) -> Iterator[str]:
+        """Yield what is wrong with plants, a line each: doubted filters, dead senders, then messages by count."""
         # Filters that are doubted, senders that are dead, then the nodes' messages.
         for (node, filter_name), test in tests.items():
             if doubt := test.doubt():
@@ -314,7 +317,7 @@ class Watch:
             )
 
 
-class Watched:
+class ObservedService:
     """A service whose batches are observed; the loop uses it like the service."""
 
     def __init__(self, service: Serves, watch: Watch):
@@ -341,7 +344,7 @@ class Watched:
             return self.service.finish(ended)
 
 
-def _newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T], most: int = PLANTS) -> T:
+def _move_to_newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T], most: int = PLANTS) -> T:
     """Return the entry of a plant, made if needed, as the newest; drop the oldest entry beyond so many."""
     if plant not in newest:
         newest[plant] = make()
@@ -351,14 +354,15 @@ def _newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T], most
     return newest[plant]
 
 
-def _band(message: Mapping[str, Any]) -> dict[str, object]:
+def _means_and_deviations(message: Mapping[str, Any]) -> dict[str, object]:
     """Return means, and standard deviations where the filter claims a covariance."""
     rows = message["covariance"]
-    claimed = rows and [_root(row[i]) for i, row in enumerate(rows)]
+    claimed = rows and [_deviation_of(row[i]) for i, row in enumerate(rows)]
     return {"mean": message["mean"], "deviation": claimed, "claim": message["claim"]}
 
 
-def _root(variance: float | None) -> float | None:
+def _deviation_of(variance: float | None) -> float | None:
+    """Standard deviation of a variance; None where it has none."""
     return None if variance is None else math.sqrt(max(variance, 0.0))
 
 
@@ -373,7 +377,8 @@ def _add_counts(plants: Iterator[WatchedPlant] | Sequence[WatchedPlant]) -> dict
     return results
 
 
-def _test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, object]:
+def _make_test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, object]:
+    """One row of the page's table of tests."""
     low, high = test.band()
     names = {"node": node, "filter": filter_name, "claim": test.claim, "doubt": test.doubt() is not None, "by": []}
     return names | {"ratio": test.ratio, "low": low, "high": high, "numbers": test.numbers}

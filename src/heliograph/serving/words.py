@@ -9,7 +9,7 @@ from heliograph.serving.output import Output
 from heliograph.serving.storage.store_protocol import StoreProtocol
 
 
-class KeepingWords:
+class LastWordsService:
     """A service that keeps the last words of devices: a device that was offline is so after a restart.
 
     Args:
@@ -29,7 +29,7 @@ class KeepingWords:
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Use messages and commit, and the words that came before them; return the outputs to publish."""
-        self._keep()
+        self._keep_words()
         return self._service.take(payloads)
 
     def published(self, outputs: Sequence[Output]) -> None:
@@ -38,10 +38,11 @@ class KeepingWords:
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit everything; return the last outputs."""
-        self._keep()
+        self._keep_words()
         return self._service.finish(ended)
 
-    def _keep(self) -> None:
+    def _keep_words(self) -> None:
+        """Store the words that came since the last call."""
         self._unkept |= self._words.changed()  # until the store has them: it may be away
         if self._unkept:
             self._store.keep_words(self._unkept)

@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.live.plant import LinkCounts
-from heliograph.live.stored.plant_codec import plant_from
+from heliograph.live.stored.plant_codec import unpack_plant
 from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
@@ -111,17 +111,17 @@ def of_speed(drive: Drive, setting: Setting) -> dict[str, int]:
 
 
 @cache
-def _lanes() -> Lanes:
+def _lanes() -> NetworkProgram:
     with warnings.catch_warnings():  # the drift over an interval is that over its parts but for the heading's share
         warnings.simplefilter("ignore", UserWarning)
-        return Lanes(network())
+        return NetworkProgram(network())
 
 
 def links_of(place: Path) -> Links:
     """What the store says that came from each node."""
     fleet = Fleet(_lanes(), Options(WINDOW))
     store = Store(str(place), identity(fleet))
-    plant = plant_from(PLANT, store.load([PLANT])[PLANT].body, fleet)
+    plant = unpack_plant(PLANT, store.load([PLANT])[PLANT].body, fleet)
     store.close()
     return plant.links
 

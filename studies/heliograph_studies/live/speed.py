@@ -11,12 +11,12 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
-from heliograph.serving.brokers.url import Address, address
+from heliograph.live.lanes import NetworkProgram
+from heliograph.serving.brokers.url import Address, parse_address
 from heliograph.serving.loop import serve_until
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
-from heliograph.serving.running import connected
+from heliograph.serving.running import make_transport
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import InMemoryStore, identity
@@ -63,7 +63,7 @@ class Counted:
         return self.service.finish(ended)
 
 
-def in_memory(lanes: Lanes, options: Options, lines: Sequence[bytes]) -> float:
+def in_memory(lanes: NetworkProgram, options: Options, lines: Sequence[bytes]) -> float:
     """Steps a second of a service that keeps nothing."""
     service = Service(Fleet(lanes, options), InMemoryStore())
     begun = perf_counter()
@@ -73,17 +73,17 @@ def in_memory(lanes: Lanes, options: Options, lines: Sequence[bytes]) -> float:
 
 
 async def through(
-    kind: str, folder: Path, server: Server, lanes: Lanes, options: Options, lines: Sequence[bytes]
+    kind: str, folder: Path, server: Server, lanes: NetworkProgram, options: Options, lines: Sequence[bytes]
 ) -> float:
     """Steps a second through a broker that has the messages already, estimates published to it, commits on disk."""
-    where = address(f"{kind}://127.0.0.1:{getattr(server, kind)}/speed-{kind}", {})
+    where = parse_address(f"{kind}://127.0.0.1:{getattr(server, kind)}/speed-{kind}", {})
     await _subscribed(where)
     await (_sent(where, lines) if kind == "nats" else asyncio.to_thread(_published, where, lines))
     fleet, stop = Fleet(lanes, options), asyncio.Event()
     store = Store(str(folder / f"{kind}.sqlite"), identity(fleet))
     counted = Counted(Service(fleet, store), len(lines), stop)
     try:
-        await asyncio.wait_for(serve_until(stop, counted, connected(where)), 300)
+        await asyncio.wait_for(serve_until(stop, counted, make_transport(where)), 300)
     finally:
         store.close()
     return len(lines) / (counted.ended - counted.begun)
@@ -91,7 +91,7 @@ async def through(
 
 async def _subscribed(where: Address) -> None:
     """Have the broker keep what will be sent: a stream, or a session."""
-    transport = connected(where)
+    transport = make_transport(where)
     try:
         await asyncio.wait_for(transport.receive(), 1.0)
     except TimeoutError:

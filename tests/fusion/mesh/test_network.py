@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph.simulation.centres.mesh import mesh_of
@@ -129,7 +129,7 @@ def test_a_service_has_every_node_where_no_message_gets_lost():
     whole, generator = network({"trace": RULES["trace"]}), np.random.default_rng(3)
     z = {name: generator.standard_normal((3, node.received)) for name, node in whole.nodes.items()}
     expected = hg.run(whole, z).estimates["b"]["trace"]
-    service = Service(Fleet(Lanes(whole), Options(5.0)), InMemoryStore())
+    service = Service(Fleet(NetworkProgram(whole), Options(5.0)), InMemoryStore())
     order = [(k, name) for k in range(3) for name in ("a", "c", "d")]
     sent = [{"node": n, "sequence": k, "time": k, "values": z[n][k].tolist()} for k, n in order]
     result = [json.loads(item.body) for item in service.take([json.dumps(item).encode() for item in sent])][-1]

@@ -5,7 +5,14 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.live.stored.layout import describe_old_layout, factors, fits, parts_of, place_flags, relocate_parts
+from heliograph.live.stored.layout import (
+    can_read,
+    describe_old_layout,
+    factorise,
+    place_flags,
+    relocate_parts,
+    split_by_path,
+)
 
 NEW = {
     ".mean": [2, 3],
@@ -20,21 +27,21 @@ OLD = {".mean": [2, 3], ".covariance": [2, 3, 3], ".inner.covariance": [1, 1], "
 
 def test_an_older_layout_is_that_of_now_with_covariances():
     assert describe_old_layout(NEW) == OLD and list(describe_old_layout(NEW)) == list(OLD)
-    assert fits(OLD, NEW) and fits(NEW, NEW) and fits(OLD, OLD)
+    assert can_read(OLD, NEW) and can_read(NEW, NEW) and can_read(OLD, OLD)
     for other in (
         OLD | {".covariance": [2, 2, 2]},
         OLD | {".more": []},
         {path: shape for path, shape in OLD.items() if path != ".law"},
         NEW | {".covariance": [2, 3, 3]},
     ):
-        assert not fits(other, NEW)
+        assert not can_read(other, NEW)
 
 
 def test_a_sum_of_an_event_filter_has_its_parts_in_the_order_that_they_had_with_covariances():
     """Snapshots without names of parts are read by this order."""
     sensor = hg.LinearSensor([[1.0]], 0.1)
     start = hg.event_filter(hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), sensor, hg.perfect(1), hg.SendOnDelta(0.5)).init()
-    before = describe_old_layout({path: part.shape for path, part in parts_of(start).items()})
+    before = describe_old_layout({path: part.shape for path, part in split_by_path(start).items()})
     assert list(before) == [".weight", ".mean", ".covariance", ".label", ".begun", ".moved"]
     assert before[".covariance"] == list(start.covariance.shape)
 
@@ -47,7 +54,7 @@ def test_factors_of_covariances_are_theirs(count):
         roots = generator.normal(size=(count, n, n)) * 10.0 ** generator.uniform(-6, 6, (count, n, 1))
         roots[0, :, 1:] = 0.0
         covariance = roots @ np.swapaxes(roots, -1, -2)
-        lower, variances = factors(covariance.reshape(count, 1, n, n))
+        lower, variances = factorise(covariance.reshape(count, 1, n, n))
         assert lower.shape == (count, 1, n * (n - 1) // 2) and variances.shape == (count, 1, n)
         assert np.all(variances >= 0)
         again = Gaussian(variances, lower, variances).covariance[:, 0]

@@ -15,8 +15,8 @@ import nats.js.errors
 
 from heliograph.serving.brokers.mqtt import Mqtt
 from heliograph.serving.brokers.nats import Nats
-from heliograph.serving.brokers.transport import Part, TakenOverError, Transport, part_of, word
-from heliograph.serving.brokers.url import Address, address
+from heliograph.serving.brokers.transport import Part, TakenOverError, Transport, encode_name, part_of
+from heliograph.serving.brokers.url import Address, parse_address
 from heliograph.serving.output import Output
 from heliograph_studies.live.server import Server
 from tests.serving.broker_servers import KINDS, at, made, numbered, published, received, running, sent, silent
@@ -35,13 +35,13 @@ def impatient(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_url_is_said_without_what_is_secret():
-    result = address("mqtts://me:p%40ss@example.org/site/one", {})
+    result = parse_address("mqtts://me:p%40ss@example.org/site/one", {})
     assert (result.kind, result.host, result.port, result.topic) == ("mqtt", "example.org", 8883, "site/one")
     assert (result.user, result.password) == ("me", "p@ss") and result.secure
     assert "p@ss" not in f"{result!r}{result}" and "me:" not in f"{result!r}{result}"
     environment = {"HELIOGRAPH_BROKER_USER": "you", "HELIOGRAPH_BROKER_PASSWORD": "word"}
-    assert address("nats://me:old@example.org", environment).password == "word"
-    assert address("nats://example.org", {}).topic == "heliograph"
+    assert parse_address("nats://me:old@example.org", environment).password == "word"
+    assert parse_address("nats://example.org", {}).topic == "heliograph"
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_the_url_is_said_without_what_is_secret():
 )
 def test_another_url_is_refused_in_one_line_without_the_password(url: str):
     with pytest.raises(ValueError, match=r"^broker") as error:
-        address(url, {})
+        parse_address(url, {})
     assert "s3cret" not in str(error.value) and "\n" not in str(error.value)
 
 
@@ -78,10 +78,10 @@ def test_one_cancellation_ends_a_wait_whatever_the_client_makes_of_it(error, mon
     """Else it would stand still for as long as nothing comes."""
 
     async def work() -> None:
-        transport = Nats(address("nats://127.0.0.1:1/away", {}))
+        transport = Nats(parse_address("nats://127.0.0.1:1/away", {}))
         deaf = Deaf(error)
         monkeypatch.setattr(transport, "_reader", deaf)
-        monkeypatch.setattr(transport, "_connected", lambda: True)
+        monkeypatch.setattr(transport, "_require_connection", lambda: True)
         monkeypatch.setattr(transport, "_open", lambda: asyncio.sleep(0, deaf))
         waits = [transport.receive] if error is None else [transport.receive, lambda: transport.publish(item)]
         for wait in waits:
@@ -120,7 +120,7 @@ def test_what_was_not_acknowledged_comes_again_in_order(server: Server):
 @pytest.mark.real("NATS")
 def test_a_server_that_is_killed_is_tried_again_and_nothing_is_missed(tmp_path, caplog, impatient):
     async def work() -> None:
-        where = address(f"nats://me:s3cret@127.0.0.1:{server.nats}/site", {})
+        where = parse_address(f"nats://me:s3cret@127.0.0.1:{server.nats}/site", {})
         reader = await made(where)
         await sent(where, numbered(0, 100))
         before = await received(reader, 100)
@@ -193,7 +193,7 @@ def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
         readers = [Mqtt(where, Part(i, 2)) for i in range(2)]
         await asyncio.sleep(0.5)
         for plant in ("a", "b", "c", "d"):
-            below = f"{part_of(plant, 2)}/{word(plant)}"
+            below = f"{part_of(plant, 2)}/{encode_name(plant)}"
             await asyncio.to_thread(published, where, [plant.encode()], below)
         for i, reader in enumerate(readers):
             mine = [plant for plant in "abcd" if part_of(plant, 2) == i]
@@ -223,7 +223,7 @@ def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatc
 
     async def report(url: str, environment: dict[str, str]) -> bool:
         """Whether the broker took it, or did not let us in twice."""
-        transport, before = make(address(url, environment)), caplog.text.count("trying again")
+        transport, before = make(parse_address(url, environment)), caplog.text.count("trying again")
         work = asyncio.create_task(transport.publish(outputs))
         async with asyncio.timeout(20):
             while not work.done() and caplog.text.count("trying again") < before + 2:

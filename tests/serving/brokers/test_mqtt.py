@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("paho")
 
 from heliograph.serving.brokers.mqtt import Mqtt
-from heliograph.serving.brokers.url import address
+from heliograph.serving.brokers.url import parse_address
 from heliograph.serving.output import Output
 
 CONNECT, PUBLISH, DISCONNECT = 1, 3, 14  # kinds of packets of MQTT 3.1.1
@@ -53,7 +53,7 @@ def serve(work: Callable[[Reluctant, Mqtt], Coroutine[None, None, None]]) -> Non
     async def run() -> None:
         broker = Reluctant()
         server = await asyncio.start_server(broker.serve, "127.0.0.1", 0)
-        transport = Mqtt(address(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}", {}))
+        transport = Mqtt(parse_address(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}", {}))
         async with asyncio.timeout(30):
             await until(transport._writer.client.is_connected)
             await work(broker, transport)

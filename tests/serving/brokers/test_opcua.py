@@ -11,13 +11,13 @@ from asyncua import Server, ua
 import heliograph as hg
 from heliograph.files.inspection import Topic, suggestion
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.listening import listen
 from heliograph.serving.brokers.opcua import Reporting, read_reporting, reporting_of
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.url import address
-from heliograph.serving.running import connected
+from heliograph.serving.brokers.url import parse_address
+from heliograph.serving.running import make_transport
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph_studies.live.server import free_port
@@ -66,10 +66,10 @@ def test_a_deadband_is_the_sender_of_a_node():
 
 
 def test_a_server_needs_sources_and_an_answer():
-    where = address("opc.tcp://me:secret@127.0.0.1:4840/plant", {})
+    where = parse_address("opc.tcp://me:secret@127.0.0.1:4840/plant", {})
     assert str(where) == "opc.tcp://127.0.0.1:4840/plant" and "secret" not in repr(where)
     with pytest.raises(InputError, match=r"opc\.tcp://.*: expected sources in the network's file"):
-        connected(where)
+        make_transport(where)
 
 
 @pytest.mark.real("OPC UA")
@@ -80,8 +80,8 @@ def test_what_the_server_states_is_read_and_subscribed():
         port = free_port()
         server = await served(port)
         sources = {VARIABLE: hg.files.json_field("value", "boiler", time="source_time")}
-        where = address(f"opc.tcp://127.0.0.1:{port}/plant", {})
-        transport = connected(where, translator=Translator(sources, network()))
+        where = parse_address(f"opc.tcp://127.0.0.1:{port}/plant", {})
+        transport = make_transport(where, translator=Translator(sources, network()))
         try:
             variable = server.get_node(VARIABLE)
             assert await reporting_of(variable) == Reporting(0.5, 0.1)
@@ -124,8 +124,8 @@ def test_a_server_that_starts_again_is_subscribed_again():
         port = free_port()
         server = await served(port)
         sources = {VARIABLE: hg.files.json_field("value", "boiler", time="source_time")}
-        where = address(f"opc.tcp://127.0.0.1:{port}/plant", {})
-        transport = connected(where, translator=Translator(sources, network()))
+        where = parse_address(f"opc.tcp://127.0.0.1:{port}/plant", {})
+        transport = make_transport(where, translator=Translator(sources, network()))
         try:
             (first,) = (await asyncio.wait_for(transport.receive(), 30)).payloads
             await stopped(server)
@@ -155,8 +155,11 @@ def test_a_change_is_a_step_of_a_node_whose_sender_has_the_deadband():
         net = hg.Network(plant, {"boiler": hg.Node(sensor, hg.perfect(), {"f": item}, trigger=trigger)})
         field = hg.files.json_field("value", "boiler", time="source_time", step=rule.interval)
         translator = Translator({VARIABLE: field}, net)
-        fleet = Fleet(Lanes(net), Options(window=20.0, step=translator.sources.step))
-        service, transport = Service(fleet, InMemoryStore()), connected(address(url, {}), translator=translator)
+        fleet = Fleet(NetworkProgram(net), Options(window=20.0, step=translator.sources.step))
+        service, transport = (
+            Service(fleet, InMemoryStore()),
+            make_transport(parse_address(url, {}), translator=translator),
+        )
         try:
             outputs = service.take((await asyncio.wait_for(transport.receive(), 30)).payloads)
             await asyncio.sleep(1.0)
@@ -186,7 +189,7 @@ def test_inspect_lists_the_variables_of_a_server_and_suggests_sources():
         server = await served(port)
         changes = asyncio.create_task(changed(server))
         try:
-            return await asyncio.to_thread(listen, address(f"opc.tcp://127.0.0.1:{port}/plant", {}), 2.0)
+            return await asyncio.to_thread(listen, parse_address(f"opc.tcp://127.0.0.1:{port}/plant", {}), 2.0)
         finally:
             changes.cancel()
             await stopped(server)

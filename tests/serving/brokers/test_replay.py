@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.files.recording import Recording, write_recording
 from heliograph.live.event import Event
-from heliograph.serving.brokers.replay import Link, along, lines, recorded, through
+from heliograph.serving.brokers.replay import Link, delay_as_traced, encode_messages, recorded, simulate_link
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from tests.serving.worlds import fleet, moving, stepping
@@ -32,7 +32,9 @@ def test_a_replayed_recording_gives_the_estimates_of_run(tmp_path, whole, dated)
     events, origin = recorded(tmp_path / "data.csv", network)
     assert (origin is not None) == dated
     service = Service(fleet(network), InMemoryStore())
-    known = service.take([line.encode() for _, line in lines(events, "", origin)]) + service.finish(ended=True)
+    known = service.take([line.encode() for _, line in encode_messages(events, "", origin)]) + service.finish(
+        ended=True
+    )
     finals = [json.loads(item.body) for item in known if item.kind == "final"]
     last = {final["time"]: final["estimates"] for final in finals}  # after all events of a time
     record = hg.run(network, *recording)
@@ -48,7 +50,7 @@ def test_a_link_loses_delays_and_doubles_as_it_says():
     """Of 20,000 messages, shares to 5 standard deviations; runs of 4 have a standard deviation below 4."""
     count = 20_000
     events = [Event("a", i, float(i), np.zeros(1)) for i in range(count)]
-    result = through(events, Link(loss=0.2, run=4.0, delay=1.5, duplicates=0.1), seed=0)
+    result = simulate_link(events, Link(loss=0.2, run=4.0, delay=1.5, duplicates=0.1), seed=0)
     arrivals = [event.arrival for event in result]
     assert arrivals == sorted(arrivals)
     received = np.zeros(count, dtype=int)
@@ -60,22 +62,22 @@ def test_a_link_loses_delays_and_doubles_as_it_says():
     assert abs(lost.sum() / begun - 4) < 5 * 4 / np.sqrt(begun)
     assert abs(np.mean(received[~lost] == 2) - 0.1) < 5 * np.sqrt(0.09 / count)
     assert abs(np.mean([e.arrival - e.time for e in result]) - 1.5) < 5 * 1.5 / np.sqrt(count)
-    single = through(events, Link(loss=0.5), seed=1)
+    single = simulate_link(events, Link(loss=0.5), seed=1)
     again = np.diff([event.sequence for event in single]) - 1
     assert abs(again[again > 0].mean() - 2) < 0.2 and abs(len(single) / count - 0.5) < 0.02
-    assert through(events[:50], Link(), 0) == [event._replace(arrival=event.time) for event in events[:50]]
-    assert through(events[:50], Link(loss=1.0), 0) == []
+    assert simulate_link(events[:50], Link(), 0) == [event._replace(arrival=event.time) for event in events[:50]]
+    assert simulate_link(events[:50], Link(loss=1.0), 0) == []
     with pytest.raises(ValueError, match="run"):
-        through(events, Link(loss=0.9, run=1.5), 0)
+        simulate_link(events, Link(loss=0.9, run=1.5), 0)
 
 
 def test_a_recorded_trace_is_followed_and_inputs_are_not_on_the_way(tmp_path):
     (tmp_path / "trace.csv").write_text("delay\n0.5\nnan\n2\n")
     events = [Event("inputs", 0, 0.0, [1.0]), *(Event("a", i, float(i), [0.0]) for i in range(6))]
-    result = along(events, tmp_path / "trace.csv")
+    result = delay_as_traced(events, tmp_path / "trace.csv")
     assert [(e.node, e.sequence, e.arrival) for e in result] == [
         ("inputs", 0, 0.0), ("a", 0, 0.5), ("a", 3, 3.5), ("a", 2, 4.0), ("a", 5, 7.0),
     ]  # fmt: skip
     (tmp_path / "trace.csv").write_text("lag\n0.5\n")
     with pytest.raises(ValueError, match="delay"):
-        along(events, tmp_path / "trace.csv")
+        delay_as_traced(events, tmp_path / "trace.csv")

@@ -23,7 +23,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.message import Message
-from heliograph.serving.running import connected
+from heliograph.serving.running import make_transport
 from heliograph_studies.live.server import Server, free_port
 from tests.serving.broker_servers import KINDS, at, running
 
@@ -141,20 +141,22 @@ def test_lines_without_a_topic_are_of_the_only_one(file):
 
 def test_sources_and_parts_exclude_each_other():
     from heliograph.live.fleet import Options
-    from heliograph.serving.brokers.url import address
+    from heliograph.serving.brokers.url import parse_address
     from heliograph.serving.running import ServiceSettings
 
     plant, sensor = hg.LinearPlant([[1.0]], [[1.0]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 1.0)
     network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {})})
     with pytest.raises(ValueError, match="--parts: expected messages in our own form"):
-        ServiceSettings(network, Options(1.0), "s.db", broker=address("nats://a", {}), parts=2, sources={"t": "f"})
+        ServiceSettings(
+            network, Options(1.0), "s.db", broker=parse_address("nats://a", {}), parts=2, sources={"t": "f"}
+        )
 
 
 @pytest.mark.real("NATS")
 def test_subjects_of_nats_are_the_same_sources(server, translator):
     async def work() -> None:
         where = at(server, "nats", "field")
-        transport = connected(where, translator=translator)
+        transport = make_transport(where, translator=translator)
         try:
             await asyncio.wait_for(transport._reading(), 20)
             client = await nats.connect(f"nats://{where.host}:{where.port}")
@@ -195,7 +197,7 @@ def test_the_stored_word_of_a_device_holds_for_a_service_that_begins_later(serve
         client.connect(where.host, where.port)
         client.loop_start()
         client.publish("den2mqtt/a/availability", b"offline", 1, retain=True).wait_for_publish(20)
-        transport = connected(where, translator=translator)
+        transport = make_transport(where, translator=translator)
         read = asyncio.ensure_future(transport.receive())
         try:
             # Brokers keep the order within a topic only: the word, the values, and "online" wait for each other.

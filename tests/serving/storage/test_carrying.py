@@ -8,9 +8,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.live.stored.carrier import Carrier
-from heliograph.live.stored.plant_codec import plant_from
+from heliograph.live.stored.plant_codec import unpack_plant
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
@@ -30,7 +30,7 @@ def network(noise: float = 0.04, names: str = "ab", states: tuple[str, ...] = ("
 
 
 def fleet(item: hg.Network, window: float = WINDOW) -> Fleet:
-    return Fleet(Lanes(item), Options(window))
+    return Fleet(NetworkProgram(item), Options(window))
 
 
 def sent(begin: int, end: int, names: str = "ab") -> list[bytes]:
@@ -66,7 +66,7 @@ def base(place: str, item: hg.Network) -> np.ndarray:
     """State of the filters after the base row of the stored plant, by leaf: (mean, covariance, moments of x) x node."""
     here = fleet(item)
     store = Store(place, identity(here))
-    plant = plant_from("p", store.load(["p"])["p"].body, here)
+    plant = unpack_plant("p", store.load(["p"])["p"].body, here)
     store.close()
     return here.pool.table[plant.rows.held[0].slot, here.pool.state].reshape(4, -1)
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.live.stored.plant_codec import plant_bytes, plant_from
+from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
@@ -52,9 +52,9 @@ def states(service):
     """What every plant holds, without the tallies, which duplicates change."""
     results = {}
     for name, item in service.store.load([f"p{i}" for i in range(4)]).items():
-        plant = plant_from(name, item.body, service.fleet)
+        plant = unpack_plant(name, item.body, service.fleet)
         plant.links, plant.forced = {}, 0
-        results[name] = plant_bytes(plant, service.fleet)
+        results[name] = pack_plant(plant, service.fleet)
     return results
 
 

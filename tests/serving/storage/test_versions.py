@@ -18,7 +18,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import Lanes
+from heliograph.live.lanes import NetworkProgram
 from heliograph.live.stored.carrier import Carrier
 from heliograph.numerics.check import InputError
 from heliograph.serving.service import Service
@@ -30,8 +30,8 @@ OPTIONS = Options(2.0, 0.1)
 
 
 @pytest.fixture(scope="module")
-def lanes() -> Lanes:
-    return Lanes(runpy.run_path(str(WRITTEN / "network.py"))["network"])
+def lanes() -> NetworkProgram:
+    return NetworkProgram(runpy.run_path(str(WRITTEN / "network.py"))["network"])
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_filters_go_on_where_the_nodes_have_changed_places_too(place, lanes):
     """Then all columns are others, so that a flag with the place of another number would change that."""
     item = lanes.network
     network = hg.Network(item.plant, {name: item.nodes[name] for name in ("b", "a")}, item.fused)
-    fleet = Fleet(Lanes(network), OPTIONS)
+    fleet = Fleet(NetworkProgram(network), OPTIONS)
     store = Store(str(place), identity(fleet), carrier=Carrier(fleet, identity(fleet), print))
     check_goes_on(finals(Service(fleet, store)))
     store.close()

@@ -11,8 +11,8 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.rows import BEFORE
-from heliograph.live.stored.layout import describe_old_layout, fits, parts_of, place_flags, relocate_parts
-from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, plant_bytes, plant_from
+from heliograph.live.stored.layout import can_read, describe_old_layout, place_flags, relocate_parts, split_by_path
+from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import Identity
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
@@ -24,7 +24,7 @@ LISTED = 4  # entries of an array that are named
 SAME = ("precision", "states", "inputs")  # what the rows of a plant mean
 
 
-def description(fleet: Fleet, covariances: bool = False) -> str:
+def describe_network(fleet: Fleet, covariances: bool = False) -> str:
     """Return the numbers of a network by name, and where the state of each filter stands in a row, as JSON.
 
     Args:
@@ -43,10 +43,10 @@ def description(fleet: Fleet, covariances: bool = False) -> str:
         "outputs": fleet.pool.step_rows.outputs.size,
         "filters": filters,
     }
-    return json.dumps({"values": {name: _values(tree) for name, tree in parts.items()}, "layout": layout})
+    return json.dumps({"values": {name: _numbers_by_path(tree) for name, tree in parts.items()}, "layout": layout})
 
 
-def _values(tree: PyTree) -> dict[str, object]:
+def _numbers_by_path(tree: PyTree) -> dict[str, object]:
     """Return the numbers of a tree by the path of their attributes."""
     results: dict[str, object] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
@@ -67,7 +67,7 @@ def _filter_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str
 
     def columns(state: PyTree) -> dict[str, np.ndarray]:
         """Number the next columns, by the path of each leaf."""
-        shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in parts_of(state).items()}
+        shapes: Mapping[str, Sequence[int]] = {path: part.shape for path, part in split_by_path(state).items()}
         shapes = describe_old_layout(shapes) if covariances else shapes
         return {
             path: np.array([next(free) for _ in range(prod(shape))]).reshape(shape) for path, shape in shapes.items()
@@ -122,28 +122,29 @@ class Carrier:
         try:
             self._old = json.loads(other[DESCRIPTION])["layout"]
             self._old["filters"] = place_flags(self._old["filters"])
-            lines = changes(self.mine, other)
+            lines = list_changes(self.mine, other)
         except (KeyError, ValueError, TypeError):
             raise fail(what, "a description of the network that it is of", "none") from None
         new = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
-        lines += [f"{name} begins with the initial law" for name in new if not self._goes_on(name, new)]
+        lines += [f"{name} begins with the initial law" for name in new if not self._has_counterpart(name, new)]
         for line in lines:
             self._say(f"{what}: {line}")
 
-    def _goes_on(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
+    def _has_counterpart(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
+        """Test whether the filter of this name had a state of the same layout before."""
         old, here = (
             {path: leaf[0] for path, leaf in side.get(name, {}).items()} for side in (self._old["filters"], new)
         )
-        return fits(old, here)
+        return can_read(old, here)
 
     def carried(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
         """Return plants, by name, as this network stores them."""
-        plants = {name: plant_from(name, self._translate(body), self.fleet) for name, body in bodies.items()}
+        plants = {name: unpack_plant(name, self._translate(body), self.fleet) for name, body in bodies.items()}
         # All rows after the base are stepped with what the network is now.
         for plant in plants.values():
             plant.dirty = 1 if len(plant.rows.held) > 1 else None
         self.fleet.step(plants.values())
-        results = {name: plant_bytes(plant, self.fleet) for name, plant in plants.items()}
+        results = {name: pack_plant(plant, self.fleet) for name, plant in plants.items()}
         for plant in plants.values():
             self.fleet.end(plant)
         return results
@@ -152,7 +153,7 @@ class Carrier:
         """Return a plant's bytes with the columns, places of nodes and counts of this network; rows not stepped."""
         old = self._old
         names, names_here = list(old["nodes"]), list(self.fleet.network.names)
-        same = [name for name in names if old["nodes"][name] == dict(self._sizes()).get(name)]
+        same = [name for name in names if old["nodes"][name] == dict(self._node_sizes()).get(name)]
         new_index = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
         received = sum(old["nodes"].values())
         parts = PlantParts.of(body, old["state"] + old["outputs"] + 2 * old["given"] + received + 2)
@@ -166,10 +167,10 @@ class Carrier:
         ]
         rows = [*rows[:ahead], *sorted(rows[ahead:])]
         number = {row[-1]: i for i, row in enumerate(rows)}
-        table = self._rows(parts.table[[row[-1] for row in rows]], new_index, names)
+        table = self._translate_rows(parts.table[[row[-1] for row in rows]], new_index, names)
         assert table.shape[1] == self.fleet.pool.table.shape[1]
         # Events, in the order of their rows.
-        ends = np.cumsum([self._size(names, int(node)) for _, node, _ in parts.events])
+        ends = np.cumsum([self._node_size(names, int(node)) for _, node, _ in parts.events])
         values = np.split(parts.values, ends[:-1]) if len(parts.events) else []
         stay = [i for i, (row, p, _) in enumerate(parts.events) if int(p) in new_index and int(row) in number]
         events = [(number[int(row)], new_index[int(p)], int(count)) for row, p, count in parts.events[stay]]
@@ -183,13 +184,15 @@ class Carrier:
             values=np.concatenate([np.zeros(0), *(values[i] for i in stay)]),
         ).to_bytes()
 
-    def _sizes(self) -> Iterator[tuple[str, int]]:
+    def _node_sizes(self) -> Iterator[tuple[str, int]]:
+        """How many numbers each node's events have here."""
         return ((name, node.received) for name, node in self.fleet.network.nodes.items())
 
-    def _size(self, names: Sequence[str], node: int) -> int:
+    def _node_size(self, names: Sequence[str], node: int) -> int:
+        """How many numbers an event of this node has, -1 standing for inputs."""
         return int(self._old["given"] if node < 0 else self._old["nodes"][names[node]])
 
-    def _rows(self, table: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
+    def _translate_rows(self, table: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
         """Return rows of the table with this network's columns."""
         old, pool, lanes = self._old, self.fleet.pool, self.fleet.lanes
         given, state = old["given"], old["state"]
@@ -198,7 +201,7 @@ class Carrier:
         translated[:, pool.state] = pool.step_rows.start
         filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
         for name, new in filters.items():
-            if self._goes_on(name, filters):
+            if self._has_counterpart(name, filters):
                 parts = {path: table[:, begin:end].reshape(len(table), *shape)
                          for path, (shape, begin, end) in old["filters"][name].items()}  # fmt: skip
                 for path, part in relocate_parts(parts, new).items():
@@ -218,7 +221,7 @@ class Carrier:
         return translated
 
 
-def changes(mine: Identity, other: Identity) -> list[str]:
+def list_changes(mine: Identity, other: Identity) -> list[str]:
     """List what has changed from the identity `other` to `mine`: options and versions, nodes and filters, numbers."""
     lines = [
         f"{name}: {other.get(name, 'none')} -> {mine.get(name, 'none')}"

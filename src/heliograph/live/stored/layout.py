@@ -19,14 +19,14 @@ Shapes = Mapping[str, Sequence[int]]  # of a state's parts, by their paths
 Columns = Mapping[str, Mapping[str, Sequence[Any]]]  # by filter and path a part's shape, and its columns' begin and end
 
 
-def parts_of(state: PyTree) -> dict[str, np.ndarray]:
+def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
     """Return the parts of a state by the path of their attributes, in their order."""
     return {
         jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]
     }
 
 
-def fits(old: Shapes, new: Shapes) -> bool:
+def can_read(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`: all shapes are there, or covariances."""
     shapes = {path: list(shape) for path, shape in old.items()}
     for stem in _find_factored(old, new):
@@ -39,7 +39,7 @@ def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[
     """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
     results, new = dict(parts), list(new)
     for stem in _find_factored(parts, new):
-        results[stem + LOWER], results[stem + VARIANCES] = factors(results.pop(stem + COVARIANCE))
+        results[stem + LOWER], results[stem + VARIANCES] = factorise(results.pop(stem + COVARIANCE))
     return {path: results[path] for path in new}
 
 
@@ -88,7 +88,7 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     return results
 
 
-def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def factorise(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return lower (..., n (n - 1) / 2) and variances (..., n) of covariances (..., n, n) that a filter computed.
 
     By elimination, of many at once; no pivot is known to less than n eps of its variance.

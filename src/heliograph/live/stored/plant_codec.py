@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.leap import Leap
-from heliograph.live.plant import Kept, LinkCounts, PlantState
+from heliograph.live.plant import BeforeLeap, LinkCounts, PlantState
 from heliograph.live.rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
@@ -59,7 +59,7 @@ class PlantParts(NamedTuple):
         return PlantParts(head, *arrays)
 
 
-def plant_bytes(plant: PlantState, fleet: Fleet) -> bytes:
+def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
     """Serialise a plant that has no pending changes."""
     rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
     origin = None if plant.origin is None else plant.origin.isoformat()
@@ -71,7 +71,7 @@ def plant_bytes(plant: PlantState, fleet: Fleet) -> bytes:
             "forced": plant.forced,
             "origin": origin,
             "links": links,
-            "leap": None if plant.leap is None else _leap_parts(plant.leap),
+            "leap": None if plant.leap is None else _pack_leap(plant.leap),
             BEFORE_LEAP: None if plant.kept is None else plant.kept.now,
         },
         [number for row in rows for number in row.key[1:]],
@@ -107,41 +107,42 @@ def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarra
     return array, at + len(bits) + values.nbytes
 
 
-def plant_from(name: str, data: bytes, fleet: Fleet) -> PlantState:
+def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     """Restore a plant from bytes, with its rows in slots of the fleet's table."""
     head, keys, events, table, times, values = PlantParts.of(data, fleet.pool.table.shape[1])
     # Rows, each in a new slot; then their events.
-    rows = [_row(fleet, numbers, *key) for numbers, key in zip(table, keys.tolist(), strict=True)]
+    rows = [_make_held_row(fleet, numbers, *key) for numbers, key in zip(table, keys.tolist(), strict=True)]
     begin = 0
     for time, (i, node, sequence) in zip(times.tolist(), events.tolist(), strict=True):
         end = begin + fleet.size(node)
         rows[i].events[node, sequence, time] = values[begin:end].tolist()
         begin = end
     before = head.get(BEFORE_LEAP)
-    kept = None if before is None else Kept(rows.pop(0), before)
+    kept = None if before is None else BeforeLeap(rows.pop(0), before)
     held = fleet.rows(rows[0])
     held.hold(rows)
     links = {node: LinkCounts(*numbers) for node, numbers in head["links"].items()}
     origin = head["origin"] and datetime.fromisoformat(head["origin"])
-    leap = None if head["leap"] is None else _leap(head["leap"])
+    leap = None if head["leap"] is None else _unpack_leap(head["leap"])
     return PlantState(name, held, head["now"], origin, forced=head["forced"], links=links, leap=leap, kept=kept)
 
 
-def _leap_parts(leap: Leap) -> dict[str, Any]:
+def _pack_leap(leap: Leap) -> dict[str, Any]:
     """Return a leap as a table of its parts."""
-    return leap._asdict() | {"earlier": None if leap.earlier is None else _leap_parts(leap.earlier)}
+    return leap._asdict() | {"earlier": None if leap.earlier is None else _pack_leap(leap.earlier)}
 
 
-def _leap(parts: Any) -> Leap:
+def _unpack_leap(parts: Any) -> Leap:
     """Read a leap; until version 0.3.0 it was a list: its time, the arrival before it, five numbers of each node."""
     if isinstance(parts, list):
         time, now, links = parts
         return Leap(time, time, now, {node: (numbers[2], numbers[4]) for node, numbers in links.items()})
     moments = {node: (at, latest) for node, (at, latest) in parts["moments"].items()}
-    return Leap(**parts | {"moments": moments, "earlier": parts["earlier"] and _leap(parts["earlier"])})
+    return Leap(**parts | {"moments": moments, "earlier": parts["earlier"] and _unpack_leap(parts["earlier"])})
 
 
-def _row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:
+def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:
+    """Make a row with an event of a node, or of the inputs."""
     slot = fleet.pool.take()
     fleet.pool.table[slot] = numbers
     row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.width)

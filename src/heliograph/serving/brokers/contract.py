@@ -110,7 +110,7 @@ class _Check:
         expected, arrived = [output.body for output in outputs], list[bytes]()
         for _ in range(1 + int(self.patience / PAUSE)):
             published = await self._soon("published", self.broker.published())
-            arrived = _once(body for body in published if body != now.body)
+            arrived = _drop_repeated(body for body in published if body != now.body)
             if len(arrived) >= len(expected):
                 break
             await asyncio.sleep(PAUSE)
@@ -140,7 +140,7 @@ class _Check:
             missing, total = len(set(bodies) - set(received)), len(bodies)
             what = f"receive: expected {total} messages within {self.patience:g} s, {missing} did not come"
             raise AssertionError(what) from None
-        return _once(received)
+        return _drop_repeated(received)
 
     async def _for_a_while(self, transport: Transport, acknowledge: bool = False) -> list[bytes]:
         """Receive for `silence` seconds, then cancel; return the bodies that arrived."""
@@ -179,5 +179,6 @@ class _Check:
         ]
 
 
-def _once(bodies: Iterable[bytes]) -> list[bytes]:
+def _drop_repeated(bodies: Iterable[bytes]) -> list[bytes]:
+    """Return bodies in their order without those that came again."""
     return list(dict.fromkeys(bodies))

@@ -35,6 +35,7 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
 
 
 def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
+    """Note all messages of an MQTT broker by topic for so many seconds, but for those that it had stored before."""
     from paho.mqtt.client import Client, ConnectFlags, MQTTMessage
     from paho.mqtt.enums import CallbackAPIVersion
     from paho.mqtt.properties import Properties

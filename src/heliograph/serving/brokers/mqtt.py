@@ -12,7 +12,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST, WHOLE, Batch, Part, topic_of, why
+from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST, WHOLE, Batch, Part, explain_failure, topic_of
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -85,7 +85,9 @@ class _Connection:
     def failed(self, client: Client, data: object) -> None:
         """Report that nobody answers there, or nobody who is trusted."""
         if self.open:
-            LOG.warning("%s: %s; trying again", self.address, why(sys.exc_info()[1]))  # called where it was caught
+            LOG.warning(
+                "%s: %s; trying again", self.address, explain_failure(sys.exc_info()[1])
+            )  # called where it was caught
 
     def close(self) -> None:
         with self.room:
@@ -120,7 +122,7 @@ class _Reader(_Connection):
                 if not self._held:
                     self._came.clear()
                 self.room.notify_all()
-            payloads = [payload for _, message, arrival in batch for payload in self._payloads(message, arrival)]
+            payloads = [payload for _, message, arrival in batch for payload in self._read_payloads(message, arrival)]
 
         async def acknowledge() -> None:
             for connection, message, _ in batch:
@@ -128,7 +130,7 @@ class _Reader(_Connection):
 
         return Batch(payloads, acknowledge)
 
-    def _payloads(self, message: MQTTMessage, arrival: datetime) -> Sequence[Payload]:
+    def _read_payloads(self, message: MQTTMessage, arrival: datetime) -> Sequence[Payload]:
         """Return a message in our form as it is, and of another topic what the sources read in it."""
         if self._translator is None or message.topic.startswith(self._prefix):
             return [bytes(message.payload)]
@@ -167,7 +169,7 @@ class _Writer(_Connection):
     def __init__(self, address: Address):
         super().__init__(address, "")
         self._arrived: set[int] = set()  # numbers of what the broker has
-        self.client.on_publish = self._has
+        self.client.on_publish = self._note_received
         self.start()
 
     def publish(self, outputs: Sequence[Output]) -> None:
@@ -182,7 +184,8 @@ class _Writer(_Connection):
             self.room.wait_for(lambda: sent <= self._arrived or not self.open)
             self._arrived.clear()
 
-    def _has(self, client: Client, data: object, number: int, code: ReasonCode, more: object) -> None:
+    def _note_received(self, client: Client, data: object, number: int, code: ReasonCode, more: object) -> None:
+        """Note that the broker has the message with this number."""
         with self.room:
             self._arrived.add(number)
             self.room.notify_all()

@@ -32,7 +32,7 @@ from heliograph.serving.brokers.transport import (
     Part,
     Retry,
     TakenOverError,
-    still_needed,
+    raise_if_cancelled,
     topic_of,
 )
 from heliograph.serving.brokers.url import Address
@@ -70,7 +70,7 @@ class Nats:
 
     async def receive(self) -> Batch | None:
         while True:
-            still_needed()
+            raise_if_cancelled()
             # A request that times out is repeated; a broken connection gets a new consumer.
             reader = await self._persist(self._reading)
             try:
@@ -90,19 +90,19 @@ class Nats:
                 self._reader = None
                 continue
             self._read = count
-            payloads = [payload for message in messages for payload in self._payloads(message)]
+            payloads = [payload for message in messages for payload in self._read_payloads(message)]
             if payloads:
                 return Batch(payloads, partial(self._acknowledge, messages[-1]))
             await self._acknowledge(messages[-1])  # topics that nobody reads
 
-    def _payloads(self, message: Msg) -> Sequence[Payload]:
+    def _read_payloads(self, message: Msg) -> Sequence[Payload]:
         """Return a message in our form as it is, and of another subject what the sources read in it."""
         if self._translator is None or message.subject.startswith(f"{self.topic}.in."):
             return [message.data]
         return self._translator.read(message.subject.replace(".", "/"), message.data, message.metadata.timestamp)
 
     @property
-    def _subjects(self) -> list[str]:
+    def _list_subjects(self) -> list[str]:
         """Return the subjects of the sources, with the wildcards of NATS."""
         topics = [] if self._translator is None else self._translator.sources.subscribed
         return [topic.replace("/", ".").replace("+", "*").replace("#", ">") for topic in topics]
@@ -145,7 +145,8 @@ class Nats:
                 self._retry.worked()
                 return done
 
-    def _connected(self) -> bool:
+    def _require_connection(self) -> bool:
+        """Return the connection, which `start` opened."""
         return self._client.is_connected
 
     async def _open(self) -> JetStreamContext:
@@ -186,7 +187,7 @@ class Nats:
 
     async def _reading(self) -> JetStreamContext.PullSubscription:
         """Return a consumer of this part that begins after the last acknowledged message; remove all others."""
-        if self._reader is not None and self._connected():
+        if self._reader is not None and self._require_connection():
             return self._reader
         server = await self._open()
         newest = await self._made(server)
@@ -201,13 +202,14 @@ class Nats:
         self._acknowledged = min(max([begun, *floors]), newest)
         # Make the new consumer before the others are removed.
         self._name, self._read = mine + uuid.uuid4().hex[:12], 0
-        await server.add_consumer(self.stream, self._consumer())
+        await server.add_consumer(self.stream, self._configure_consumer())
         self._reader = await server.pull_subscribe_bind(self._name, self.stream)
         for other in others:
             await server.delete_consumer(self.stream, other.name)
         return self._reader
 
-    def _consumer(self) -> ConsumerConfig:
+    def _configure_consumer(self) -> ConsumerConfig:
+        """Settings of the consumer: this part's messages in order, from the first that was not acknowledged."""
         return ConsumerConfig(
             durable_name=self._name,
             deliver_policy=DeliverPolicy.BY_START_SEQUENCE,
@@ -216,7 +218,7 @@ class Nats:
             ack_wait=UNTOUCHED,
             max_ack_pending=4 * MOST,
             filter_subject=f"{self.topic}.in.{self.part.number}.*" if self.part.of > 1 else None,
-            filter_subjects=None if self.part.of > 1 else [f"{self.topic}.in.*", *self._subjects],
+            filter_subjects=None if self.part.of > 1 else [f"{self.topic}.in.*", *self._list_subjects],
         )
 
     async def _made(self, server: JetStreamContext) -> int:
@@ -230,7 +232,7 @@ class Nats:
         source, parts = f"{self.topic}.in.*", self.part.of
         target = f"{self.topic}.in.{{{{partition({parts},1)}}}}.{{{{wildcard(1)}}}}"
         transform = SubjectTransform(source, target) if parts > 1 else None
-        subjects = [source, *self._subjects]
+        subjects = [source, *self._list_subjects]
         expected = StreamConfig(self.stream, subjects=subjects, storage=StorageType.FILE, subject_transform=transform)
         info = await _stream(server, expected)
         known = info.config.subject_transform

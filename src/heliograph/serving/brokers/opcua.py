@@ -19,7 +19,7 @@ from heliograph.numerics.check import fail, items, show_value, text
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import Batch, Retry, nothing
-from heliograph.serving.brokers.url import Address, address
+from heliograph.serving.brokers.url import Address, parse_address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
@@ -69,14 +69,14 @@ def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
         ValueError: no server there, an unknown variable; one line.
         ModuleNotFoundError: asyncua is not installed (extra "opcua").
     """
-    where = address(url)
+    where = parse_address(url)
     if where.kind != "opc.tcp":
         raise fail("url", "opc.tcp://host:port/path", where.kind)
     names = [text("variable", name) for name in items("variables", variables, "identifiers")]
 
     async def work() -> dict[str, Reporting]:
         async with Client(url, timeout=WAIT) as client:
-            return {name: await reporting_of(_node(client, name)) for name in names}
+            return {name: await reporting_of(_find_node(client, name)) for name in names}
 
     try:
         return asyncio.run(work())
@@ -114,11 +114,11 @@ class OpcUa:
     subscribed is lost, except for its last value.
     """
 
-    def __init__(self, address: Address, translator: Translator, target: int = 1):
-        self.address, self._translator = address, translator
-        self._output, self._retry = Pipe(target=target), Retry(str(address))
+    def __init__(self, parse_address: Address, translator: Translator, target: int = 1):
+        self.address, self._translator = parse_address, translator
+        self._output, self._retry = Pipe(target=target), Retry(str(parse_address))
         self._came: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
-        self._client: Client | None = None
+        self._make_client: Client | None = None
         self._first: set[str] = set()  # variables of which the first value is still to come
         self.reporting: dict[str, Reporting] = {}
 
@@ -138,13 +138,13 @@ class OpcUa:
         await self._output.publish(outputs)
 
     async def close(self) -> None:
-        if self._client is not None:
+        if self._make_client is not None:
             with contextlib.suppress(*AWAY):
-                await asyncio.wait_for(self._client.disconnect(), WAIT)
+                await asyncio.wait_for(self._make_client.disconnect(), WAIT)
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
         """Translate a change; the first value of a subscription was there before, as a stored message."""
-        name, body = _message(node, val, data)
+        name, body = _translate_change(node, val, data)
         stored = name in self._first
         self._first.discard(name)
         self._came.put_nowait(self._translator.read(name, body, datetime.now(UTC), stored))
@@ -153,25 +153,25 @@ class OpcUa:
         """Connect and subscribe, again and again while the server is away."""
         while True:
             try:
-                if self._client is not None:
-                    await self._client.check_connection()
+                if self._make_client is not None:
+                    await self._make_client.check_connection()
                     return
                 await self._subscribe()
                 self._retry.worked()
                 return
             except AWAY as error:
-                if self._client is not None:
+                if self._make_client is not None:
                     with contextlib.suppress(*AWAY):
-                        await self._client.disconnect()
-                self._client = None
+                        await self._make_client.disconnect()
+                self._make_client = None
                 await self._retry.wait(error)
 
     async def _subscribe(self) -> None:
-        client = _client(self.address)
+        client = _make_client(self.address)
         await client.connect()
-        self._client = client
+        self._make_client = client
         for name in self._translator.sources.subscribed:
-            node = _node(client, name)
+            node = _find_node(client, name)
             self._first.add(node.nodeid.to_string())
             self.reporting[name] = await _monitor(client, node, self)
 
@@ -192,7 +192,7 @@ class Listener:
             ValueError: no server there; one line.
         """
         try:
-            async with _client(where) as client:
+            async with _make_client(where) as client:
                 for node in await _variables(client):
                     self.kinds[node.nodeid.to_string()] = (await node.read_data_type_as_variant_type()).name
                     rule = await _monitor(client, node, self)
@@ -206,14 +206,15 @@ class Listener:
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
         """Note a change."""
-        name, body = _message(node, val, data)
+        name, body = _translate_change(node, val, data)
         stored = name not in self.topics
         note(self.topics, name, body, time.time_ns())
         if stored:
             del self.topics[name].logged[:], self.topics[name].late[:]
 
 
-def _client(where: Address) -> Client:
+def _make_client(where: Address) -> Client:
+    """Make a client of the server at an address, with its user and password if it has any."""
     logging.getLogger("asyncua").setLevel(logging.ERROR)  # it warns of what a server grants less of than it asks for
     client = Client(str(where), timeout=WAIT)
     if where.user is not None:
@@ -249,19 +250,20 @@ async def _variables(client: Client) -> list[Node]:
     return variables
 
 
-def _message(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
+def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
     """Return the topic of a change and its message; null is a value of bad quality."""
     sample = data.monitored_item.Value
     good = sample.StatusCode is None or sample.StatusCode.is_good()
     content = {
         "value": value if good and isinstance(value, bool | int | float) else None if not good else show_value(value),
-        "source_time": _iso(sample.SourceTimestamp),
-        "server_time": _iso(sample.ServerTimestamp),
+        "source_time": _format_date(sample.SourceTimestamp),
+        "server_time": _format_date(sample.ServerTimestamp),
     }
     return node.nodeid.to_string(), json.dumps(content).encode()
 
 
-def _node(client: Client, name: str) -> Node:
+def _find_node(client: Client, name: str) -> Node:
+    """Return the server's node with this identifier, or refuse an identifier that is none."""
     try:
         return client.get_node(name)
     except (UaError, ValueError):
@@ -283,7 +285,8 @@ async def _property(node: Node, name: str) -> object:
     return None
 
 
-def _iso(moment: datetime | None) -> str | None:
+def _format_date(moment: datetime | None) -> str | None:
+    """Return a date as ISO 8601 in UTC; the server's dates have no zone."""
     if moment is None:
         return None
     return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).isoformat()

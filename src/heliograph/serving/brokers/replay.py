@@ -70,7 +70,7 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     return events, None if steps else origin
 
 
-def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
+def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
     """Simulate a link: return the events that arrive, in order of arrival. Inputs arrive at once and are never lost.
 
     Losses form a two-state Markov chain per node: P(loss | loss) = 1 - 1/run, and P(loss | no loss) such that the
@@ -97,18 +97,18 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
     arriving, lost = list[Event](), dict[str, bool]()
     for event in events:
         if event.node == INPUTS:
-            arriving.append(_arriving(event, 0.0))
+            arriving.append(_delay_event(event, 0.0))
             continue
         # The first state of the chain is drawn from the stationary law.
         before = lost.get(event.node, chance.random() < loss)
         now = chance.random() < (stays if before and link.run > 1 else falls)
         lost[event.node] = now
         copies = 0 if now else 1 + (chance.random() < twice)
-        arriving += [_arriving(event, chance.exponential(link.delay)) for _ in range(copies)]
+        arriving += [_delay_event(event, chance.exponential(link.delay)) for _ in range(copies)]
     return _sort_events(arriving)
 
 
-def along(events: Sequence[Event], trace: Path) -> list[Event]:
+def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     """Delay events as in a recorded trace, and return those that arrive, in order of arrival.
 
     The trace has one row for each message, and is repeated from its start if there are more messages. Inputs arrive at
@@ -130,11 +130,11 @@ def along(events: Sequence[Event], trace: Path) -> list[Event]:
         raise fail(f"trace {trace}, column {DELAY!r}", "no negative number", float(np.nanmin(delays)))
     received = [event for event in events if event.node != INPUTS]
     known = zip(received, np.resize(delays, len(received)).tolist(), strict=True)
-    results = [_arriving(event, delay) for event, delay in known if not np.isnan(delay)]
-    return _sort_events(results + [_arriving(event, 0.0) for event in events if event.node == INPUTS])
+    results = [_delay_event(event, delay) for event, delay in known if not np.isnan(delay)]
+    return _sort_events(results + [_delay_event(event, 0.0) for event in events if event.node == INPUTS])
 
 
-def lines(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
+def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
     """Encode each event as a message, with the time of its arrival.
 
     Args:
@@ -149,14 +149,15 @@ def lines(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> 
         arrival = event.time if event.arrival is None else event.arrival
         values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]
         parts = {"plant": plant} if plant else {}
-        moments = {"time": _moment(event.time, origin), "arrival": _moment(arrival, origin)}
+        moments = {"time": _date_or_number(event.time, origin), "arrival": _date_or_number(arrival, origin)}
         yield (
             arrival,
             json.dumps(parts | {"node": event.node, "sequence": int(event.sequence)} | moments | {"values": values}),
         )
 
 
-def _arriving(event: Event, delay: float) -> Event:
+def _delay_event(event: Event, delay: float) -> Event:
+    """Return an event that arrives so much later."""
     began = event.time if event.arrival is None else event.arrival
     return event._replace(arrival=began + float(delay))
 
@@ -165,7 +166,8 @@ def _sort_events(events: list[Event]) -> list[Event]:
     return sorted(events, key=lambda event: event.time if event.arrival is None else event.arrival)
 
 
-def _moment(time: float, origin: np.datetime64 | None) -> float | str:
+def _date_or_number(time: float, origin: np.datetime64 | None) -> float | str:
+    """Return a time as messages have it: a date where time 0 has one, else the number."""
     if origin is None:
         return float(time)
     microseconds = np.timedelta64(round(time * 1e6), "us")  # what a message keeps of a date

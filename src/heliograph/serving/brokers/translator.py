@@ -81,7 +81,7 @@ class Translator:
             return [payload]
         topic, inner, came, stored = logged
         try:
-            arrival = None if came is None else moment(parse_arrival(came, f"{topic}, arrival"))
+            arrival = None if came is None else date_of(parse_arrival(came, f"{topic}, arrival"))
         except InputError as error:
             return [str(error)]
         return list(self._read(topic, inner.encode(), arrival, stored, again=False))
@@ -119,7 +119,7 @@ class Translator:
                 if stored and reading.time is None:
                     self._stored += 1
                     continue
-                results.append(self._message(topic, reading, arrival, again))
+                results.append(self._make_message(topic, reading, arrival, again))
                 self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.asked(topic))
                 for said in self.sources.senders.news():
                     LOG.warning("%s", said)
@@ -133,11 +133,12 @@ class Translator:
         if unread.counted is None:
             return why
         try:
-            return UnreadMessage(self._message(topic, unread.counted, known, again), why)
+            return UnreadMessage(self._make_message(topic, unread.counted, known, again), why)
         except InputError:
             return why
 
-    def _message(self, topic: str, reading: Reading, known: datetime | None, again: bool) -> Message:
+    def _make_message(self, topic: str, reading: Reading, known: datetime | None, again: bool) -> Message:
+        """Make the message of a reading, with the arrival that is known, else now, and a number if it has no count."""
         if len(reading.plant) > NAME or "\0" in reading.plant:
             raise fail(
                 f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", show_value(reading.plant)
@@ -149,7 +150,7 @@ class Translator:
         if reading.time is not None and self.sources.steps and self.sources.step is None:
             time = float(reading.time)
         elif reading.time is not None:
-            time = moment(reading.time)
+            time = date_of(reading.time)
             if known is not None and (arrival - time) // MICROSECOND * 1000 > YEAR:
                 what = f"{topic}, time"
                 raise fail(what, f"a time that was set, near that of arrival, {arrival.isoformat()}", time.isoformat())
@@ -157,7 +158,7 @@ class Translator:
             came = arrival if time > arrival or (known is not None and not again) else None
         sequence, name = reading.sequence, (reading.plant, reading.node)
         if sequence is None:
-            sequence = self._counts[name] if reading.time is None else self._order(reading, again)
+            sequence = self._counts[name] if reading.time is None else self._number_among_equals(reading, again)
             self._counts[name] += 1
         # Checked already, and dates are no texts here.
         return Message.model_construct(
@@ -170,7 +171,7 @@ class Translator:
             arrival=came,
         )
 
-    def _order(self, reading: Reading, again: bool) -> int:
+    def _number_among_equals(self, reading: Reading, again: bool) -> int:
         """Return the number of a message without a count among those of its node and time."""
         assert reading.time is not None
         values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
@@ -183,7 +184,7 @@ class Translator:
         return len(values) - 1
 
 
-def moment(nanoseconds: int) -> datetime:
+def date_of(nanoseconds: int) -> datetime:
     """Return a date, to the microsecond, from nanoseconds since 1970.
 
     Raises:

@@ -71,14 +71,14 @@ LOG = logging.getLogger("heliograph.serving")
 FIRST, LONGEST = 0.25, 30.0  # seconds
 
 
-def still_needed() -> None:
+def raise_if_cancelled() -> None:
     """Raise the cancellation again if this task was cancelled: a client may have swallowed it."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
 
 
-def why(error: BaseException | None) -> str:
+def explain_failure(error: BaseException | None) -> str:
     """Return in words why there is no connection; no part of it is a password."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not trusted: {error.verify_message}"
@@ -101,9 +101,9 @@ class Retry:
 
     async def wait(self, error: Exception) -> None:
         """Log the failure, and wait before the next attempt."""
-        still_needed()
+        raise_if_cancelled()
         wait = self._wait * random.uniform(0.5, 1.0)
-        LOG.warning("%s: %s; trying again in %.1f s", self.what, why(error), wait)
+        LOG.warning("%s: %s; trying again in %.1f s", self.what, explain_failure(error), wait)
         self._wait = min(2 * self._wait, LONGEST)
         await asyncio.sleep(wait)
 
@@ -117,7 +117,7 @@ OFFSET, PRIME = 0x811C9DC5, 0x01000193
 NAMELESS = "_"  # the word for the plant that has no name
 
 
-def word(plant: str) -> str:
+def encode_name(plant: str) -> str:
     """Encode a plant's name as one word of a topic or subject: letters, digits and hyphens stay, others become %XX.
 
     Args:
@@ -130,8 +130,8 @@ def word(plant: str) -> str:
 def topic_of(topic: str, output: Output) -> str:
     """Return the topic of an output of the service at `topic`; of a message to a node the input of its service."""
     if output.kind == "message":
-        return "/".join([*topic.split("/")[:-1], word(output.to), "in", word(output.plant)])
-    return f"{topic}/out/{output.kind}/{word(output.plant)}"
+        return "/".join([*topic.split("/")[:-1], encode_name(output.to), "in", encode_name(output.plant)])
+    return f"{topic}/out/{output.kind}/{encode_name(output.plant)}"
 
 
 def part_of(plant: str, parts: int) -> int:
@@ -146,6 +146,6 @@ def part_of(plant: str, parts: int) -> int:
     """
     check_count("parts", parts)
     value = OFFSET
-    for byte in word(plant).encode():
+    for byte in encode_name(plant).encode():
         value = (value ^ byte) * PRIME & 0xFFFFFFFF
     return value % parts

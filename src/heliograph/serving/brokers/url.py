@@ -53,7 +53,7 @@ class Address:
         return context
 
 
-def address(url: str, environment: Mapping[str, str] | None = None) -> Address:
+def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Address:
     """A broker's URL, SCHEME://user:password@host:port/topic, as an address; the host must be there.
 
     User and password are taken from HELIOGRAPH_BROKER_USER and HELIOGRAPH_BROKER_PASSWORD if these are set, since other

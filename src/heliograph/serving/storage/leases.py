@@ -47,9 +47,9 @@ class Leases:
         Raises:
             AwayError: the database does not answer now.
         """
-        with self._answering(), self.engine.begin() as connection:
+        with self._raise_if_away(), self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
-            fair = self._fair(connection, now)
+            fair = self._fair_share(connection, now)
             leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
             held = [(row.number, row.process) for row in connection.execute(leased)]
             mine = [number for number, process in sorted(held) if process == self.process]
@@ -59,7 +59,8 @@ class Leases:
             return {number for number in expected if self._lease(connection, number, now)}
 
     @contextmanager
-    def _answering(self) -> Iterator[None]:
+    def _raise_if_away(self) -> Iterator[None]:
+        """Turn the database's error into one line that says it is away, where it is."""
         try:
             yield
         except SQLAlchemyError as error:
@@ -70,16 +71,16 @@ class Leases:
 
     def release(self, number: int) -> None:
         """Release one part to other processes."""
-        with self._answering(), self.engine.begin() as connection:
+        with self._raise_if_away(), self.engine.begin() as connection:
             connection.execute(delete(PARTS).where((PARTS.c.number == number) & (PARTS.c.process == self.process)))
 
     def leave(self) -> None:
         """Release everything to other processes."""
-        with self._answering(), self.engine.begin() as connection:
+        with self._raise_if_away(), self.engine.begin() as connection:
             connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
             connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
 
-    def _fair(self, connection: Connection, now: float) -> int:
+    def _fair_share(self, connection: Connection, now: float) -> int:
         """Return how many parts this process should have; the remainder goes to the first processes by name."""
         connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
         new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)

@@ -34,7 +34,7 @@ def name_of_process() -> str:
 
 
 @contextmanager
-def owned(location: str, process: str) -> Iterator[None]:
+def own_store(location: str, process: str) -> Iterator[None]:
     """Own a store for a block, for services of one name; the operating system, or the server, ends it with the process.
 
     A file has a lock of the operating system in a file beside it, which contains the owner's name; a database of
@@ -50,10 +50,10 @@ def owned(location: str, process: str) -> Iterator[None]:
     engine = engine_at(location)
     try:
         if engine.dialect.name == "postgresql":
-            with _session(engine, process):
+            with _lock_session(engine, process):
                 yield
         else:
-            with _file(str(engine.url.database), process):
+            with _lock_file(str(engine.url.database), process):
                 yield
     except SQLAlchemyError as error:
         where = engine.url.render_as_string(hide_password=True)
@@ -64,7 +64,8 @@ def owned(location: str, process: str) -> Iterator[None]:
 
 
 @contextmanager
-def _file(path: str, process: str) -> Iterator[None]:
+def _lock_file(path: str, process: str) -> Iterator[None]:
+    """Hold a lock on a file beside an SQLite store, which names the process that has it."""
     lock = f"{path}{'.' if process else ''}{''.join(c if c.isalnum() else '-' for c in process)}.lock"
     try:
         file = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
@@ -85,7 +86,8 @@ def _file(path: str, process: str) -> Iterator[None]:
 
 
 @contextmanager
-def _session(engine: Engine, process: str) -> Iterator[None]:
+def _lock_session(engine: Engine, process: str) -> Iterator[None]:
+    """Hold an advisory lock of PostgreSQL for the life of a session, whose application's name is the process's."""
     key = crc32(process.encode()) >> 1
     with engine.connect() as connection:
         connection.execute(text("SELECT set_config('application_name', :name, false)"),

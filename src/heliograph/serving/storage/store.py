@@ -10,7 +10,7 @@ from sqlalchemy import Column, Connection, Table, delete, func, inspect, select,
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
-from heliograph.live.stored.carrier import DESCRIPTION, LISTED, Carrier, changes
+from heliograph.live.stored.carrier import DESCRIPTION, LISTED, Carrier, list_changes
 from heliograph.live.stored.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
@@ -74,7 +74,7 @@ class Store:
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         try:
-            with self._saying("a database that can be written"):
+            with self._name_store_in_errors("a database that can be written"):
                 self.identity = self._read_identity(mine)
                 self._check_layout(carrier is not None or mine is None)
                 # The network must be the same, unless its plants are carried over or any will do.
@@ -97,7 +97,7 @@ class Store:
         if _strip_description(mine) == _strip_description(self.identity):
             return
         try:
-            differs = changes(mine, self.identity)
+            differs = list_changes(mine, self.identity)
         except (KeyError, ValueError, TypeError, AttributeError):  # without its numbers, or with damaged ones
             differs = []
         if differs:
@@ -107,12 +107,12 @@ class Store:
         check_same(f"store {self.name}", _strip_description(mine), _strip_description(self.identity))
 
     @contextmanager
-    def _saying(self, expected: str) -> Iterator[None]:
+    def _name_store_in_errors(self, expected: str) -> Iterator[None]:
         """Turn errors of the database into one line that names the store."""
         try:
             yield
         except UnicodeError:  # of a damaged one: the database's own complaint cites it
-            raise self._broken("bytes that are no text") from None
+            raise self._fail_unreadable("bytes that are no text") from None
         except SQLAlchemyError as error:
             said = getattr(error, "orig", None) or type(error).__name__
             if is_away(error):
@@ -124,7 +124,7 @@ class Store:
         # All tables are there, or none: a store with some missing is damaged.
         there = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
         if there and there != set(TABLES.tables):
-            raise self._broken(f"no table {', '.join(sorted(set(TABLES.tables) - there))}")
+            raise self._fail_unreadable(f"no table {', '.join(sorted(set(TABLES.tables) - there))}")
         TABLES.create_all(self._engine)
         with self._engine.begin() as connection:
             # A store without an identity is new, unless it has counted something.
@@ -133,7 +133,7 @@ class Store:
             ).scalar()
             if stored is None:
                 if connection.execute(select(func.count()).select_from(NUMBERS)).scalar():
-                    raise self._broken("no network that it is of")
+                    raise self._fail_unreadable("no network that it is of")
                 if mine is None:
                     raise fail(f"store {self.name}", "plants to begin from", "an empty one")
                 connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
@@ -141,7 +141,7 @@ class Store:
         try:
             identity = dict(json.loads(stored))
         except (ValueError, TypeError):
-            raise self._broken("no network that it is of") from None
+            raise self._fail_unreadable("no network that it is of") from None
         return {LAYOUT_KEY: "1"} | identity
 
     def _check_layout(self, carried: bool) -> None:
@@ -160,14 +160,15 @@ class Store:
             if self._engine.dialect.name == "sqlite":
                 said = connection.exec_driver_sql("PRAGMA integrity_check(1)").scalar()
                 if said != "ok":
-                    raise self._broken(f"{said}")
+                    raise self._fail_unreadable(f"{said}")
             for rows in connection.execution_options(yield_per=AT_ONCE).execute(select(PLANTS)).partitions():
                 for name, version, body, written in rows:
                     if not is_whole(written, name, version, body):
                         results[str(name)] = Damage(is_named(written, name), written)
         return results
 
-    def _broken(self, what: str) -> InputError:
+    def _fail_unreadable(self, what: str) -> InputError:
+        """The error of a store that cannot be read."""
         return fail(f"store {self.name}", "a database as it was written", f"one that is damaged: {what}")
 
     @property
@@ -179,27 +180,30 @@ class Store:
     def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
         """Load the stored plants of these names; of some only damage may be left."""
         names = list(names)
-        with self._saying("a database that can be read"), self._engine.connect() as connection:
+        with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             rows = _select_plants(connection, list(PLANTS.c), names)
         results = {}
         for name, version, body, written in rows:
             whole = is_whole(written, name, version, body)
             results[name] = (
-                StoredPlant(version, body) if whole else StoredPlant(0, b"", self._damage(name, "a damaged one"))
+                StoredPlant(version, body)
+                if whole
+                else StoredPlant(0, b"", self._describe_damage(name, "a damaged one"))
             )
         nameless = [name for name, damage in self.damaged.items() if not damage.named]
         for name in names if nameless else ():
             got = f"none of that name, and damaged ones that may have had it: {', '.join(map(repr, nameless))}"
-            results.setdefault(name, StoredPlant(0, b"", self._damage(name, got)))
+            results.setdefault(name, StoredPlant(0, b"", self._describe_damage(name, got)))
         return results
 
-    def _damage(self, name: str, got: str) -> str:
+    def _describe_damage(self, name: str, got: str) -> str:
+        """The damage of a row, and what stands in its place."""
         anew = f"--anew {quote(name)} begins it anew"
         return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
 
     def begin_anew(self, names: Iterable[str]) -> None:
         """Forget the plants of these names: each begins anew with its next message."""
-        with self._saying("a database that takes a commit"), self._engine.begin() as connection:
+        with self._name_store_in_errors("a database that takes a commit"), self._engine.begin() as connection:
             for name in names:
                 damage = self.damaged.pop(name, None)
                 nameless = damage is not None and not damage.named  # it may be no text that a name could equal
@@ -215,12 +219,13 @@ class Store:
         Raises:
             ConflictError: another process has committed one of the plants.
         """
-        with self._saying("a database that takes a commit"):
-            return self._commit(plants, entries, malformed, published)
+        with self._name_store_in_errors("a database that takes a commit"):
+            return self._commit_at_once(plants, entries, malformed, published)
 
-    def _commit(
+    def _commit_at_once(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
+        """One transaction: check the versions, then write plants, journal and counts."""
         with self._engine.begin() as connection:
             # The count locks the store for the other processes, which then see the new versions.
             newest = self._count(connection, NEWEST, len(entries))
@@ -259,25 +264,25 @@ class Store:
         """
         expected = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
         outputs = list[Output]()
-        with self._saying("a database that can be read"), self._engine.connect() as connection:
+        with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             for last, by, lines, written in connection.execute(expected):
                 if not is_whole(written, last, by, lines):
                     got = f"damage in those up to number {last}; {MEND} {self.name}"
                     raise fail(f"store {self.name}, journal", "entries as they were written", got)
                 if process in (None, by):
-                    outputs += [_output(line) for line in lines.split("\n")]
+                    outputs += [_parse_output(line) for line in lines.split("\n")]
         return outputs
 
     def number(self, name: str) -> int:
         """Return a stored count."""
-        with self._saying("a database that can be read"), self._engine.connect() as connection:
+        with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
         return 0 if row is None else self._count_written(*row)
 
     def words(self) -> dict[str, int]:
         """Return the last words of devices that are kept, as numbers by topic."""
         mine = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
-        with self._saying("a database that can be read"), self._engine.connect() as connection:
+        with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             rows = connection.execute(mine).all()
         return {name.removeprefix(WORD): self._count_written(name, value, written) for name, value, written in rows}
 
@@ -285,7 +290,7 @@ class Store:
         """Keep the last words of devices, by topic; a topic that is longer than a name may be is left out."""
         rows = [with_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
         if rows:
-            with self._saying("a database that can be written"), self._engine.begin() as connection:
+            with self._name_store_in_errors("a database that can be written"), self._engine.begin() as connection:
                 self._put(connection, NUMBERS, rows)
 
     def _count_written(self, name: str, value: int, written: int) -> int:
@@ -311,7 +316,7 @@ class Store:
     def begin_from(self, location: str, mine: Identity, carrier: Carrier | None = None) -> None:
         """Copy the plants of another store, which is not changed; those of another network by a carrier."""
         other = Store(location, mine if carrier is None else None)
-        saying = self._saying(f"a database that takes the plants of {other.name}")
+        saying = self._name_store_in_errors(f"a database that takes the plants of {other.name}")
         with saying, self._engine.begin() as here, other._engine.connect() as there:
             if here.execute(select(func.count()).select_from(PLANTS)).scalar():
                 raise fail(f"store {self.name}", f"no plants yet, to begin from {other.name}", "some")
@@ -324,12 +329,12 @@ class Store:
 
     def count(self) -> int:
         """Return the number of stored plants."""
-        with self._saying("a database that can be read"), self._engine.connect() as connection:
+        with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             return int(connection.execute(select(func.count()).select_from(PLANTS)).scalar_one())
 
     def names(self) -> list[str]:
         """Return the names of all stored plants."""
-        with self._saying("a database that can be read"), self._engine.connect() as connection:
+        with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             return [str(name) for name in connection.execute(select(PLANTS.c.name)).scalars()]
 
     def close(self) -> None:
@@ -362,7 +367,8 @@ def _select_plants(connection: Connection, columns: Sequence[Column[object]], na
     return results
 
 
-def _output(line: str) -> Output:
+def _parse_output(line: str) -> Output:
+    """Parse a line of the journal."""
     parts = json.loads(line)
     return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.stored.carrier import DESCRIPTION, description
+from heliograph.live.stored.carrier import DESCRIPTION, describe_network
 from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.numerics.check import InputError, instance
 from heliograph.serving.output import Kind, Output
@@ -100,7 +100,7 @@ def identity(fleet: Fleet) -> Identity:
     """
     instance("fleet", fleet, Fleet, "a Fleet")
     return network_identity(fleet.network, fleet.lanes.step_rows.program, fleet.options._asdict()) | {
-        DESCRIPTION: description(fleet)
+        DESCRIPTION: describe_network(fleet)
     }
 
 

@@ -21,7 +21,7 @@ IDENTITY_TABLE = Table("whose", TABLES, Column("name", String(20), primary_key=T
 
 def checksum(name: str | int, *values: str | int | bytes) -> int:
     """Return the CRC-32 of a row's name in the upper 31 of 63 bits, and of the name and all columns in the lower 32."""
-    return (crc32(f"{name}".encode()) >> 1) << 32 | _sum(name, values)
+    return (crc32(f"{name}".encode()) >> 1) << 32 | _checksum_row(name, values)
 
 
 def is_whole(written: object, name: object, *values: object) -> bool:
@@ -36,7 +36,8 @@ def is_named(written: object, name: object) -> bool:
     return isinstance(name, str) and isinstance(written, int) and written >> 32 == crc32(name.encode()) >> 1
 
 
-def _sum(name: str | int, values: Sequence[str | int | bytes]) -> int:
+def _checksum_row(name: str | int, values: Sequence[str | int | bytes]) -> int:
+    """The checksum of a row with this name and these columns."""
     checksum = crc32(f"{name}".encode())
     for value in values:
         data = value if isinstance(value, bytes) else f"{value}".encode()
