@@ -65,7 +65,7 @@ from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
-from .rows import (
+from .filter_data import (
     Filtered as Filtered,
 )
 from .linear.scheduled import (
@@ -94,7 +94,7 @@ from .gaussian.update import (
     Polytope as Polytope,
     ZeroMean as ZeroMean,
 )
-from .linear.truth import (
+from .linear.true_error import (
     TrueError as TrueError,
     true_error as true_error,
 )

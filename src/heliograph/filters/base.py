@@ -10,8 +10,8 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.filters.plausibility import Judgement, judge
-from heliograph.filters.rows import Filtered, filtered, over_rows
+from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
+from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
 from heliograph.filters.vector import check_vector
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -134,7 +134,7 @@ class AbstractFilter(Module):
         Raises:
             ValueError: data of another size than the filter's, infinite values, more steps than the filter covers.
         """
-        return filtered(self, z, u)
+        return run_over_data(self, z, u)
 
     def scan(
         self,
@@ -149,7 +149,7 @@ class AbstractFilter(Module):
             u: inputs, the one that led to each row.
             output: arrays of the state after a row, its innovation and its number.
         """
-        return over_rows(self, z, u, output)
+        return scan_inside_jit(self, z, u, output)
 
     def judge_step(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
@@ -303,18 +303,19 @@ def _call_with_state(filter: AbstractFilter, state: PyTree, function: Callable[.
         return function(filter, state, *data)
     except (AttributeError, IndexError, TypeError, ValueError):
         # A user's call says it, of the state that was given; those within its trace only fail.
-        if is_traced(state) or _form(state) == _form(filter.init()):
+        if is_traced(state) or _describe_structure(state) == _describe_structure(filter.init()):
             raise
         raise fail("state", "one of the filter's, as its init() returns", show_value(state)) from None
 
 
-def _form(state: PyTree) -> PyTree:
-    """Structure of a state, and the shapes of its arrays."""
+def _describe_structure(state: PyTree) -> PyTree:
+    """Return the structure of a state, and the shapes of its arrays."""
     return jax.tree.structure(state), [np.shape(leaf) for leaf in jax.tree.leaves(state)]
 
 
 @compile_on_call
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
+    """Compiled body of `AbstractFilter.step`."""
     after, _ = filter.correct(filter.predict(state, u, k), z, k)
     return after, filter.after_step(after, k)
 
@@ -329,7 +330,7 @@ def step_with_judgement(
     estimate = filter.after_step(after, k)
     estimates = filter.estimate(state), filter.estimate(prior), estimate
     spoilt = inputs_spoil(filter, filter.inputs, u, k)
-    judgement = judge(filter.claim, (state, prior, after), estimates, innovation, z, filter.of_atoms, spoilt)
+    judgement = judge_step(filter.claim, (state, prior, after), estimates, innovation, z, filter.of_atoms, spoilt)
     return after, estimate, judgement, innovation
 
 
@@ -337,6 +338,7 @@ def step_with_judgement(
 def _step_with_smoother(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, SmootherStep]:
+    """Compiled body of `AbstractFilter.step_with_smoother`."""
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     return after, add_nis(filter.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)
@@ -378,6 +380,7 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 def _check_calls(
     function: Callable[P, R], check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]]
 ) -> Callable[P, R]:
+    """Make a filter's method check its data and its step number, name a wrong state, and run compiled."""
     run = cast(Callable[..., R], compile_on_call(function))
 
     @wraps(function)

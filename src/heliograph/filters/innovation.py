@@ -89,7 +89,9 @@ class Weighed(NamedTuple):
         of the median the quantiles 1/2 -+ 1.96 / (2 sqrt N), with a of the innovations by ranks, which outliers do not
         hide.
         """
-        return tuple(_summary(*columns) for columns in zip(*(np.asarray(column).T for column in self), strict=True))
+        return tuple(
+            _summarise_output(*columns) for columns in zip(*(np.asarray(column).T for column in self), strict=True)
+        )
 
     def square_used(self) -> Float[np.ndarray, "time m"]:
         """Return the squares over their variances of those that count at least half, NaN for the others."""
@@ -139,7 +141,7 @@ class InnovationSummary(NamedTuple):
         return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {self.bias:.2g} +- {half:.1g}"
 
     def describe_left_out(self, filter: str, output: str) -> list[str]:
-        """Say in a line that a filter left out most values of an output, which outliers are not; nothing elsewhere."""
+        """Warn in a line where a filter left out most values of an output, which outliers are not; else empty."""
         if not self.share.low > MOST:
             return []
         return [
@@ -173,7 +175,8 @@ class InnovationSummary(NamedTuple):
         return outliers
 
 
-def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
+def _summarise_output(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
+    """Summarise one output's innovations (time,): counts, down-weighted share and median, each with its interval."""
     arrived = np.isfinite(value)
     e, w, d2 = value[arrived], weight[arrived], value[arrived] ** 2 / variance[arrived]
     down, count = int(np.sum(w < HALF)), len(e)

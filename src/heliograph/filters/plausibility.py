@@ -147,7 +147,7 @@ def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
     return distance, jnp.sum(present).astype(distance.dtype)
 
 
-def judge(
+def judge_step(
     claim: Claim, states: tuple[PyTree, PyTree, PyTree], estimates: tuple[Estimate, Estimate, Estimate],
     innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, spoilt: Array | bool = False,
 ) -> Judgement:  # fmt: skip
@@ -165,12 +165,14 @@ def judge(
     # Squared distance of each component given those before it, and which are determined.
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
-    every, certain = _squares(value, covariance, present, size)
+    every, certain = _squared_distances_in_turn(value, covariance, present, size)
     distance, count = jnp.sum(every), jnp.sum(present.astype(value.dtype))
 
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
-    squares, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
+    squares, determined = (
+        _squared_distances_in_turn(value, covariance, larger, size) if len(value) > 1 else (every, certain)
+    )
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
     far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
@@ -180,9 +182,11 @@ def judge(
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
 
     # States that stop being numbers, by the correction or already by the prediction.
-    sound = _sound(after, claim, prior)
-    unsound = (_sound(prior, claim, before) & ~sound) | _overflows(states[1], states[2])
-    predicted = (_finite(before, claim) & ~_is_prediction(prior, claim)) | _overflows(states[0], states[1])
+    sound = _is_sound_correction(after, claim, prior)
+    unsound = (_is_sound_correction(prior, claim, before) & ~sound) | _overflows(states[1], states[2])
+    predicted = (_is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)) | _overflows(
+        states[0], states[1]
+    )
     predicted |= spoilt
     reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
     came = (count > 0) | jnp.any(~jnp.isnan(z))  # also where what was expected is no number
@@ -195,44 +199,47 @@ def judge(
     return Judgement(distance, count, reason.astype(value.dtype), jnp.asarray(input_verdict))
 
 
-def _squares(value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the squared distances of the components in use, in turn, and which of these the others determine."""
+def _squared_distances_in_turn(
+    value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return e_j^2 / s_j of each component in use given those before it, and which of them the others determine."""
     padded = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
     squares, determined = squared_distances(padded, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
     return jnp.where(used, squares, 0.0), used & determined
 
 
-def _finite(estimates: Estimate, claim: Claim) -> jax.Array:
+def _is_finite_number(estimates: Estimate, claim: Claim) -> jax.Array:
+    """True if all means are finite numbers, and the covariances too where one is claimed."""
     finite = ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.mean)))
     return finite if claim == "none" else finite & ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.covariance)))
 
 
-def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
-    """Test for finite numbers, with no variance below zero by more than the rounding of the covariance before."""
+def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
+    """True if all is finite, and no variance is below zero by more than rounding of the covariance before."""
     if claim == "none":
-        return _finite(estimates, claim)
+        return _is_finite_number(estimates, claim)
     left, whole = jnp.diagonal(jnp.asarray(estimates.covariance)), jnp.diagonal(jnp.asarray(before.covariance))
     rounded = rounding(NEGATIVE_TOLERANCE, left) * jnp.where(jnp.isfinite(whole), jnp.abs(whole), 0.0)
-    return _finite(estimates, claim) & ~jnp.any(left < -rounded)
+    return _is_finite_number(estimates, claim) & ~jnp.any(left < -rounded)
 
 
-def _is_prediction(prior: Estimate, claim: Claim) -> jax.Array:
-    """Test for finite numbers and no negative variance, to the rounding of the largest: any may have moved into it."""
+def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
+    """True if all is finite and no variance negative, to the rounding of the largest, which may have moved there."""
     if claim == "none":
-        return _finite(prior, claim)
+        return _is_finite_number(prior, claim)
     variances = jnp.diagonal(jnp.asarray(prior.covariance))
     largest = jnp.max(jnp.abs(variances), initial=0.0)
-    return _finite(prior, claim) & ~jnp.any(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
+    return _is_finite_number(prior, claim) & ~jnp.any(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
     """Test whether some number of a state became infinite."""
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
-    items = [jnp.any(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
+    items = [jnp.any(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real_array(b)]
     return reduce(jnp.logical_or, items, jnp.asarray(False))
 
 
-def _is_real(leaf: Array) -> bool:
+def _is_real_array(leaf: Array) -> bool:
     return bool(jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating))
 
 

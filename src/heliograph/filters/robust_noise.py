@@ -1,4 +1,4 @@
-"""The noise that may hold outliers as it arrives behind a channel, and the channel without it."""
+"""Noise that may hold outliers, as it arrives behind a channel, and the channel without that noise."""
 
 from typing import NamedTuple
 
@@ -33,8 +33,8 @@ REGULAR = 1e-7  # least eigenvalue of a noise's correlations: with less, there i
 TOLERANCE = 1e-12  # of correlations and of gains, that are zero but for rounding
 
 
-class Law(NamedTuple):
-    """Gaussian branches of each received component's noise, about the noise's mean: (m, branches) each.
+class NoiseBranches(NamedTuple):
+    """Gaussian branches of each received component's noise: log probability, mean and variance, (m, branches) each.
 
     least: the branch's own noise, below which the variance of an innovation is not.
     """
@@ -71,8 +71,8 @@ class ReceivedNoise(Module):
     covariance: Float[jax.Array | np.ndarray, "m m"]
     degrees: Vector
 
-    def law(self, sensed: jax.Array) -> Law:
-        """Branches as they arrive, for a sensor's signal of this mean (p,).
+    def law(self, sensed: jax.Array) -> NoiseBranches:
+        """Mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensed` (p,).
 
         Branch j of a noise before the gain arrives with mean E[g] m_j and variance
         E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's spread acts on the signal and on the branch's
@@ -82,7 +82,7 @@ class ReceivedNoise(Module):
         signal = (self.output @ sensed)[:, None]
         least = power * self.variance + self.late_variance
         variance = least + (power - gain**2) * mean * (mean + 2 * signal)
-        return Law(
+        return NoiseBranches(
             jnp.asarray(self.log_share),
             jnp.asarray(gain * mean + self.late_mean),
             jnp.asarray(variance),
@@ -90,41 +90,45 @@ class ReceivedNoise(Module):
         )
 
 
-class SplitChannel(NamedTuple):
-    """A channel without the noise of its last hop that has outliers, and that noise (None: there is none)."""
+class ChannelAndNoise(NamedTuple):
+    """A channel whose last hop has no noise with outliers any more, and that noise (None: there is none)."""
 
     plain: AbstractRandomAffine
     noise: AbstractNoise | None
 
 
-def split(channel: AbstractRandomAffine) -> SplitChannel:
-    """Take the last hop's noise from a channel where its law has outliers; its mean stays."""
+def detach_outlier_noise(channel: AbstractRandomAffine) -> ChannelAndNoise:
+    """Replace the last hop's noise by its mean where its law has outliers; return the channel left and that noise."""
     match channel:
         case GainAndNoise() if has_outliers(channel.noise):
             still = Gaussian(np.zeros((channel.outputs, channel.outputs)), channel.noise.mean)
-            return SplitChannel(GainAndNoise(channel.law, channel.matrix, still), channel.noise)
+            return ChannelAndNoise(GainAndNoise(channel.law, channel.matrix, still), channel.noise)
         case Superposed() if has_outliers(channel.noise):
             still = Gaussian(np.zeros((channel.outputs, channel.outputs)), channel.noise.mean)
             plain = Superposed(channel.maps, still, channel.places, channel.inputs)
-            return SplitChannel(plain, channel.noise)
+            return ChannelAndNoise(plain, channel.noise)
         case Series():
             *before, last = channel.maps
-            end = split(last)
-            return SplitChannel(Series([*before, end.plain]), end.noise) if end.noise else SplitChannel(channel, None)
+            end = detach_outlier_noise(last)
+            return (
+                ChannelAndNoise(Series([*before, end.plain]), end.noise)
+                if end.noise
+                else ChannelAndNoise(channel, None)
+            )
         case Stack():
             # Parallel links are split one by one; one without outliers has no noise to take.
-            links = [split(affine) for affine in channel.maps]
+            links = [detach_outlier_noise(affine) for affine in channel.maps]
             if not any(link.noise for link in links):
-                return SplitChannel(channel, None)
+                return ChannelAndNoise(channel, None)
             noises = [link.noise or Gaussian(np.zeros((link.plain.outputs,) * 2)) for link in links]
-            return SplitChannel(Stack([link.plain for link in links]), Independent(noises))
-    return SplitChannel(channel, None)
+            return ChannelAndNoise(Stack([link.plain for link in links]), Independent(noises))
+    return ChannelAndNoise(channel, None)
 
 
-def received(
+def separate_outlier_noise(
     sensor: AnySensor, channel: Channel, apart: bool
 ) -> tuple[SecondOrder | OverTime, ReceivedNoise | OverTime]:
-    """The channel's moments without the noise that may hold outliers, and that noise as it arrives.
+    """Separate moments of z without the noise that may hold outliers from that noise as it arrives at the filter.
 
     `apart`: components are taken one after another, and must be independent.
 
@@ -133,21 +137,23 @@ def received(
     """
     steps = max((model.steps for model in (sensor, channel) if isinstance(model, OverTime)), default=None)
     if steps is None:
-        parted = split(first(channel))
+        parted = detach_outlier_noise(first(channel))
         plain = Polytope().describe(parted.plain)
-        return plain, received_noise(first(sensor).noise, parted.noise, plain, apart)
+        return plain, describe_outlier_noise(first(sensor).noise, parted.noise, plain, apart)
     channels = unstack(channel) if isinstance(channel, OverTime) else [channel] * steps
-    pieces = [split(step) for step in channels]
+    pieces = [detach_outlier_noise(step) for step in channels]
     plains = [Polytope().describe(piece.plain) for piece in pieces]
     noises = [
-        received_noise(at(sensor, k).noise, piece.noise, plain, apart)
+        describe_outlier_noise(at(sensor, k).noise, piece.noise, plain, apart)
         for k, (piece, plain) in enumerate(zip(pieces, plains, strict=True))
     ]
     return over_time(plains) if isinstance(channel, OverTime) else plains[0], over_time(noises)
 
 
-def received_noise(sensed: AbstractNoise, late: AbstractNoise | None, plain: SecondOrder, apart: bool) -> ReceivedNoise:
-    """The noise as it arrives: of the sensor, and `late` of the last hop, behind a channel described without it.
+def describe_outlier_noise(
+    sensed: AbstractNoise, late: AbstractNoise | None, plain: SecondOrder, apart: bool
+) -> ReceivedNoise:
+    """Describe the noise as it arrives: the sensor's behind the channel `plain`, and `late`, that of the last hop.
 
     Raises:
         ValueError: components that are correlated where they may not be, or mixed; no noise that could be weighed.
@@ -157,29 +163,29 @@ def received_noise(sensed: AbstractNoise, late: AbstractNoise | None, plain: Sec
     squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
     # Moments of the noise without its outliers, as it arrives.
     base, last = nominal(sensed), nominal(late) if late is not None else None
-    source = _sources(squares, base.covariance, plain)
+    source = _find_noisy_outputs(squares, base.covariance, plain)
     covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
     center = plain.mean_gain @ base.mean
     if last is not None:
         covariance, center = covariance + last.covariance, center + last.mean
-    _check(covariance, apart)
+    _check_weighable(covariance, apart)
     # Branches of the sensor's noise, and their pairs with those of the last hop's.
     log_share, mean, variance = (values[source] for values in branches(sensed))
     late_mean: Array = np.zeros(mean.shape)
     late_variance: Array = late_mean
     if late is not None:
-        log_share, mean, variance, late_mean, late_variance = _pairs(
+        log_share, mean, variance, late_mean, late_variance = _combine_branches(
             Branches(log_share, mean, variance), branches(late)
         )
     return ReceivedNoise(
         log_share=log_share, mean=mean, variance=variance, late_mean=late_mean, late_variance=late_variance,
         output=np.eye(p)[source], gain=plain.mean_gain[rows, source], power=squares[rows, source],
-        center=center, covariance=covariance, degrees=_degrees(sensed, late)[source],
+        center=center, covariance=covariance, degrees=_student_degrees(sensed, late)[source],
     )  # fmt: skip
 
 
-def _sources(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
-    """Output whose noise each received component brings, (m,).
+def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
+    """Find the sensor's output whose noise each received component brings, (m,).
 
     Raises:
         ValueError: one that brings the noise of several.
@@ -198,7 +204,7 @@ def _sources(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarra
     return np.asarray(np.argmax(brought, axis=1))
 
 
-def _check(covariance: Array, apart: bool) -> None:
+def _check_weighable(covariance: Array, apart: bool) -> None:
     """Raise ValueError where no noise could be weighed, or where components are correlated and may not be.
 
     Nor may they be tied: other weights would make another combination of them the one without noise, a wrong one.
@@ -220,8 +226,8 @@ def _check(covariance: Array, apart: bool) -> None:
         raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
 
 
-def _pairs(sensed: Branches, late: Branches) -> tuple[Array, ...]:
-    """All pairs of branches: log shares add up, means and variances stay apart."""
+def _combine_branches(sensed: Branches, late: Branches) -> tuple[Array, ...]:
+    """Combine every branch of the sensor with every one of the last hop: log probabilities add, moments are listed."""
     xp = library(sensed, late)
     shape = (len(sensed.mean), sensed.mean.shape[1], late.mean.shape[1])
 
@@ -235,8 +241,8 @@ def _pairs(sensed: Branches, late: Branches) -> tuple[Array, ...]:
             every(late.variance, False))  # fmt: skip
 
 
-def _degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
-    """Student's degrees of each output; NaN where the noise has another law."""
+def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
+    """Degrees of freedom of each output's Student noise; NaN where the noise has another law."""
     parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [
         component.degrees * np.ones(component.dimension) if isinstance(component, StudentT) and late is None

@@ -32,8 +32,8 @@ class StepTrace(NamedTuple):
     k: int | np.integer | Int[jax.Array, ""]
 
 
-class Point(NamedTuple):
-    """An earlier state x_j given the data so far, by the state x now: x_j = mean + M L^-1 (x - E x) + noise.
+class EarlierState(NamedTuple):
+    """An earlier state x_j regressed on the present state x: x_j = mean + M L^-1 (x - E x) + noise.
 
     Shapes: mean (N,), link M (N, N), lower (N (N - 1) / 2,) of L, noise (N, columns), uncorrelated with x.
     """
@@ -44,7 +44,7 @@ class Point(NamedTuple):
     noise: Columns
 
     def through(self, rows: jax.Array) -> jax.Array:
-        """M L^-1 times rows (N, ...)."""
+        """Return M L^-1 times rows (N, ...)."""
         return self.link @ decorrelate(unit_lower(self.lower), rows)
 
 
@@ -84,28 +84,30 @@ class SmootherStep(Module):
         return covariance
 
     def back(self, later: Gaussian) -> Gaussian:
-        """Law of the filter's state before the step, from that after the step, both given the same later data."""
+        """Smooth the state before the step from the state after it, both given the same later data (one RTS step)."""
         return smooth(self.before, later)
 
-    def start(self) -> Point:
-        """Return the state after this step as a point to be carried ahead."""
+    def start(self) -> EarlierState:
+        """Return the state after this step as an earlier state that is yet to be carried ahead."""
         n = len(self.after.mean)
-        return Point(self.after.mean, jnp.eye(n), jnp.zeros_like(self.after.lower), Columns(jnp.eye(n), jnp.zeros(n)))
+        return EarlierState(
+            self.after.mean, jnp.eye(n), jnp.zeros_like(self.after.lower), Columns(jnp.eye(n), jnp.zeros(n))
+        )
 
-    def ahead(self, point: Point) -> Point:
-        """Return an earlier state given this step's data too.
+    def ahead(self, point: EarlierState) -> EarlierState:
+        """Condition an earlier state on this step's data too.
 
         Before the step x = m + K e + d, so that x_j = mean + M L^-1 (K e + d) + noise, of which the data tell e alone.
         """
         before = self.before
         noise = Columns(point.through(before.left.root), before.left.variances)
-        after = Point(
+        after = EarlierState(
             point.mean, point.through(before.gain), before.lower, triangular(join_columns(point.noise, noise))
         )
         return after._replace(mean=point.mean + after.through((self.after.mean - before.ahead)[:, None])[:, 0])
 
-    def reached(self, point: Point) -> Gaussian:
-        """Law of an earlier state that was carried to this step."""
+    def reached(self, point: EarlierState) -> Gaussian:
+        """Mean and covariance of an earlier state given all data up to this step."""
         now = Columns(point.through(self.after.root), self.after.variances)
         return of_columns(point.mean, join_columns(now, point.noise))
 
@@ -123,7 +125,7 @@ class SmootherStep(Module):
         return Estimate(wrap_angles(mean, self.angles), columns.covariance, self.claim)
 
 
-class Believed(Protocol):
+class HasMoments(Protocol):
     """A filter's state with mean (N,) and factors of its covariance, as `Gaussian` has them."""
 
     @property
@@ -140,9 +142,9 @@ class Believed(Protocol):
 
 
 def smoother_step_of(
-    before: Believed,
-    prior: Believed,
-    after: Believed,
+    before: HasMoments,
+    prior: HasMoments,
+    after: HasMoments,
     moved: tuple[Array, Columns],
     claim: Claim,
     angles: Angles = (),
@@ -161,8 +163,8 @@ def smoother_step_of(
     """
     slopes, noise = moved
     return SmootherStep(
-        _law(after),
-        backwards(_law(before), jnp.asarray(slopes), jnp.asarray(prior.mean), noise),
+        _gaussian_of(after),
+        backwards(_gaussian_of(before), jnp.asarray(slopes), jnp.asarray(prior.mean), noise),
         claim=claim,
         angles=angles,
         projection=None if projection is None else jnp.asarray(projection),
@@ -175,5 +177,6 @@ def add_nis(step: SmootherStep, innovation: Innovation) -> SmootherStep:
     return replace(step, nis=nis, received=count)
 
 
-def _law(state: Believed) -> Gaussian:
+def _gaussian_of(state: HasMoments) -> Gaussian:
+    """Return a filter's state as a Gaussian."""
     return Gaussian(*map(jnp.asarray, (state.mean, state.lower, state.variances)))

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call, compute_once
 from heliograph.factors.gaussian import Gaussian, given, leading
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
@@ -71,7 +71,7 @@ class Outlook(Module):
         """Moments of what the sensor would measure, part by part."""
         if self.sensor is None or self.plant is None:
             return None
-        plant, sensor, start = at(self.plant, k), at(self.sensor, k), start_of(self.plant)
+        plant, sensor, start = at(self.plant, k), at(self.sensor, k), second_moments_at_start(self.plant)
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             signal = signal_of(plant, sensor, self.transform, given(mean, covariance), start)

@@ -9,7 +9,7 @@ from scipy.stats import chi2, f
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter, FilterAngles
-from heliograph.filters.rows import data_of
+from heliograph.filters.filter_data import check_data
 from heliograph.forecasting.outlook import Outlook, outlook_of, output_claim, prediction_of
 from heliograph.forecasting.prediction import Array, Forecast, InputsAhead
 from heliograph.model.over_time import first
@@ -44,7 +44,7 @@ def predict_rows(
         ValueError: data of another size than the filter's, no rows.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    rows, inputs = data_of(filter, z, u)
+    rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
     outlook = outlook_of(filter)
@@ -132,7 +132,7 @@ def residuals(
         Series Analysis by State Space Methods, Section 2.12.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    rows, inputs = data_of(filter, z, u)
+    rows, inputs = check_data(filter, z, u)
     predicted, count = predict_rows(filter, rows, inputs), check_count("lags", lags)
     law = predicted.received
     if law is None or law.claim == "none":

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of, eliminate, join_columns, rounding_of, square_root, unit_of
 from heliograph.factors.gaussian import Gaussian, gain_of, leading, move, of_columns
-from heliograph.filters.gaussian.signal import homogeneous
+from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, Errors
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.quantizer import widen
@@ -196,7 +196,7 @@ def _prepend_present(past: Past, errors: Errors, links: ReportModel) -> Past:
     second = errors.state_covariance - both + blocks + mean[:, :, None] * mean[:, None]
     # Noise of the reports: the spread of the links on what is sent, and the quantizers' error.
     error = jnp.asarray(links.error)
-    known = jax.vmap(lambda s, m: homogeneous(s, m, 1.0))(second, mean)
+    known = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
     known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))
     noise = jnp.einsum("iabcd,icd->iab", links.spread, known)
     new = Past(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.rows import data_of
+from heliograph.filters.filter_data import check_data
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.traced import is_traced
@@ -34,7 +34,7 @@ def log_likelihood(
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
     """
     instance("filter", filter, AbstractFilter, "a filter")
-    arguments = filter, *data_of(filter, measurements, inputs)
+    arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
         return _sum(*arguments)
     return float(compute_once(_sum, _by_xla, arguments))

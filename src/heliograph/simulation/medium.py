@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.event_filter import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.event_filter import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.side_information import SideInformationFilter

@@ -9,8 +9,8 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.rows import data_of
-from heliograph.filters.smoother_step import Point, SmootherStep
+from heliograph.filters.filter_data import check_data
+from heliograph.filters.smoother_step import EarlierState, SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, instance
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
@@ -38,7 +38,7 @@ def smoother_steps(
         ValueError: arrays that are not the filter's, a step that is none, a filter that cannot be smoothed.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    z, u = data_of(filter, measurements, inputs)
+    z, u = check_data(filter, measurements, inputs)
     first = np.asarray(check_count("first step", first_step, 0))
     return step_rows(filter, z, u, filter.init() if state is None else state, first)
 
@@ -124,7 +124,7 @@ def carry_ahead(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
-    def body(point: Point, later_step: SmootherStep) -> tuple[Point, Estimate]:
+    def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
         after = later_step.ahead(point)
         return after, start.estimate_from(later_step.reached(after))
 

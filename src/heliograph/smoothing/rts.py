@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.rows import data_of
+from heliograph.filters.filter_data import check_data
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.module import Module, readable
@@ -54,7 +54,7 @@ def rts_smoother(
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    rows, inputs = data_of(filter, z, u)
+    rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
     _, steps = step_rows(filter, rows, inputs, filter.init(), np.asarray(0))

@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.factors.columns import square_root
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.rows import data_of
+from heliograph.filters.filter_data import check_data
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance
@@ -45,7 +45,7 @@ def simulation_smoother(
     Source: Fruehwirth-Schnatter, Data augmentation and dynamic linear models (1994); Carter and Kohn (1994).
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    rows, inputs = data_of(filter, z, u)
+    rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
     keys = jax.random.split(jax.random.key(check_seed("seed", seed)), check_count("draws", draws))

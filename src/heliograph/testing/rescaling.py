@@ -14,10 +14,10 @@ from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.sequential import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.linear.polynomial import Centre, PolynomialFilter
+from heliograph.filters.linear.polynomial import MeanBeforeData, PolynomialFilter
 from heliograph.filters.linear.scheduled import LinearSystemFilter
 from heliograph.filters.modes.additive import AdditiveModalFilter
-from heliograph.filters.modes.mixture import Components, MixtureFilter
+from heliograph.filters.modes.mixture import AtomCombinations, MixtureFilter
 from heliograph.filters.modes.modal import ModalFilter, ObservationModel
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.patterns import SideInformation
@@ -195,10 +195,10 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
     return OverTime(scaled) if isinstance(channel, OverTime) else scaled
 
 
-def _components(components: Components | OverTime, units: Units) -> Components | OverTime:
+def _components(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
     values = components.values if isinstance(components, OverTime) else components
     q = units.received
-    scaled = Components(
+    scaled = AtomCombinations(
         values.weight,
         q[:, None] * values.gain / units.states,
         q * values.offset,
@@ -209,7 +209,7 @@ def _components(components: Components | OverTime, units: Units) -> Components |
     return OverTime(scaled) if isinstance(components, OverTime) else scaled
 
 
-def _centre(centre: Centre | None, units: Units) -> Centre | None:
+def _centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeData | None:
     if centre is None:
         return None
     s = units.states
@@ -218,7 +218,9 @@ def _centre(centre: Centre | None, units: Units) -> Centre | None:
         return OverTime(factors * matrix.values) if isinstance(matrix, OverTime) else factors * matrix
 
     received = scaled(centre.received, units.received[:, None] / s)
-    return Centre(s * centre.start, scaled(centre.transition, s[:, None] / s), scaled(centre.drift, s), received)
+    return MeanBeforeData(
+        s * centre.start, scaled(centre.transition, s[:, None] / s), scaled(centre.drift, s), received
+    )
 
 
 def _system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:

@@ -16,7 +16,7 @@ from heliograph.factors.columns import Columns, decorrelate, join_columns, recip
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
-from heliograph.filters.gaussian.signal import Received, Signal, observe_received
+from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, condition_on_received
 from heliograph.filters.gaussian.transform import evaluate_at_points
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -66,7 +66,7 @@ class StepFourGain(AbstractReading):
 class CentralMoment(AbstractReading):
     """The one symbol P^yy of (10) and Step 4 read as the covariance of the innovation in every term."""
 
-    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Take Cov(y) for E[y y']."""
         return _condition(self.update, signal._replace(second=signal.covariance), channel, z)
 
@@ -74,15 +74,15 @@ class CentralMoment(AbstractReading):
 class RawMoment(AbstractReading):
     """The one symbol P^yy read as E[y y'] in every term."""
 
-    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Take E[y y'] for Cov(y): E y (E y)' is one more column of its noise."""
         noise = join_columns(signal.noise, Columns(signal.mean[:, None], jnp.ones(1)))
         return _condition(self.update, signal._replace(noise=noise), channel, z)
 
 
-def _condition(update: AbstractUpdate, signal: Signal, channel: SecondOrder, z: Received) -> Gaussian:
+def _condition(update: AbstractUpdate, signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> Gaussian:
     """Condition on a signal that is read in another way."""
-    return update.condition(signal, channel, z, observe_received(signal, channel, z)[0])
+    return update.condition(signal, channel, z, condition_on_received(signal, channel, z)[0])
 
 
 class Propagated(NamedTuple):

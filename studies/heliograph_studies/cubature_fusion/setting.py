@@ -12,7 +12,7 @@ import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.gaussian.bounds import as_array, as_scalars, observe_by_young
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.signal import Received, Signal
+from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.gaussian.update import AbstractUpdate, interval_description
 from heliograph.numerics.check import check_count
@@ -46,7 +46,7 @@ class LooseInterval(AbstractUpdate):
         """Young's bound, as for a polytope."""
         return hg.filters.Polytope(as_scalars(self.scalars))
 
-    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 

@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 import heliograph as hg
-from heliograph.filters.wrappers.fed_back import Ahead
+from heliograph.filters.wrappers.fed_back import BeliefAndPrior
 from heliograph.numerics.module import Module
 
 SHARES = np.array([1.0, 0.5, 0.1, 0.01])  # of the way to the gradient's direction; the best one is taken
@@ -175,6 +175,6 @@ class _Output(Module):
 def _from(filter: hg.filters.AbstractFilter, mean: jax.Array) -> PyTree:
     """The state of a filter that starts from another initial mean."""
     state = jax.tree.map(jnp.asarray, filter.init())
-    if isinstance(state, Ahead):
+    if isinstance(state, BeliefAndPrior):
         return state._replace(belief=state.belief._replace(mean=mean))
     return state._replace(mean=mean)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.event.ball import ball_moments, cut_to_ball
-from heliograph.filters.event.parts import GaussianSum
+from heliograph.filters.event.ball import ball_moments, truncate_to_ball
+from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.numerics.float64 import compile_in_float64
 
 # One program for each side and number of components, whatever the numbers.
@@ -63,9 +63,9 @@ def test_inside_and_outside_are_the_whole_and_what_is_known_stays():
     law = Gaussian(random.normal(size=(1, 4)), random.normal(size=(1, 6)), random.uniform(0.5, 4, size=(1, 4)))
     parts = GaussianSum(np.zeros(1), law, np.ones((1, 1, 1)))
     directions = np.eye(4)[:2] - np.eye(4)[2:]
-    near, far = compile_in_float64(lambda r: tuple(cut_to_ball(parts, directions, r, side) for side in (True, False)))(
-        1.5
-    )
+    near, far = compile_in_float64(
+        lambda r: tuple(truncate_to_ball(parts, directions, r, side) for side in (True, False))
+    )(1.5)
     share = np.exp([near.log_weight[0], far.log_weight[0]])
     assert share.sum() == pytest.approx(1, rel=1e-9)
     means, covariances = (
@@ -77,6 +77,6 @@ def test_inside_and_outside_are_the_whole_and_what_is_known_stays():
     np.testing.assert_allclose(whole, law.covariance[0], atol=1e-7)
     still = Gaussian(np.array([[0.5, 0.2, 0.0, 0.0]]), np.zeros((1, 6)), np.zeros((1, 4)))
     known = GaussianSum(np.zeros(1), still, np.ones((1, 1, 1)))
-    known_inside = compile_in_float64(lambda radius: cut_to_ball(known, directions, radius, True))
+    known_inside = compile_in_float64(lambda radius: truncate_to_ball(known, directions, radius, True))
     assert known_inside(1.0).log_weight[0] == pytest.approx(0, abs=1e-8) and known_inside(0.5).log_weight[0] < -1e3
     np.testing.assert_array_equal(known_inside(1.0).gaussian.mean, still.mean)

@@ -139,7 +139,7 @@ def test_a_branch_before_a_random_gain_arrives_with_the_variance_that_draws_have
     gain = hg.Rayleigh(np.sqrt(2 / np.pi))
     plant = hg.LinearPlant([[1.0]], [[0.0]], [2.0], [[1e-12]])
     item = hg.robust_filter(plant, hg.LinearSensor([[1.0]], law), hg.hop(gain, 0.1))
-    before, sensed = item.expected(item.init(), 0)
+    before, sensed = item.predict_received(item.init(), 0)
     received = item.noise.law(sensed)
     rng = np.random.default_rng(2)
     g = rng.rayleigh(np.sqrt(2 / np.pi), 200_000)

@@ -6,7 +6,7 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph.engine.choice import compute_once
-from heliograph.filters.modes.multiple_model import shares
+from heliograph.filters.modes.multiple_model import normalise_columns
 from heliograph.testing import check_filter
 from tests.follow import follow
 
@@ -304,4 +304,6 @@ def test_particles_are_the_same_in_a_simulation_a_recording_and_a_stream(record)
 def test_a_weight_whose_reciprocal_overflows_is_none():
     """Mixing by a probability of 1e-319, which native code divides by: the mixture is that of equal parts, as of 0."""
     weight = np.array([[1e-319, 0.5], [0.0, 0.5]])
-    np.testing.assert_array_equal(compute_once(shares, shares, (weight,)), [[0.5, 0.5], [0.5, 0.5]])
+    np.testing.assert_array_equal(
+        compute_once(normalise_columns, normalise_columns, (weight,)), [[0.5, 0.5], [0.5, 0.5]]
+    )

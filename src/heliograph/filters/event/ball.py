@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, eliminate, join_columns, nothing
 from heliograph.factors.gaussian import Gaussian, observe, of_columns
-from heliograph.filters.event.parts import CERTAIN, GaussianSum
+from heliograph.filters.event.gaussian_sum import CERTAIN, GaussianSum
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.lapack import eigh
 
@@ -36,7 +36,7 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     Shapes: centre and variance (m,), variance positive; radius ().
     """
     if len(centre) == 1:
-        return _join_pieces(_cut_component(centre[0], variance[0], radius, inside))
+        return _join_pieces(_truncate_component(centre[0], variance[0], radius, inside))
     # Where e_1 lies inside of the radius: the moments of the others at each node.
     first, deviation = centre[0], jnp.sqrt(variance[0])
     near = jnp.clip(first, -radius, radius)
@@ -52,14 +52,14 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     if inside:
         return _join_pieces(pieces)
     # Where it does not: above and below, and the others anywhere.
-    tails = _cut_component(first, variance[0], radius, False)
+    tails = _truncate_component(first, variance[0], radius, False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
     free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
     wide = BallMoments(tails.log_mass, mean, free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
     return _join_pieces(BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True))))
 
 
-def cut_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
+def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
     """Cut each Gaussian to |D x| <= radius, or to where it is more, and take the Gaussian of the same moments.
 
     With Cov(D x) = V diag(s) V', e = V' D x has independent components. Of those that are known to vary, x is given
@@ -68,7 +68,7 @@ def cut_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, in
     Shapes: directions (m, N).
     """
 
-    def cut_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
+    def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
         rows, centre = directions @ x.root, directions @ x.mean
         variance, turn = eigh(Columns(rows, x.variances).covariance)
         # What has no variance lies where it is.
@@ -83,11 +83,11 @@ def cut_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, in
         spread = eliminate(moments.covariance).through(gain)
         return moments.log_mass, of_columns(mean, join_columns(given.columns, spread))
 
-    log_mass, after = jax.lax.map(cut_one, parts.gaussian)
+    log_mass, after = jax.lax.map(truncate_one, parts.gaussian)
     return GaussianSum(parts.log_weight + log_mass, after, parts.label)
 
 
-def _cut_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
     """Cut one component to within the radius, (1, ...), or below and above it, (2, ...)."""
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.event.parts import GaussianSum, safe_log
+from heliograph.filters.event.gaussian_sum import GaussianSum, safe_log
 
 
 class EventBelief(NamedTuple):

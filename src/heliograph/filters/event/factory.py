@@ -7,10 +7,10 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, make_sizes
 from heliograph.filters.event.ball import MOST_COMPONENTS
-from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.event_filter import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.patterns import SideInformation, by_pattern
+from heliograph.filters.modes.patterns import SideInformation, describe_by_pattern
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, lower_to_upper
 from heliograph.model.fading import uncertain_chain
@@ -77,7 +77,7 @@ def event_filter(
     described, initial = _describe_channel(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
-    loses = any(_loses(step) for step in steps)
+    loses = any(_may_lose(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
     shared: dict[str, Any] = {
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
@@ -86,16 +86,16 @@ def event_filter(
     # A random trigger: one Gaussian is enough.
     premise = Premise(plant, sensor, channel, trigger, order=None)
     if isinstance(trigger, StochasticTrigger | Periodic):
-        claim = _claim_of(plant, sensor, channel, trigger)
+        claim = _decide_claim(plant, sensor, channel, trigger)
         return believing(
             StochasticEventFilter(trigger=trigger, **shared, **make_sizes(claim, start, received)), premise
         )
     filter = EventFilter(
-        trigger=_threshold(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
+        trigger=_check_threshold_rule(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
         known=known,
         lost=lost,
-        delivers=all(_delivers(step) for step in steps),
-        alike=all(_alike(step) for step in steps),
+        delivers=all(_delivers_y_unchanged(step) for step in steps),
+        alike=all(_has_same_law_in_every_mode(step) for step in steps),
         ages=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
         **shared,
         **make_sizes("nominal", start, received),
@@ -104,64 +104,68 @@ def event_filter(
 
 
 def _describe_channel(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:
-    """The channel by mode and by what arrives, and the law of the modes at the first use."""
+    """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities."""
     drifting = [memory for memory in memories(first(channel)).values() if not isinstance(memory, MarkovChain)]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
     steps = [joint_modes(step) for step in unstack(channel)]
-    parts = by_pattern(steps, np.ones((len(steps[0].initial), 1)))
+    parts = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
     return over_time(parts) if isinstance(channel, OverTime) else parts[0], np.asarray(steps[0].initial)
 
 
-def _claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
-    """ "exact" where one Gaussian is the posterior, or behind a schedule has its first two moments."""
+def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
+    """Claim of the one-Gaussian filter: exact if it is the posterior (schedule: its two moments), else nominal."""
     steps = unstack(_describe_channel(channel)[0])
-    if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_is_known(step) for step in steps):
+    if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_has_known_gain(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):
         return lower_to_upper("exact", plant, sensor, channel)
-    hidden = trigger.losses == "unknown" and any(_loses(step) for step in steps)
-    return "exact" if all(_reveals(s) for s in steps) and _is_gaussian(plant, sensor) and not hidden else "nominal"
+    hidden = trigger.losses == "unknown" and any(_may_lose(step) for step in steps)
+    return (
+        "exact"
+        if all(_arrival_determines_y(s) for s in steps) and _has_gaussian_noise(plant, sensor) and not hidden
+        else "nominal"
+    )
 
 
-def _loses(channel: SideInformation) -> bool:
-    """True if some pattern of arrivals in which not all arrives is possible."""
+def _may_lose(channel: SideInformation) -> bool:
+    """True if with positive probability not all components arrive."""
     return bool(np.any(np.asarray(channel.chance)[:, ~np.all(channel.present, axis=1)] > 0))
 
 
-def _is_known(channel: SideInformation) -> bool:
-    """True if no gain is random, and what arrives is all that was sent."""
-    return _alike(channel) and not np.any(_spread(channel)[..., :-1, :-1])
+def _has_known_gain(channel: SideInformation) -> bool:
+    """True if no gain is random, and what arrives is all that was sent, in every mode."""
+    return _has_same_law_in_every_mode(channel) and not np.any(_gain_and_noise_spread(channel)[..., :-1, :-1])
 
 
-def _spread(channel: SideInformation) -> np.ndarray:
-    """Spread of gain and noise, without what rounding leaves of a known gain behind losses."""
+def _gain_and_noise_spread(channel: SideInformation) -> np.ndarray:
+    """Spread of gain and noise by mode and pattern, with what rounding leaves of a known gain set to zero."""
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
     size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
     size = np.pad(size, [(0, 0)] * (size.ndim - 2) + [(0, 1)] * 2)
     return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * size, 0.0, spread)
 
 
-def _is_gaussian(*models: PyTree) -> bool:
+def _has_gaussian_noise(*models: PyTree) -> bool:
     """True if all noise in these models is Gaussian, so that silence of probability exp(-e' W e / 2) leaves it so."""
     leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, AbstractNoise))
     return all(isinstance(leaf, Gaussian) for leaf in leaves if isinstance(leaf, AbstractNoise))
 
 
-def _reveals(channel: SideInformation) -> bool:
-    """True if whatever arrives determines y: then it says all that its having been sent says."""
+def _arrival_determines_y(channel: SideInformation) -> bool:
+    """True if y follows from whatever arrives, without noise: then that it was sent says nothing more."""
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
         gain, rows = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
         size = np.abs(gain).max(axis=1, keepdims=True)
-        free = rows.all() and not np.any(_spread(channel)[j, a])
+        free = rows.all() and not np.any(_gain_and_noise_spread(channel)[j, a])
         if not free or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < gain.shape[1]:
             return False
     return True
 
 
-def _alike(channel: SideInformation) -> bool:
-    """True if what arrives has the same law in all modes in which it can."""
+def _has_same_law_in_every_mode(channel: SideInformation) -> bool:
+    """True if what arrives has the same mean and spread in every mode in which it can arrive."""
     possible = np.asarray(channel.chance) > 0
     return all(
         np.array_equal(moment[rows, a], np.broadcast_to(moment[rows, a][:1], moment[rows, a].shape))
@@ -171,8 +175,8 @@ def _alike(channel: SideInformation) -> bool:
     )
 
 
-def _delivers(channel: SideInformation) -> bool:
-    """True if what arrives is y itself."""
+def _delivers_y_unchanged(channel: SideInformation) -> bool:
+    """True if what arrives is y itself, all of it."""
     m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
     if m != p:
         return False
@@ -184,10 +188,10 @@ def _delivers(channel: SideInformation) -> bool:
     )
 
 
-def _threshold(
+def _check_threshold_rule(
     rule: AbstractTrigger, lost: int | None, outputs: int, received: int, steps: list[SideInformation]
 ) -> AbstractThreshold:
-    """Return the rule where the sum of Gaussians carries its regions and losses (`lost`: None if there are none)."""
+    """Return the sending rule; raise ValueError where the Gaussian sum has no form for its region or its losses."""
     trigger = instance("trigger", rule, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these")
     if lost == 0 and trigger.reference == "sent":
         raise fail("lost", "at least 1, since transmissions may be lost", lost)
@@ -200,14 +204,14 @@ def _threshold(
     if trigger.region == "each":
         if received != outputs:
             raise fail("channel of components that are each sent alone", f"{outputs} outputs", received)
-        if not all(_one_by_one(step) for step in steps):
+        if not all(_has_independent_losses(step) for step in steps):
             raise fail("channel of components that are each sent alone", "links side by side that lose them one by one "
                        "and remember nothing, such as parallel([erasure(perfect(), .9)] * 2)", "another")  # fmt: skip
     return trigger
 
 
-def _one_by_one(channel: SideInformation) -> bool:
-    """True if components arrive as they are, and are lost independently of each other."""
+def _has_independent_losses(channel: SideInformation) -> bool:
+    """True if components arrive unchanged, and are lost independently of each other, without modes."""
     m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
     if len(chance) > 1:
         return False

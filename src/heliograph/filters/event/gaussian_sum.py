@@ -1,374 +1,184 @@
-"""A filter behind a sender that decides when to send: a sum of Gaussians over what the sender compares with."""
+"""A sum of weighted Gaussians: truncated to an interval of one component, merged, and reduced to few."""
 
 from collections.abc import Sequence
-from copy import copy
+from functools import partial
+from itertools import combinations
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, append_rows, given, leading
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.event.ball import cut_to_ball
-from heliograph.filters.event.belief import EventBelief
-from heliograph.filters.event.moments import LinkMoments, arriving, augment, condition_parts, pin, predict_jointly
-from heliograph.filters.event.parts import (
-    FLOOR,
-    GaussianSum,
-    cut,
-    cut_away,
-    join,
-    log_total,
-    reduce_parts,
-    together,
-)
-from heliograph.filters.gaussian.belief import smoother_step_by_transform, start_of
-from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.patterns import SideInformation, pattern_of
-from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.centred import predict_signal
-from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
-from heliograph.model.trigger import AbstractThreshold
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.factors.gaussian import Gaussian, leading, merge, of_columns, revise
+from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
+from heliograph.numerics.types import Array, Float
 
-RIM = 1e-9  # share of delta by which a value may lie inside for rounding
-COUNTED = 16  # lost transmissions that are counted; more are as many
+FLOOR = 1e-6  # probability of what the rule forbids
+CERTAIN = 1e-24  # a variance below this share of its mean square and of the interval's is rounding
 
 
-class EventFilter(AbstractSizedFilter):
-    """The Gaussian sum of `event_filter`.
+class GaussianSum(NamedTuple):
+    """Gaussians of a sum, with what is known of the sender in each.
 
-    known: parts of the interval in which y - r lay last, one Gaussian each; lost: Gaussians whose reference is a value
-    that was lost. `follows`: the sender's reference may be a value that never arrived. `loses`: transmissions may be.
-    `delivers`: what arrives is y itself. `ages`: of the transmission before, which labels count, from 0.
+    log_weight (K,), gaussian of N components with a leading axis K, label (K, senders, ...): probabilities of each
+    sender's label given the Gaussian.
     """
 
-    plant: AnyPlant
-    sensor: AnySensor
-    channel: SideInformation | OverTime
-    trigger: AbstractThreshold
-    initial: Float[Array, " M"]
-    transform: AbstractTransform
-    known: int = eqx.field(static=True)
-    lost: int = eqx.field(static=True)
-    loses: bool = eqx.field(static=True)
-    delivers: bool = eqx.field(static=True)
-    alike: bool = eqx.field(static=True)
-    outputs: int = eqx.field(static=True)
-    ages: int = eqx.field(static=True)
+    log_weight: Float[jax.Array, " K"]
+    gaussian: Gaussian
+    label: Float[jax.Array, "K senders ..."]
 
-    @property
-    def follows(self) -> bool:
-        """True if the reference may be a value that was lost."""
-        return self.loses and self.trigger.reference == "sent"
+    def relabel_sender(self, s: int, label: jax.Array) -> "GaussianSum":
+        """Give sender s these labels (K, ...), which need not sum to 1: the sum goes into each Gaussian's weight."""
+        shape = (-1, *[1] * (label.ndim - 1))
+        total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
+        share = label / jnp.where(total > 0, total, 1.0).reshape(shape)
+        share = jnp.where((total > 0).reshape(shape), share, self.label[:, s])
+        return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(share))
 
-    def as_large_as(self, others: Sequence[AbstractFilter]) -> "EventFilter":
-        """Return the filter with room for the longest heartbeat of others that have one."""
-        ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
-        if self.trigger.heartbeat is None or ages <= self.ages:
-            return self
-        larger = copy(self)  # with what it knows of its world
-        object.__setattr__(larger, "ages", ages)
-        return larger
+    def scale_weights(self, log_factor: Array | float) -> "GaussianSum":
+        """Multiply all weights by exp(log_factor)."""
+        return self._replace(log_weight=self.log_weight + log_factor)
 
-    @property
-    def senders(self) -> list[slice]:
-        """Components of y that are sent together."""
-        m = self.outputs
-        return [slice(i, i + 1) for i in range(m)] if self.trigger.region == "each" else [slice(0, m)]
+    def take(self, first: int, stop: int | None = None) -> "GaussianSum":
+        """Take the Gaussians first, ..., stop - 1."""
+        few: GaussianSum = jax.tree.map(lambda leaf: leaf[first:stop], self)
+        return few
 
-    @property
-    def silence_tells(self) -> bool:
-        """Always true: silence is a measurement."""
-        return True
+    def select_components(self, places: np.ndarray) -> "GaussianSum":
+        """Select components of the Gaussians' vector, in the order of `places`."""
+        if np.array_equal(places, np.arange(len(places))):
+            return self._replace(gaussian=leading(self.gaussian, len(places)))
 
-    @compile_on_call
-    def init(self) -> EventBelief:
-        """The prior, and no reference yet."""
-        start, m = at(self.plant, 0), self.outputs
-        x = given(start.initial_mean, start.initial_covariance)
-        both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
-        counts = COUNTED if self.trigger.losses == "numbered" else 1
-        label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
-        label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
-        begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.of(self._pad_sum(prior_sum), begun, jnp.asarray(False))
+        def keep_one(x: Gaussian) -> Gaussian:
+            return of_columns(x.mean[places], Columns(x.root[places], x.variances))
 
-    def _pad_sum(self, one: GaussianSum) -> GaussianSum:
-        """Pad a sum of one Gaussian with others that have no weight."""
-        count = self._known_slots + (self.lost if self.follows else 0)
-        every: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
-        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
-
-    @property
-    def _known_slots(self) -> int:
-        """Number of Gaussians with a known reference: parts of the interval, and of the outside if it may be silent."""
-        return self.known + (self._outside if self.loses and not self.follows else 0)
-
-    @property
-    def _outside(self) -> int:
-        """Number of parts of what is outside of a sender's region."""
-        return 2 * len(range(self.outputs)[self.senders[0]]) + self.ball
-
-    @property
-    def ball(self) -> bool:
-        """True if the region is a ball of several components."""
-        return self.trigger.region == "ball" and self.outputs > 1
-
-    @predicts
-    def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
-        """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
-        plant, u, start = at(self.plant, k), jnp.asarray(u), start_of(self.plant)
-        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.parts.gaussian)
-        if self.trigger.reference == "prediction":
-            expected, places = self.reference(self._whole(state).mean, u, k), len(self.states) + np.arange(self.outputs)
-            both = jax.vmap(lambda x: pin(x, places, expected))(both)
-        rows = jnp.asarray(at(self.channel, k).transition)
-        label = jnp.einsum("hsiac,ij->hsjac", state.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
-        if self.trigger.heartbeat is not None:
-            older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
-            age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
-            label = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, label, 0.0)
-        return EventBelief(state.weight, *both, label, state.begun, jnp.asarray(True))
-
-    def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
-        """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
-        return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
-
-    @corrects
-    def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:
-        """Correct with the values that came, and with the silence of the senders from which none came."""
-        plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        count = self.received - self.trigger.side_information(self.outputs)
-        values, losses = z[:count], z[count:]
-        parts, begun, start = state.parts, state.begun, start_of(self.plant)
-        total, value, covariance = jnp.zeros(()), [], []
-        # Senders one after the other, each with its value or its silence.
-        for s, those in enumerate(self.senders):
-            mine = values[those] if len(self.senders) > 1 else values
-            lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
-            wide = augment(plant, sensor, self.transform, parts, start)
-            arrived = jnp.any(~jnp.isnan(mine))
-            after, expected, spread = self._condition_on_sender(wide, channel, mine, lost, s, begun[s])
-            whole = log_total(after.log_weight)
-            total, parts = total + whole, after.times(-whole)
-            begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
-            value.append(mine - expected)
-            covariance.append(spread)
-        innovation = Innovation(*_append_losses(jnp.concatenate(value), covariance, losses), total)
-        return EventBelief.of(parts, begun, state.moved), innovation
-
-    def _condition_on_sender(
-        self, wide: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
-    ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition on a sender's value or on its silence; return the mean and covariance expected of a value too."""
-
-        def silent(wide: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            return (
-                self._condition_on_silence(wide, channel, lost, s, begun),
-                jnp.zeros_like(z),
-                jnp.zeros((len(z), len(z))),
-            )
-
-        def came(wide: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            return self._condition_on_value(wide, channel, z, lost, s, begun)
-
-        used: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(jnp.any(~jnp.isnan(z)), came, silent, wide)
-        return used
-
-    def _condition_on_silence(
-        self, wide: GaussianSum, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array
-    ) -> GaussianSum:
-        """Condition the sum on silence: nothing was sent, or it was sent and lost."""
-        n, m, sender = len(self.states), self.outputs, self.senders[s]
-        as_it_was, label = np.r_[0 : n + m], wide.label[:, s]
-        waiting, due = self._label_sending(label, begun)
-        loss = self._loss(channel, s)[:, None, None]
-        dropped, forced = (_relabel_sent(which * loss, True) for which in (waiting, due))
-        if self.trigger.losses == "known":
-            waiting = jnp.where(lost > 0, 0.0, waiting)
-            dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
-
-        # Known reference: every Gaussian cut to each part of the line, and joined part by part.
-        if not self.follows:
-            inside = wide.labelled(s, waiting + forced if self.loses else waiting)
-            slots, _ = self._cut_to_region(inside, inside.some(0, 0), sender)
-            if self.loses:
-                outside = self._cut_to_outside(wide.labelled(s, dropped + forced), sender, 1.0)
-                slots = together([slots, join(outside, self._outside)])
-            return self._or_nothing(slots.keep(as_it_was), wide)
-
-        # Reference that may be a value that was lost: not sent, with the reference as it was ...
-        unsent = wide.labelled(s, waiting)
-        slots, others = self._cut_to_region(unsent.some(0, self.known), unsent.some(self.known), sender)
-        # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
-        outside = join(self._cut_to_outside(wide.labelled(s, dropped), sender, 1.0), self._outside)
-        fresh = together([outside, join(wide.labelled(s, forced))]).keep(self._find_new_reference(sender))
-        few = reduce_parts(
-            together([others.keep(as_it_was), fresh]), self.lost, slice(n + sender.start, n + sender.stop)
-        )
-        return self._or_nothing(together([slots.keep(as_it_was), few]), wide)
-
-    def _condition_on_value(
-        self, wide: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
-    ) -> tuple[GaussianSum, jax.Array, jax.Array]:
-        """Condition on a value: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
-        # Probability that this pattern of values arrives, by mode.
-        sender, arrived = self.senders[s], ~jnp.isnan(z)
-        pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
-        kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
-        chance = jnp.asarray(channel.chance)[:, kind]
-        arrives = chance if len(self.senders) == 1 else 1 - self._loss(channel, s)
-        label = wide.label[:, s] * arrives[:, None, None]
-        if self.trigger.losses == "numbered":
-            number = jnp.clip(jnp.where(jnp.isnan(lost), 0.0, lost).astype(int), 0, COUNTED - 1)
-            label = label * (jnp.isnan(lost) | (jnp.arange(COUNTED) == number))
-        # Each mode's Gaussians, updated by the value, and after them as they were.
-        used, before, links = [], [], []
-        for j in range(1 if self.alike else label.shape[1]):
-            only = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
-            mode = jnp.argmax(chance > 0) if self.alike else j
-            moments = channel.mean, channel.gain_spread, channel.noise
-            links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
-            before.append(wide.labelled(s, only))
-            used.append(condition_parts(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers))
-        # Restricted to where the sender had to send.
-        count, size = len(links), len(label)
-        selected = self._select_sent(together([*used, *before]), s, begun)
-        pieces = [selected.some(start, start + size) for start in range(0, len(selected.log_weight), size)]
-        by_mode = [together(pieces[j :: 2 * count]) for j in range(2 * count)]
-        # What was to be expected of a value that comes.
-        signals = []
-        for sent, link in zip(map(join, by_mode[count:]), links, strict=True):
-            received = arriving(sent.gaussian, link, sender, self.outputs)
-            signals.append(GaussianSum(sent.log_weight, received, jnp.zeros((1, 1))))
-        # One sum again, with a new reference.
-        whole = join(together(by_mode[:count]).keep(self._find_new_reference(sender)))
-        whole = whole.labelled(s, _relabel_sent(whole.label[:, s], False))
-        signal = join(together(signals)).gaussian
-        return self._pad_sum(whole), signal.mean[0], signal.covariance[0]
-
-    def _select_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
-        """Select where the sender had to send, all Gaussians time after time: outside, or anywhere if it was due."""
-        waiting, due = self._label_sending(used.label[:, s], begun)
-        event = used.labelled(s, waiting)
-        outside = self._cut_to_outside(event, self.senders[s], 1 - RIM)
-        mass = jnp.max(outside.log_weight.reshape(self._outside, -1), axis=0)
-        lowest = event.log_weight + np.log(FLOOR)
-        floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
-        return together([outside, floor, used.labelled(s, due)])
-
-    def _label_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """A sender's label (K, M, A, C) where it sends on an event alone, and where it sends in any case."""
-        heartbeat = self.trigger.heartbeat
-        oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
-        due = jnp.where(~begun | oldest, label, 0.0)
-        return label - due, due
-
-    def _loss(self, channel: SideInformation, s: int) -> jax.Array:
-        """Return the probability that what a sender transmits is lost, in each mode."""
-        mine = self.senders[s] if len(self.senders) > 1 else slice(None)
-        lost = ~jnp.any(jnp.asarray(channel.present)[:, mine], axis=1)
-        return jnp.asarray(channel.chance) @ lost.astype(float)
-
-    def _find_new_reference(self, sender: slice) -> np.ndarray:
-        """Places of (x, r) with what the sender transmits as its new reference, in (x, r, y)."""
-        n, m = len(self.states), self.outputs
-        places: np.ndarray = np.r_[0 : n + m]
-        if self.trigger.needs_reference:
-            places[n + sender.start : n + sender.stop] = n + m + np.r_[sender]
-        return places
-
-    def _errors(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
-        """Direction of y - r in (x, r, y), and delta, of each component of a sender."""
-        n, m = len(self.states), self.outputs
-        delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
-        unit = jnp.eye(n + 2 * m)
-        return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
-
-    def _cut_to_region(self, parts: GaussianSum, others: GaussianSum, sender: slice) -> tuple[GaussianSum, GaussianSum]:
-        """Cut to the region: `parts` to each part of its first component's interval, joined; `others` to all of it."""
-        (direction, delta), *rest = self._errors(sender)
-        size, edges = len(parts.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
-        low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
-        every = together([parts] * self.known)
-        if self.ball:
-            every = cut(every, direction, low * delta, high * delta) if self.known > 1 else every
-            every = self._cut_to_ball(together([every, others]), sender, 1.0, True)
-        else:
-            whole = np.ones(len(others.log_weight))
-            low, high = np.append(low, -whole), np.append(high, whole)
-            every = cut(together([every, others]), direction, low * delta, high * delta)
-            for direction, delta in rest:
-                every = cut(every, direction, -delta, delta)
-        count = size * self.known
-        return join(every.some(0, count), self.known), every.some(count)
-
-    def _cut_to_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
-        """Cut to what is outside, all one time after the other, `_outside` times.
-
-        The first component that is, above or below, those before it inside; of a ball these are what is outside of the
-        box around it, and then what the ball leaves of the box.
-        """
-        outside, errors = [], self._errors(sender)
-        for i, (direction, delta) in enumerate(errors, 1):
-            edge = scale * delta
-            outside.append(cut_away(parts, direction, edge))
-            if i < len(errors) or self.ball:
-                parts = cut(parts, direction, -edge, edge)
-        return together([*outside, self._cut_to_ball(parts, sender, scale, False)] if self.ball else outside)
-
-    def _cut_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
-        directions, deltas = zip(*self._errors(sender), strict=True)
-        return cut_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
-
-    def _or_nothing(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
-        """Return the sum, or where the rule forbids what came the sum before, with a floor as its likelihood."""
-        stays = before.keep(np.arange(parts.gaussian.mean.shape[1]))
-        stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
-        forbidden = ~jnp.isfinite(log_total(parts.log_weight))
-        either: GaussianSum = jax.tree.map(lambda x, y: jnp.where(forbidden, x, y), stays, parts)
-        return either
-
-    @estimates
-    def estimate(self, state: EventBelief) -> Estimate:
-        """Mean and covariance of the whole sum."""
-        whole = self._whole(state)
-        return Estimate(whole.mean, whole.covariance, self.claim)
-
-    def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """The one of the joined sums' moments around the update."""
-        return smoother_step_by_transform(self, step, first(self.plant), self._whole)
-
-    def _whole(self, state: EventBelief) -> Gaussian:
-        """Mean and covariance of the state by the whole sum."""
-        whole = leading(join(state.parts).gaussian, len(self.states))
-        first: Gaussian = jax.tree.map(lambda leaf: leaf[0], whole)
-        return first
+        return self._replace(gaussian=jax.vmap(keep_one)(self.gaussian))
 
 
-def _relabel_sent(label: jax.Array, lost: bool) -> jax.Array:
-    """Relabel a sender (K, M, A, C) after a transmission: no step since then, and one more lost or none."""
-    label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
-    if label.shape[-1] == 1:
-        return label
-    if not lost:
-        return jnp.zeros_like(label).at[..., 0].set(jnp.sum(label, axis=-1))
-    more = jnp.concatenate([jnp.zeros_like(label[..., :1]), label[..., :-1]], axis=-1)
-    return more.at[..., -1].add(label[..., -1])
+def safe_log(x: jax.Array) -> jax.Array:
+    """log x, -inf at 0 without a derivative that is no number."""
+    return jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), -jnp.inf)
 
 
-def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Append the losses to the innovation: they are side information, of which nothing is expected."""
-    loss_values = jnp.where(jnp.isnan(losses), jnp.nan, 0.0)
-    value = jnp.concatenate([value, loss_values])
-    arrived = ~jnp.isnan(value)
-    whole = jax.scipy.linalg.block_diag(*(jnp.nan_to_num(block) for block in blocks), jnp.zeros((len(losses),) * 2))
-    return value, jnp.where(arrived[:, None] & arrived, whole, jnp.nan)
+def log_total(log_weight: jax.Array) -> jax.Array:
+    """log of the sum of weights; -inf where all are 0."""
+    top = jnp.max(log_weight)
+    top = jnp.where(jnp.isfinite(top), top, 0.0)
+    return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
+
+
+def concatenate(parts: Sequence[GaussianSum]) -> GaussianSum:
+    """Concatenate the Gaussians of several sums into one sum."""
+    every: GaussianSum = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return every
+
+
+@jax.jit
+def truncate_between(parts: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
+    """Truncate each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
+    row, variance = _project_on_direction(parts, direction)
+    ends = [jnp.broadcast_to(end, variance.shape) for end in (lower, upper)]
+    return _truncate(parts, parts.gaussian.mean @ direction, row, variance, ends)
+
+
+@jax.jit
+def truncate_outside(parts: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
+    """Truncate each Gaussian to d'x >= edge, and then each to d'x <= -edge: a sum of 2 K Gaussians."""
+    row, variance = _project_on_direction(parts, direction)
+    centre, edges = parts.gaussian.mean @ direction, jnp.full(2 * len(variance), edge)
+    centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
+    return _truncate(concatenate([parts, parts]), centre, row, jnp.tile(variance, 2), [edges])
+
+
+def _project_on_direction(parts: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the row f (K, N) of d'x = d'm + f xi, and its variance (K,)."""
+    row = direction @ parts.gaussian.root
+    return row, jnp.sum(row**2 * parts.gaussian.variances, axis=1)
+
+
+def _truncate(
+    parts: GaussianSum, centre: jax.Array, row: jax.Array, variance: jax.Array, ends: Sequence[jax.Array]
+) -> GaussianSum:
+    """Truncate to where d'x = centre + row xi is above the first end, and below the second if there is one.
+
+    With S the variance of d'x and mu, v the moments of a standard normal number that is cut: d'x moves by sqrt(S) mu
+    and has the variance v S; x given d'x stays.
+    """
+    # Without variance d'x lies inside or it does not.
+    certain = variance <= CERTAIN * (centre**2 + sum(end**2 for end in ends))
+    deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
+    inside = (ends[0] <= centre) & (centre <= ends[-1] if len(ends) > 1 else True)
+    # Moments of a standard normal number between the two, or beyond one.
+    moments = (truncated_normal if len(ends) > 1 else upper_tail)(*((end - centre) / deviation for end in ends))
+    log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
+    # Moments of the part inside, where it has any probability.
+    changes = jnp.isfinite(log_mass) & ~certain
+    shift = deviation * jnp.where(changes, moments.mean, 0.0)
+    ratio = jnp.where(changes, moments.variance, 1.0)
+    after = jax.vmap(revise)(parts.gaussian, jnp.where(changes[:, None], row, 0.0), shift, ratio)
+    return GaussianSum(parts.log_weight + log_mass, after, parts.label)
+
+
+def merge_groups(parts: GaussianSum, groups: int = 1) -> GaussianSum:
+    """Merge the sum by moment matching into `groups` Gaussians, each of one consecutive block (default: all)."""
+    few: GaussianSum = _merge_groups(parts, groups)
+    return few
+
+
+@partial(jax.jit, static_argnames="groups")
+def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
+    """Compiled body of `merge_groups`."""
+
+    def merge_group(parts: GaussianSum) -> GaussianSum:
+        total = log_total(parts.log_weight)
+        share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
+        share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
+        return GaussianSum(total, merge(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
+
+    size = len(parts.log_weight) // groups
+    few: GaussianSum = jax.vmap(merge_group)(
+        jax.tree.map(lambda leaf: leaf.reshape(groups, size, *leaf.shape[1:]), parts)
+    )
+    return few
+
+
+def reduce_parts(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
+    """Reduce to at most `count` Gaussians, merging the pair that is nearest in the components `places` each time.
+
+    The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.
+    """
+    while len(parts.log_weight) > count:
+        parts = _merge_cheapest_pair(parts, (places.start, places.stop))
+    return parts
+
+
+@partial(jax.jit, static_argnames="ends")
+def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianSum:
+    """Merge the pair of least cost: it stays at the first's place, and the last Gaussian moves to the second's."""
+    size, places = len(parts.log_weight), slice(*ends)
+    pairs = list(combinations(range(size), 2))
+    first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))
+    top = jnp.max(parts.log_weight)
+    weight = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
+    centre, spread = parts.gaussian.mean[:, places], jax.vmap(lambda x: x.columns.diagonal)(parts.gaussian)[:, places]
+    # Cost of each pair, and the least.
+    w1, w2 = weight[first], weight[second]
+    both = spread[first] + spread[second]
+    apart = (centre[first] - centre[second]) ** 2 / jnp.where(both > 0, both, 1.0)
+    cost = w1 * w2 / jnp.where(w1 + w2 > 0, w1 + w2, 1.0) * jnp.sum(apart, axis=1)
+    least = jnp.argmin(cost)
+    chosen = jnp.arange(len(pairs)) == least
+    is_first = jnp.stack([jnp.any(chosen & (first == i)) for i in range(size)])
+    is_second = jnp.stack([jnp.any(chosen & (second == i)) for i in range(size)])
+    # The two joined; the others keep their places.
+    merged = merge_groups(parts._replace(log_weight=jnp.where(is_first | is_second, parts.log_weight, -jnp.inf)))
+
+    def replace_pair(values: jax.Array, new: jax.Array) -> jax.Array:
+        shape = (-1, *[1] * (values.ndim - 1))
+        moved = jnp.where(is_second.reshape(shape), values[-1:], values)
+        return jnp.where(is_first.reshape(shape), new, moved)[:-1]
+
+    fewer: GaussianSum = jax.tree.map(replace_pair, parts, merged)
+    return fewer

@@ -11,11 +11,11 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, eliminate, join_columns
 from heliograph.factors.gaussian import Gaussian, given, observe, of_columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.event.parts import FLOOR, GaussianSum, join, safe_log, together
-from heliograph.filters.gaussian.belief import predict_gaussian, smoother_step_by_transform, start_of
+from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate, merge_groups, safe_log
+from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.gaussian.signal import Signal, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.multiple_model import receive, repeat
+from heliograph.filters.modes.multiple_model import correct_in_every_mode, replicate
 from heliograph.filters.modes.patterns import SideInformation, append_flag
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred import predict_signal
@@ -86,7 +86,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
         """Move x and the modes; both ends compute the next reference."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = predict_gaussian(plant, self.transform, state.gaussian, u, start_of(self.plant))
+        moved = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
         rows = jnp.asarray(at(self.channel, k).transition)
         law = jnp.where(state.moved, state.law @ rows, state.law)
         reference = state.reference
@@ -105,16 +105,18 @@ class StochasticEventFilter(AbstractSizedFilter):
         count = self.received - self.trigger.side_information(self.outputs)
         values, down = z[:count], z[count:]
         prior = state.gaussian
-        signal = signal_of(plant, sensor, self.transform, prior, start_of(self.plant))
+        signal = signal_of(plant, sensor, self.transform, prior, second_moments_at_start(self.plant))
 
         # A value: each mode's update, joined.
         modes = len(state.law)
-        sent = repeat(signal, modes)
-        posteriors, weight, innovation = receive(sent, channel, jnp.arange(modes), state.law, values)
-        came = join(GaussianSum(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
+        sent = replicate(signal, modes)
+        posteriors, weight, innovation = correct_in_every_mode(sent, channel, jnp.arange(modes), state.law, values)
+        came = merge_groups(GaussianSum(safe_log(weight), posteriors, jnp.eye(len(weight))[:, None]))
         # Nothing: silence, or a link that is down.
         log_silent, quiet = self._condition_on_silence(prior, signal, state.reference, k)
-        nothing = self._condition_on_nothing(prior, _sum_of_one(log_silent, quiet, state.law), state.law, channel, down)
+        nothing = self._mix_silence_and_outage(
+            prior, _sum_of_one_gaussian(log_silent, quiet, state.law), state.law, channel, down
+        )
         # Which of the two it is, with its likelihood.
         arrived = jnp.any(~jnp.isnan(values))
         log_nothing = jnp.maximum(nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
@@ -122,10 +124,10 @@ class StochasticEventFilter(AbstractSizedFilter):
         log_came = innovation.log_likelihood
         if isinstance(self.trigger, StochasticTrigger):
             # Given that it was sent, where no component of it is missing.
-            link, is_complete = self._link(channel, state.law), ~jnp.any(jnp.isnan(value))
+            link, is_complete = self._average_link(channel, state.law), ~jnp.any(jnp.isnan(value))
             shift, change = self._change_by_sending(link, signal, state.reference, log_silent)
             complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
-            log_sent = self._log_sent(link[0], signal, state.reference, *complete)
+            log_sent = self._log_probability_sent(link[0], signal, state.reference, *complete)
             log_came = log_came + jnp.where(is_complete, log_sent, 0.0)
             value, covariance = (
                 jnp.where(is_complete, value - shift, value),
@@ -140,21 +142,24 @@ class StochasticEventFilter(AbstractSizedFilter):
         following = StochasticBelief(*x, after.label[0, 0], state.reference, state.moved)
         return following, Innovation(value, covariance, total)
 
-    def _condition_on_nothing(
+    def _mix_silence_and_outage(
         self, prior: Gaussian, silent: GaussianSum, law: jax.Array, channel: SideInformation, down: jax.Array
     ) -> GaussianSum:
-        """Condition on nothing that came: the sender was silent, or the link was down, and the prior stays."""
+        """No value came: mix the update by silence (link up) with the prior (link down) by posterior weights."""
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
-        parts = [silent.labelled(0, law[None] * (1 - lost))]
+        parts = [silent.relabel_sender(0, law[None] * (1 - lost))]
         if self.loses:
-            parts.append(_sum_of_one(jnp.zeros(()), prior, law).labelled(0, law[None] * lost))
+            parts.append(_sum_of_one_gaussian(jnp.zeros(()), prior, law).relabel_sender(0, law[None] * lost))
         if len(down):
             up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
-            parts = [parts[0].times(up), *(cause.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:])]
-        return join(together(parts))
+            parts = [
+                parts[0].scale_weights(up),
+                *(cause.scale_weights(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:]),
+            ]
+        return merge_groups(concatenate(parts))
 
-    def _link(self, channel: SideInformation, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mean gain (m, p) and spread (m, m, p + 1, p + 1) of the link where all of what was sent arrives."""
+    def _average_link(self, channel: SideInformation, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Mean gain (m, p) and spread (m, m, p + 1, p + 1) of the link, averaged over modes in which all arrives."""
         whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
             jnp.tensordot(whole, jnp.asarray(moment), 2) / jnp.sum(whole) for moment in (channel.mean, channel.spread)
@@ -164,7 +169,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _change_by_sending(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Change of the mean and covariance of a value by knowing that it was sent: larger ones are sent more often.
+        """Change of z's predicted mean and covariance given that it was sent: values far from r are sent more often.
 
         Of y ~ N(m, S) the share s is silent, with mean m + d and covariance S_s, so that of what is sent the mean is
         m - s d / (1 - s) and the second moment about m is (S - s (S_s + d d')) / (1 - s).
@@ -183,7 +188,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         change = gain @ (about - jnp.outer(shift, shift)) @ gain.T + jnp.einsum("ijkl,kl->ij", spread, second)
         return gain @ shift, symmetrize(change)
 
-    def _log_sent(
+    def _log_probability_sent(
         self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
     ) -> jax.Array:
         """log P(sent | z) = log(1 - P(silent | z)), by the law of y given z with this innovation."""
@@ -191,7 +196,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         back = psd_solve(covariance, gain @ total)
         left = symmetrize(total - total @ gain.T @ back) + inverse
         off = reference - signal.mean - value @ back
-        log_silent = log_density(off, left, jnp.abs(reference)) + self._log_height()
+        log_silent = log_density(off, left, jnp.abs(reference)) + self._log_silence_normaliser()
         return jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_silent, 0.0)), FLOOR))
 
     def _inverse_weight(self) -> jax.Array:
@@ -199,8 +204,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         assert isinstance(self.trigger, StochasticTrigger)
         return psd_solve(self.trigger.matrix(self.outputs), jnp.eye(self.outputs))
 
-    def _log_height(self) -> jax.Array:
-        """log of exp(-e' W e / 2) over the density N(e; 0, W^-1)."""
+    def _log_silence_normaliser(self) -> jax.Array:
+        """log of exp(-e' W e / 2) / N(e; 0, W^-1), the same for all e."""
         assert isinstance(self.trigger, StochasticTrigger)
         log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
         return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
@@ -216,7 +221,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         noise = join_columns(signal.noise, eliminate(self._inverse_weight()))
         after, innovations = observe(prior, signal.slopes, value, noise)
         size = jnp.abs(reference) + jnp.abs(signal.mean)
-        return innovations.log_density(jnp.ones(len(value), bool), size) + self._log_height(), after
+        return innovations.log_density(jnp.ones(len(value), bool), size) + self._log_silence_normaliser(), after
 
     @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
@@ -228,6 +233,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self, step, first(self.plant))
 
 
-def _sum_of_one(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> GaussianSum:
+def _sum_of_one_gaussian(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> GaussianSum:
+    """Return a sum of one Gaussian, with the probabilities `law` of the link's modes as its label."""
     alone: GaussianSum = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], GaussianSum(log_weight, belief, law[None]))
     return alone

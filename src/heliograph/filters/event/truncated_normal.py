@@ -32,8 +32,8 @@ PAIR = 2  # computed side by side: of one alone each operation waits for the one
 Moments = Callable[..., TruncatedNormal]
 
 
-def _pair_by_pair(moments: Moments) -> Moments:
-    """Make moments an operation that native code computes for a pair of entries after another, with its code once."""
+def _compute_pair_by_pair(moments: Moments) -> Moments:
+    """Make the moments one operation, so that native code holds their code once, for all pairs (lower, upper)."""
 
     def native(*ends: jax.Array) -> TruncatedNormal:
         width = 1 if ends[0].size % PAIR else PAIR
@@ -43,7 +43,7 @@ def _pair_by_pair(moments: Moments) -> Moments:
     return operation(native)(moments)
 
 
-@_pair_by_pair
+@_compute_pair_by_pair
 def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     """Log mass, mean and variance of N(0, 1) cut to [lower, upper], either of which may be infinite.
 
@@ -94,7 +94,7 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     return TruncatedNormal(log_mass, jnp.where(turned, -mean, mean), variance)
 
 
-@_pair_by_pair
+@_compute_pair_by_pair
 def upper_tail(lower: jax.Array) -> TruncatedNormal:
     """Log mass, mean and variance of N(0, 1) above `lower`: `truncated_normal` by a tenth of its operations.
 

@@ -17,20 +17,20 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.robust import RobustFilter, expect_received, signal_without_noise
+from heliograph.filters.gaussian.robust import RobustFilter, predict_behind_channel, signal_without_noise
 from heliograph.filters.gaussian.scores import (
     SMALLEST,
     AbstractWeights,
-    Expected,
+    PredictedMeasurement,
     branch_precision,
+    expected_squared_residuals,
     joint_update,
     reweight,
     score_update,
-    square_residuals,
 )
-from heliograph.filters.robust_noise import Law, ReceivedNoise, received_noise
+from heliograph.filters.robust_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.model.premise import believing
@@ -113,13 +113,13 @@ class AdaptiveFilter(AbstractSizedFilter):
         # Moments of what arrives without its noise, and the noise's law.
         base, belief, noise = self.base, state.gaussian, at(self.noise, k)
         sensor, plant = at(base.sensor, k), at(base.plant, k)
-        signal = signal_without_noise(plant, sensor, base.transform, belief, start_of(base.plant, base))
-        before = expect_received(signal, at(base.channel, k))
+        signal = signal_without_noise(plant, sensor, base.transform, belief, second_moments_at_start(base.plant, base))
+        before = predict_behind_channel(signal, at(base.channel, k))
         angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
         z = nearest(jnp.asarray(z), before.signal, angles)
         rule = base.rule if isinstance(base, RobustFilter) else None
         law = noise.law(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
-        learned = _learn(
+        learned = _variational_update(
             before,
             (state.shape, state.scale),
             z,
@@ -148,9 +148,8 @@ class AdaptiveFilter(AbstractSizedFilter):
         return variances
 
 
-class Learned(NamedTuple):
-    """State and law of the variances after the update, and the innovation's covariance (m, m) with those before it;
-    weight of each component.
+class VariationalUpdate(NamedTuple):
+    """State and variances' law after one update; predicted covariance of z by those before; weights of components.
 
     By those that were learned from a value itself no value would be far from what was expected.
     """
@@ -162,20 +161,29 @@ class Learned(NamedTuple):
     weight: jax.Array
 
 
-def _learn(
-    before: Expected,
+def _variational_update(
+    before: PredictedMeasurement,
     state: tuple[jax.Array, jax.Array],
     z: jax.Array,
     center: jax.Array,
     variance: jax.Array,
     memory: jax.Array,
     rule: AbstractWeights | None,
-    law: Law | None,
-) -> Learned:
+    law: NoiseBranches | None,
+) -> VariationalUpdate:
+    """One step of variational Bayes: alternate x given R = b / a and b given x, `ITERATIONS` times.
+
+    Each R_i has the law of an inverse gamma variable, R = b / a. Both parameters are forgotten towards the prior, a
+    grows by 1/2 for each value that arrived, and b by E[(z - t)^2] / 2 times its weight. The state is corrected with
+    the variances before the last b.
+
+    before: prediction of z without its noise; state: (a, b) before, (m,) each; center, variance: mean and nominal
+    variance of the noise; memory: share that is kept a step; rule or law: how a robust filter weighs outliers.
+    """
     arrived = ~jnp.isnan(z)
     # Forget towards the prior, and count the new value.
-    first = PRIOR_SHAPE * (1 - memory)
-    shape, scale = memory * state[0] + first, memory * state[1] + first * variance
+    prior_weight = PRIOR_SHAPE * (1 - memory)
+    shape, scale = memory * state[0] + prior_weight, memory * state[1] + prior_weight * variance
     after_shape = shape + 0.5
     e = jnp.where(arrived, z - before.signal - center, 0.0)
     noise, weight, shown, received = scale / shape, jnp.ones_like(e), jnp.ones_like(e), arrived
@@ -187,29 +195,31 @@ def _learn(
             residual = jnp.where(arrived, e + center - shift, 0.0)
             shown = weight
         elif rule is not None:
-            weight, shown = rule.iterate(before, _independent(noise), e, arrived)
+            weight, shown = rule.iterate(before, _make_independent_noise(noise), e, arrived)
             received = arrived & (weight > SMALLEST)
-        used = reweight(_independent(noise), weight)
-        learned = scale + weight * square_residuals(before, used, residual, received) / 2
-        last, noise = noise, jnp.where(received, learned / after_shape, noise)
+        used = reweight(_make_independent_noise(noise), weight)
+        learned = scale + weight * expected_squared_residuals(before, used, residual, received) / 2
+        previous_noise, noise = noise, jnp.where(received, learned / after_shape, noise)
     # The state with the last variances.
     if law is not None:
-        x = score_update(before, z, _scale_law(law, last / variance)).state
+        x = score_update(before, z, _scale_law(law, previous_noise / variance)).state
     else:
         x = joint_update(before, e, received, used)
     a, b = jnp.where(received, after_shape, state[0]), jnp.where(received, noise * after_shape, state[1])
-    return Learned(x, a, b, before.columns.covariance + jnp.diag(scale / shape), jnp.where(arrived, shown, jnp.nan))
+    return VariationalUpdate(
+        x, a, b, before.columns.covariance + jnp.diag(scale / shape), jnp.where(arrived, shown, jnp.nan)
+    )
 
 
-def _independent(variance: jax.Array) -> Columns:
+def _make_independent_noise(variance: jax.Array) -> Columns:
     """Noise of independent components with these variances (m,)."""
     return Columns(np.eye(len(variance)), variance)
 
 
-def _scale_law(law: Law, ratio: jax.Array) -> Law:
-    """The law with noise of other units: a variance `ratio` times as large."""
+def _scale_law(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
+    """Scale the noise's branches to a variance `ratio` times as large."""
     ratio = ratio[:, None]
-    return Law(law.log_share, law.mean * jnp.sqrt(ratio), law.variance * ratio, law.least * ratio)
+    return NoiseBranches(law.log_share, law.mean * jnp.sqrt(ratio), law.variance * ratio, law.least * ratio)
 
 
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
@@ -235,7 +245,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
         expected = "one of kalman_filter, extended_filter, cubature_filter or robust_filter"
         raise fail("filter to adapt", expected, type(filter).__name__)
     stored = scalar("memory of an adaptive filter", memory, TINY, 1.0)
-    noise = filter.noise if isinstance(filter, RobustFilter) else _noise_of(filter)
+    noise = filter.noise if isinstance(filter, RobustFilter) else _find_sensor_noise(filter)
     adaptive = AdaptiveFilter(
         base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,
         received=filter.received,
@@ -243,11 +253,14 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
     return believing(adaptive, filter.premise)
 
 
-def _noise_of(filter: GaussianFilter) -> ReceivedNoise | OverTime:
-    """The sensor's noise as it arrives."""
+def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
+    """Find the sensor's noise as it arrives behind the filter's channel."""
     steps = [model.steps for model in (filter.sensor, filter.channel) if isinstance(model, OverTime)]
     if not steps:
-        return received_noise(at(filter.sensor, 0).noise, None, at(filter.channel, 0), True)
+        return describe_outlier_noise(at(filter.sensor, 0).noise, None, at(filter.channel, 0), True)
     return over_time(
-        [received_noise(at(filter.sensor, k).noise, None, at(filter.channel, k), True) for k in range(max(steps))]
+        [
+            describe_outlier_noise(at(filter.sensor, k).noise, None, at(filter.channel, k), True)
+            for k in range(max(steps))
+        ]
     )

@@ -55,7 +55,9 @@ class AbstractBeliefFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """Mean and covariance of f(x, u) + w."""
-        return predict_gaussian(at(self.plant, k), self.transform, state, jnp.asarray(u), start_of(self.plant, self))
+        return predict_gaussian(
+            at(self.plant, k), self.transform, state, jnp.asarray(u), second_moments_at_start(self.plant, self)
+        )
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
@@ -74,8 +76,8 @@ class HasStart(Protocol):
     initial_covariance: Array
 
 
-def start_of(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array, " n"]:
-    """How large numbers are, of which the rounding stays unknown: E[x_i^2] at the start, and Var w_i of a step, (n,).
+def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array, " n"]:
+    """E[x_i^2] at the start plus Var w_i of a step, (n,): how large the numbers are that rounding acts on.
 
     Of the plant's first step, and of its law at the start or of another one; a noise that depends on inputs counts
     where it is added.
@@ -134,7 +136,7 @@ def smoother_step_by_transform(
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     before, prior, after = step[:3] if whole is None else map(whole, step[:3])
     image = image_of(plant, filter.transform, before, u)
-    rest = sum_unexplained(image, process_noise(plant, u, start_of(filter.plant, start)))
+    rest = sum_unexplained(image, process_noise(plant, u, second_moments_at_start(filter.plant, start)))
     return smoother_step_of(before, prior, after, (image.slopes, rest), filter.claim, plant.angles)
 
 

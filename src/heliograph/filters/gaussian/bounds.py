@@ -12,8 +12,12 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal, triangular
 from heliograph.factors.gaussian import Gaussian, observe, of_columns
-from heliograph.filters.gaussian.scalars import smallest_scalars, young_sweep, zero_mean_sweep
-from heliograph.filters.gaussian.signal import Received, Signal, factor_spread, homogeneous
+from heliograph.filters.gaussian.scalars import (
+    trace_minimising_scalars,
+    young_fixed_point_map,
+    zero_mean_fixed_point_map,
+)
+from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
@@ -54,13 +58,13 @@ def as_scalars(values: np.ndarray) -> Scalars | None:
     return None if np.isnan(values).any() else Scalars(*values)
 
 
-def keep_unless(changes: jax.Array, after: T, before: T) -> T:
+def keep_where_unchanged(changes: jax.Array, after: T, before: T) -> T:
     """Return `after` where something changes, else `before`."""
     chosen: T = jax.tree.map(lambda a, b: jnp.where(changes, a, b), after, before)
     return chosen
 
 
-def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars: Array) -> Gaussian:
+def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalars: Array) -> Gaussian:
     """Update by `Polytope` for any description of the channel; scalars (2,), NaN to minimise the trace over them.
 
     (1 + b1) P - C' Omega^-1 C with Omega = base + (1/b1 + 1/b2) shift + (1 + b2) M (H P H' + R) M' is what a Kalman
@@ -69,13 +73,13 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars:
     """
     prior, present = signal.prior, z.present
     slopes, of_state, of_noise = _select_received(signal, channel, present)
-    w = homogeneous(signal.second, signal.mean, 1.0)
+    w = augmented_second_moment(signal.second, signal.mean, 1.0)
     base, shift = channel.spread(w, present), channel.shift(w, present)
     # The scalars of least trace.
     cross = (slopes * prior.variances) @ prior.root.T
     whole = jnp.trace(prior.covariance)
-    parts = base + absent(present), shift, of_state + of_noise, cross @ cross.T, whole
-    beta = smallest_scalars(young_sweep, scalars, parts)
+    parts = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, whole
+    beta = trace_minimising_scalars(young_fixed_point_map, scalars, parts)
     a, b = jnp.where(jnp.any(present), 1 + beta[0], 1.0), 1 + beta[1]
     # The same bound as a Kalman update.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
@@ -83,7 +87,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: Received, scalars:
     return observe(wide, slopes, a * z.innovation, factor_spread(noise), present)[0]
 
 
-def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scalar: Array) -> Gaussian:
+def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
     """Update by `ZeroMean`; scalar (1,), NaN to optimise it.
 
     Omega = power(Pyy) + spread(yhat yhat') + shift(Pyy) / beta is at least M H P H' M', so that the rest is a noise;
@@ -92,8 +96,8 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
     prior, present = signal.prior, z.present
     slopes, of_state, _ = _select_received(signal, channel, present)
     # E[y y'] divided: yhat yhat' is known, Cov y is not.
-    known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
-    unknown_part = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
+    known_part = augmented_second_moment(signal.second - signal.covariance, signal.mean, 1.0)
+    unknown_part = augmented_second_moment(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
     base = channel.power(unknown_part, present) + channel.spread(known_part, present)
     shift = channel.shift(unknown_part, present)
     # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
@@ -104,11 +108,11 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: Received, scal
     share = reciprocal(factors.weights)
     # The best beta, then the update with what is left of Omega as noise.
     cross = (slopes * prior.variances) @ prior.root.T
-    parts = base + absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
-    beta = smallest_scalars(zero_mean_sweep, scalar, parts)[0]
+    parts = base + unit_variance_where_absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
+    beta = trace_minimising_scalars(zero_mean_fixed_point_map, scalar, parts)[0]
     after = observe(prior, slopes, z.innovation, factor_spread(base + shift / beta - of_state), present)[0]
     wider = of_columns(after.mean, join_columns(after.columns, Columns(explained, beta * share)))
-    return keep_unless(jnp.any(present), wider, after)
+    return keep_where_unchanged(jnp.any(present), wider, after)
 
 
 def _select_received(
@@ -120,7 +124,7 @@ def _select_received(
     return slopes, Columns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance
 
 
-def absent(present: jax.Array) -> jax.Array:
+def unit_variance_where_absent(present: jax.Array) -> jax.Array:
     """Return unit variance for components that did not arrive, so that the reduced system keeps its full size."""
     return jnp.diag(jnp.where(present, 0.0, 1.0))
 

@@ -12,11 +12,17 @@ from heliograph.filters.base import (
     corrects,
     make_sizes,
 )
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
-from heliograph.filters.gaussian.signal import Received, Signal, condition, make_received_noise, signal_of
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, second_moments_at_start
+from heliograph.filters.gaussian.signal import (
+    ArrivedInnovation,
+    Signal,
+    condition_on_measurement,
+    make_received_noise,
+    signal_of,
+)
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
-from heliograph.filters.linear.plan import plan
+from heliograph.filters.linear.plan import plan_filter
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain, perfect
 from heliograph.model.estimate import Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, without_memory
@@ -56,7 +62,7 @@ class GaussianFilter(AbstractBeliefFilter):
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
         """Moments of the sensor's signal y at step k, from the state before its measurement."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
-        return signal_of(plant, sensor, self.transform, state, start_of(self.plant, self))
+        return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     @compile_in_float64
     def expect_signals(
@@ -98,7 +104,7 @@ class GaussianFilter(AbstractBeliefFilter):
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
-        return plan(self, inputs) if self.linear else self
+        return plan_filter(self, inputs) if self.linear else self
 
 
 def correct_signal(
@@ -109,7 +115,7 @@ def correct_signal(
     angles: Angles = (),
     unknown: Signal | None = None,
 ) -> tuple[Gaussian, Innovation]:
-    """Correct the prior of a signal with the components of z that arrived; without any, it stays as it is.
+    """Condition a signal's prior on the components of z that arrived; without any, it stays as it is.
 
     `unknown`: what of the signal decides gain and covariance, where that is less than all. The innovation has the
     covariance and the density of the nominal law, whatever the rule bounds.
@@ -118,23 +124,23 @@ def correct_signal(
     expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
     # By the nominal law: the best update of a known one.
     slopes, noise = jnp.asarray(channel.mean_gain) @ unknown.slopes, make_received_noise(unknown, channel)
-    nominal, innovation = condition(unknown.prior, slopes, noise, z, expected, angles)
-    received = Received(jnp.asarray(innovation.value), ~jnp.isnan(z))
+    nominal, innovation = condition_on_measurement(unknown.prior, slopes, noise, z, expected, angles)
+    received = ArrivedInnovation(jnp.asarray(innovation.value), ~jnp.isnan(z))
     return rule.condition(unknown, channel, received, nominal), innovation
 
 
-def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
-    """Second moments of the channel in the form of the update, for each step where it varies."""
+def describe_channel(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
+    """Describe the channel's second moments in the form of the update, for each step where it varies."""
     described: SecondOrder | OverTime = at_each_step(update.describe, channel)
     return described
 
 
-def perfect_for(sensor: AnySensor) -> Channel:
+def make_perfect_channel(sensor: AnySensor) -> Channel:
     """Return the channel that delivers all outputs of a sensor as they are."""
     return perfect(len(instance("sensor", first(sensor), AbstractSensor, "a Sensor or LinearSensor").outputs))
 
 
-def _build(
+def _make_gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel | None,
@@ -144,10 +150,11 @@ def _build(
     initial_covariance: ArrayLike | None,
     trusted: bool,
 ) -> GaussianFilter:
+    """Check the parts, describe the channel by second moments without its memory, and decide the claim."""
     # Checks, and the prior.
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
-    channel = perfect_for(sensor) if channel is None else channel
+    channel = make_perfect_channel(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
@@ -155,7 +162,7 @@ def _build(
     premise = Premise(plant, sensor, channel)
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
-    described = describe(channel, update)
+    described = describe_channel(channel, update)
     pairs = zip(unstack(channel), unstack(described), strict=True)
     # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular
@@ -209,7 +216,9 @@ def gaussian_filter(
     """
     instance("transform", transform, AbstractTransform, "one such as Cubature()")
     rule = Polytope() if update is None else instance("update", update, AbstractUpdate, "one such as Polytope()")
-    return _build(plant, sensor, channel, transform, rule, initial_mean, initial_covariance, trusted=True)
+    return _make_gaussian_filter(
+        plant, sensor, channel, transform, rule, initial_mean, initial_covariance, trusted=True
+    )
 
 
 def cubature_filter(
@@ -294,7 +303,9 @@ def mean_gain_filter(
     Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
     """
     believed = mean_gain(without_memory(channel))
-    return _build(plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False)
+    return _make_gaussian_filter(
+        plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False
+    )
 
 
 MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"

@@ -12,19 +12,19 @@ from heliograph.filters.base import (
     Step,
     corrects,
 )
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, start_of
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, second_moments_at_start
 from heliograph.filters.gaussian.scores import (
     AbstractWeights,
-    Corrected,
-    Expected,
+    PredictedMeasurement,
+    ScoreUpdate,
+    expected_squared_residuals,
     reweight,
     score_update,
-    square_residuals,
     update_weighted,
 )
 from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
+from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
@@ -131,14 +131,14 @@ class StudentVB(AbstractWeights):
         return rule
 
     def iterate(
-        self, before: Expected, noise: Columns, e: jax.Array, present: jax.Array
+        self, before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """The weights of the last update, and those that it would give the next one."""
         scale = noise.diagonal
         used = w = jnp.broadcast_to(jnp.ones_like(scale), e.shape)
         for _ in range(self.iterations):
             used = w
-            residual = square_residuals(before, reweight(noise, used), e, present)
+            residual = expected_squared_residuals(before, reweight(noise, used), e, present)
             w = (jnp.asarray(self.degrees) + 1) / (jnp.asarray(self.degrees) + residual / scale)
         return used, w
 
@@ -170,22 +170,24 @@ class RobustFilter(AbstractBeliefFilter):
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Use what arrived of the measurement, component after component or with weights."""
-        before, sensed = self.expected(state, k)
+        before, sensed = self.predict_received(state, k)
         z = nearest(jnp.asarray(z), before.signal, self.received_angles)
         noise = at(self.noise, k)
         if self.rule is None:
             law = noise.law(sensed)
             after = score_update(before, z, law)
             center, variance = law.mean_and_variance()
-            return after.state, _innovation(before, z, center, jnp.diag(variance), after, True)
+            return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, True)
         after = update_weighted(before, z, noise.center, columns_of(noise.covariance), self.rule)
-        return after.state, _innovation(before, z, noise.center, noise.covariance, after)
+        return after.state, _innovation_about_mean(before, z, noise.center, noise.covariance, after)
 
-    def expected(self, state: Gaussian, k: Step) -> tuple[Expected, jax.Array]:
-        """Moments of what would arrive without the noise that may hold outliers, and the sensor's mean signal."""
+    def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
+        """Predict what would arrive without the noise that may hold outliers; return the sensor's mean signal too."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start_of(self.plant, self))
-        return expect_received(signal, channel), signal.mean
+        signal = signal_without_noise(
+            at(self.plant, k), sensor, self.transform, state, second_moments_at_start(self.plant, self)
+        )
+        return predict_behind_channel(signal, channel), signal.mean
 
 
 def signal_without_noise(
@@ -195,15 +197,20 @@ def signal_without_noise(
     return signal_of(plant, sensor, transform, state, start, nothing(len(sensor.outputs)))
 
 
-def expect_received(signal: Signal, channel: SecondOrder) -> Expected:
+def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:
     """Through the channel: t with mean M y + b and slopes M times the signal's; gain and plain noise are its noise."""
     gain = jnp.asarray(channel.mean_gain)
     mean = gain @ signal.mean + channel.offset
-    return Expected(signal.prior, mean, gain @ signal.slopes, make_received_noise(signal, channel))
+    return PredictedMeasurement(signal.prior, mean, gain @ signal.slopes, make_received_noise(signal, channel))
 
 
-def _innovation(
-    before: Expected, z: jax.Array, center: jax.Array, noise: jax.Array, after: Corrected, by_law: bool = False
+def _innovation_about_mean(
+    before: PredictedMeasurement,
+    z: jax.Array,
+    center: jax.Array,
+    noise: jax.Array,
+    after: ScoreUpdate,
+    by_law: bool = False,
 ) -> Innovation:
     """Innovation about the noise's mean with the covariance that the law says; the score's density is the mixture's."""
     present = ~jnp.isnan(z)
@@ -214,7 +221,7 @@ def _innovation(
     return Innovation(value, jnp.where(both, covariance, jnp.nan), density, after.weight)
 
 
-def _degrees(noise: ReceivedNoise) -> Vector:
+def _student_degrees_of(noise: ReceivedNoise) -> Vector:
     """Student's degrees of each component.
 
     Raises:
@@ -268,9 +275,9 @@ def robust_filter(
     move = Cubature() if transform is None else transform
     instance("transform", move, AbstractTransform, "one such as Cubature()")
     mean, spread, _ = prior_of(start, initial_mean, initial_covariance)
-    plain, noise = received(sensor, without_memory(channel), rule is None or isinstance(rule, StudentVB))
+    plain, noise = separate_outlier_noise(sensor, without_memory(channel), rule is None or isinstance(rule, StudentVB))
     if isinstance(rule, StudentVB):
-        rule = rule.of_law(_degrees(first(noise)))
+        rule = rule.of_law(_student_degrees_of(first(noise)))
     return RobustFilter(
         plant=plant, sensor=sensor, channel=plain, noise=noise, rule=rule, transform=move, initial_mean=mean,
         initial_covariance=spread, received_angles=find_received_angles(plant, sensor, channel), claim="nominal",

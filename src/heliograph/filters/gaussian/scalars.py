@@ -26,8 +26,8 @@ Slopes = list[list[jax.Array]]  # slopes[i][j] = d log f_i / d log beta_j
 Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(beta), slopes
 
 
-def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
-    """Scalars (count,) as given, and where they are NaN the fixed point of `sweep`.
+def trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
+    """Scalars of Young's inequality of least tr P: Newton's method on log beta; those that are given stay.
 
     Alternating minimisation converges slowly, so this is Newton's method, after one sweep from START. Where a Newton
     step is too long the sweep itself is taken. The last step is taken outside the loop: its derivative is that of the
@@ -37,10 +37,10 @@ def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
     fixed = jax.lax.stop_gradient(parts)
     free = jnp.isnan(given)
 
-    def moving(t: jax.Array, previous: jax.Array) -> jax.Array:
+    def has_moved(t: jax.Array, previous: jax.Array) -> jax.Array:
         return jnp.any(free & (jnp.abs(t - previous) > rounding(CONVERGED, t, LOOP)))
 
-    def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def iterate(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         t, _, sweeps = carry
         refined, slopes = sweep(t, *fixed)
         return jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes)), t, sweeps + 1
@@ -48,7 +48,7 @@ def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
     # Newton's method on the logarithms, until they stay.
     first = jnp.log(jnp.where(free, START, given))
     carry = first, jnp.where(free, -jnp.inf, first), jnp.asarray(0)
-    t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & moving(c[0], c[1]), again, carry)[0]
+    t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & has_moved(c[0], c[1]), iterate, carry)[0]
     # One Newton step with derivatives: dt = (I - J)^-1 df.
     refined, slopes = sweep(t, *parts)
     return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
@@ -71,12 +71,12 @@ def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: j
     return base + (1 / beta[0] + 1 / beta[1]) * shift + (1 + beta[1]) * mean_part
 
 
-def young_sweep(
+def young_fixed_point_map(
     t: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array, power: jax.Array, whole: jax.Array
 ) -> tuple[jax.Array, Slopes]:
-    """Compute the next scalars by the last gain: beta_1 = sqrt(tr W S / tr P), beta_2 = sqrt(tr W S / tr W M)."""
+    """Map log beta to its next value: beta_1 = sqrt(tr W S / tr P), beta_2 = sqrt(tr W S / tr W M); with slopes."""
     beta = jnp.exp(t)
-    weight, (s, m) = _weight(young_omega(beta, base, shift, mean_part), power, (shift, mean_part))
+    weight, (s, m) = _trace_weight(young_omega(beta, base, shift, mean_part), power, (shift, mean_part))
     ws, wm = weight @ shift, weight @ mean_part
     shift_trace, mean_trace = jnp.trace(ws), jnp.trace(wm)
     by_first = [2 / beta[0] * jnp.vdot(s.T, x) for x in (ws, wm)]  # d tr W X / d log beta_1
@@ -88,18 +88,18 @@ def young_sweep(
     return jnp.stack([first, second]), [first_slopes, second_slopes]
 
 
-def zero_mean_sweep(
+def zero_mean_fixed_point_map(
     t: jax.Array, base: jax.Array, shift: jax.Array, power: jax.Array, whole: jax.Array
 ) -> tuple[jax.Array, Slopes]:
-    """Compute the next scalar by the last gain: beta = sqrt(tr W S / tr explained) with Omega = base + S / beta."""
+    """Map log beta to its next value, beta = sqrt(tr W S / tr explained) with Omega = base + S / beta; with slopes."""
     beta = jnp.exp(t[0])
-    weight, (s,) = _weight(base + shift / beta, power, (shift,))
+    weight, (s,) = _trace_weight(base + shift / beta, power, (shift,))
     ws = weight @ shift
     refined, slopes = _root_ratio(jnp.trace(ws), [2 / beta * jnp.vdot(s.T, ws)], whole, [None])
     return refined[None], [slopes]
 
 
-def _weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
+def _trace_weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
     """W = Omega^-1 C C' Omega^-1 of K = C' Omega^-1, and Omega^-1 X of others: in matrices of the data's size."""
     solve = solver(omega)
     first, *rest = jnp.split(solve(jnp.concatenate([power, *others], axis=1)), 1 + len(others), axis=1)

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 
 from heliograph.factors.columns import Columns, join_columns, triangular
 from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns, revise
-from heliograph.filters.robust_noise import Law
+from heliograph.filters.robust_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
 
 LARGEST = 1e150  # deviations of the widest branch: beyond, squares overflow
 SMALLEST = 1e-200  # weight: below, a component counts as missing
 
 
-class Expected(NamedTuple):
-    """What would arrive without its noise, t = E t + slopes xi + noise, of a state x = m + L xi before the measurement.
+class PredictedMeasurement(NamedTuple):
+    """Prediction of the measurement without its noise, t = E t + slopes xi + noise, of a state x = m + L xi.
 
     Shapes: prior of n states, signal (m,), slopes (m, n), noise (m, columns).
     """
@@ -34,7 +34,7 @@ class Expected(NamedTuple):
         return join_columns(Columns(self.slopes, self.prior.variances), self.noise)
 
 
-class Corrected(NamedTuple):
+class ScoreUpdate(NamedTuple):
     """State after the update, weight of each component (0: left out, 1: in full), log density of what arrived."""
 
     state: Gaussian
@@ -42,7 +42,7 @@ class Corrected(NamedTuple):
     log_density: jax.Array
 
 
-def score_update(before: Expected, z: jax.Array, law: Law) -> Corrected:
+def score_update(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches) -> ScoreUpdate:
     """Exact posterior moments of one component after another, for a Gaussian prior and a noise of Gaussian branches.
 
     With s_j = V_ii + r_j (at least `least`), u_j = (e - m_j) / s_j and q_j in proportion to p_j N(e; m_j, s_j), the
@@ -61,11 +61,13 @@ def score_update(before: Expected, z: jax.Array, law: Law) -> Corrected:
         v = row**2 @ both.variances
         e = jnp.where(present[i], z[i] - both.mean[n + i], 0.0)
         branches = law.log_share[i], law.mean[i], jnp.maximum(law.variance[i], law.least[i] - v)
-        score = _score(e, v, *branches)
-        weights.append(jnp.where(present[i], score.weight / _score(jnp.zeros_like(e), v, *branches).weight, jnp.nan))
+        score = _compute_score(e, v, *branches)
+        weights.append(
+            jnp.where(present[i], score.weight / _compute_score(jnp.zeros_like(e), v, *branches).weight, jnp.nan)
+        )
         density = density + jnp.where(present[i], score.log_density, 0.0)
         both = revise(both, jnp.where(present[i], row, 0.0), v * score.slope, score.left)
-    return Corrected(leading(both, n), _stack(weights), density)
+    return ScoreUpdate(leading(both, n), _stack_entries(weights), density)
 
 
 class _Score(NamedTuple):
@@ -77,7 +79,7 @@ class _Score(NamedTuple):
     log_density: jax.Array
 
 
-def _score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.Array, noise: jax.Array) -> _Score:
+def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.Array, noise: jax.Array) -> _Score:
     """Score of an innovation e about a t of variance v, with branches (branches,) of the noise."""
     total = v + noise
     reach = LARGEST * jnp.sqrt(jnp.max(total))
@@ -102,7 +104,7 @@ class AbstractWeights(Module):
         raise unwritten(self, "weights")
 
     def iterate(
-        self, before: Expected, noise: Columns, e: jax.Array, present: jax.Array
+        self, before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """The weights of the update, and those to report, for noise of m components."""
         scale = noise.diagonal
@@ -111,14 +113,14 @@ class AbstractWeights(Module):
 
 
 def update_weighted(
-    before: Expected, z: jax.Array, center: jax.Array, noise: Columns, rule: AbstractWeights
-) -> Corrected:
+    before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: Columns, rule: AbstractWeights
+) -> ScoreUpdate:
     """One joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; a component of weight zero is missing."""
     arrived = ~jnp.isnan(z)
     e = jnp.where(arrived, z - before.signal - center, 0.0)
     w, shown = rule.iterate(before, noise, e, arrived)
     after = joint_update(before, e, arrived & (w > SMALLEST), reweight(noise, w))
-    return Corrected(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
+    return ScoreUpdate(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
 
 
 def reweight(noise: Columns, w: jax.Array) -> Columns:
@@ -126,19 +128,23 @@ def reweight(noise: Columns, w: jax.Array) -> Columns:
     return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
 
-def joint_update(before: Expected, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
+def joint_update(before: PredictedMeasurement, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
     """State after the components that are present, with noise of this covariance besides that of t."""
     return observe(before.prior, before.slopes, e, join_columns(before.noise, noise), present)[0]
 
 
-def square_residuals(before: Expected, noise: Columns, e: jax.Array, present: jax.Array) -> jax.Array:
-    """E_i = (z_i - t_i+)^2 + V_ii+ after a joint update with this noise: what is then known of each noise's square."""
+def expected_squared_residuals(
+    before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
+) -> jax.Array:
+    """E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,)."""
     t = of_columns(jnp.zeros_like(e), before.columns)
     after, _ = observe(t, t.root, e, noise, present)
     return (e - after.mean) ** 2 + after.columns.diagonal
 
 
-def branch_precision(before: Expected, e: jax.Array, scale: jax.Array, law: Law) -> tuple[jax.Array, jax.Array]:
+def branch_precision(
+    before: PredictedMeasurement, e: jax.Array, scale: jax.Array, law: NoiseBranches
+) -> tuple[jax.Array, jax.Array]:
     """Expected precision sum q_j r / r_j (m,) of each component's noise, in units of r, and the mean that it is about.
 
     q_j is the probability of branch j given the component alone.
@@ -153,5 +159,6 @@ def branch_precision(before: Expected, e: jax.Array, scale: jax.Array, law: Law)
     return whole / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / whole
 
 
-def _stack(entries: list[jax.Array]) -> jax.Array:
+def _stack_entries(entries: list[jax.Array]) -> jax.Array:
+    """Stack scalars along one axis; of a single one no operation is needed."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

@@ -23,8 +23,8 @@ from heliograph.random_affine.moments.second_moments import SecondOrder
 LOST = 100  # roundings of its variance, which elimination leaves of a combination free of a random gain
 
 
-class Received(NamedTuple):
-    """z - E z (m,), and which components arrived (m,): an expectation that is no number is no missing measurement."""
+class ArrivedInnovation(NamedTuple):
+    """Innovation z - E z (m,), and which components arrived (m,): one that is no number is not a missing one."""
 
     innovation: jax.Array
     present: jax.Array
@@ -84,12 +84,12 @@ def signal_of(
         image = transform.image(continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles), prior)
     mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
     second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
-    size = size_of(sensor, start) if isinstance(sensor, LinearSensor) else jnp.diagonal(second)
+    size = signal_size_at_start(sensor, start) if isinstance(sensor, LinearSensor) else jnp.diagonal(second)
     return Signal(prior, mean, image.slopes, noise, second, size)
 
 
-def size_of(sensor: LinearSensor, start: jax.Array) -> jax.Array:
-    """(|H| root E[x x'] + |E v|)^2 + Cov v of the state at the start, (p,): how large what y is summed of may be.
+def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
+    """(|H| root E[x x'] + |E v|)^2 + Cov v of the state at the start, (p,): size of the terms summed in y.
 
     Not of the prior: on data no covariance of a linear filter depends, and before them moments grow without end where
     only inputs hold a plant.
@@ -107,10 +107,10 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
     What the random gain adds, E[(G - M) y y' (G - M)'], is formed and eliminated: of a combination free of it, that
     leaves a hundred eps.
     """
-    return noise_through(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
+    return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
 
 
-def noise_through(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
+def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
     plain = triangular(join_columns(signal.noise.through(gain), link, rounding))
@@ -119,11 +119,11 @@ def noise_through(signal: Signal, gain: jax.Array, gain_spread: Array, link: Col
 
 def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> Columns:
     """Factor E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
-    return factor_spread(contract(gain_spread, homogeneous(second, mean, 1.0)))
+    return factor_spread(contract(gain_spread, augmented_second_moment(second, mean, 1.0)))
 
 
 def factor_spread(spread: jax.Array) -> Columns:
-    """Factor a spread that is formed: of a combination free of it, elimination leaves a hundred eps."""
+    """Factor a covariance that was formed as a matrix, by elimination; below a hundred eps of it counts as zero."""
     return eliminate(spread, LOST * unit_of(spread))
 
 
@@ -132,13 +132,13 @@ def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Colu
     return join_columns(channel.noise, gain_noise(channel.gain_spread, second, mean))
 
 
-def observe_received(signal: Signal, channel: SecondOrder, z: Received) -> tuple[Gaussian, Innovations]:
+def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> tuple[Gaussian, Innovations]:
     """Condition the prior on what arrived behind the nominal law of the channel."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
     return observe(signal.prior, slopes, z.innovation, make_received_noise(signal, channel), z.present)
 
 
-def condition(
+def condition_on_measurement(
     x: Gaussian, slopes: jax.Array, noise: Columns, z: jax.Array, expected: jax.Array, angles: Angles = ()
 ) -> tuple[Gaussian, Innovation]:
     """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive."""
@@ -157,7 +157,7 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
     return join_columns(Columns(slopes, signal.prior.variances), make_received_noise(signal, channel)).covariance
 
 
-def homogeneous(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
+def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
     """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
     top = jnp.concatenate([second, mean[:, None]], axis=1)
     return jnp.concatenate([top, jnp.append(mean, last)[None]])

@@ -16,11 +16,11 @@ from heliograph.filters.gaussian.bounds import (
     Scalars,
     as_array,
     as_scalars,
-    keep_unless,
+    keep_where_unchanged,
     observe_by_young,
     observe_by_zero_mean,
 )
-from heliograph.filters.gaussian.signal import Received, Signal, observe_received
+from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, condition_on_received
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten
@@ -70,14 +70,14 @@ class AbstractUpdate(Module):
             raise unwritten(self, "correct")
 
         def moved(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
-            z = Received(innovation, present)
-            after = self.condition(signal, channel, z, observe_received(signal, channel, z)[0])
+            z = ArrivedInnovation(innovation, present)
+            after = self.condition(signal, channel, z, condition_on_received(signal, channel, z)[0])
             return jnp.asarray(after.mean), after
 
         gain, after = jax.jacfwd(moved, has_aux=True)(jnp.zeros(len(present)))
         return gain, jnp.asarray(after.covariance)
 
-    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Condition `signal.prior` on z - E z; by default from `correct`.
 
         Args:
@@ -89,7 +89,7 @@ class AbstractUpdate(Module):
         prior = signal.prior
         gain, bound = self.correct(prior.covariance, signal, channel, z.present)
         after = given(prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0), bound)
-        return keep_unless(jnp.any(z.present), after, prior)
+        return keep_where_unchanged(jnp.any(z.present), after, prior)
 
     def claim(self, uncertain: bool) -> Claim:
         """Claim of the bound behind a channel of this kind, of a filter for which all else is exact.
@@ -122,7 +122,7 @@ class Polytope(AbstractUpdate):
     def __init__(self, scalars: Scalars | None = None):
         self.scalars = as_array(scalars)
 
-    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
@@ -156,7 +156,7 @@ class ZeroMean(AbstractUpdate):
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
 
-    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over beta unless it is fixed."""
         return observe_by_zero_mean(signal, channel, z, self.scalar) if channel.uncertain else nominal
 
@@ -194,7 +194,7 @@ class Interval(AbstractUpdate):
         """Young's bound, as for a polytope."""
         return Polytope(as_scalars(self.scalars))
 
-    def condition(self, signal: Signal, channel: SecondOrder, z: Received, nominal: Gaussian) -> Gaussian:
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
@@ -213,8 +213,9 @@ class HopRange(NamedTuple):
     noise: np.ndarray
 
 
-def _hop_range(hop: AbstractRandomAffine) -> HopRange:
-    if not isinstance(hop, GainAndNoise) or not _is_scalar(hop.matrix) or np.any(hop.noise.mean):
+def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
+    """Describe one hop by intervals of E g and E g^2; refuse one that is not one gain with zero-mean noise."""
+    if not isinstance(hop, GainAndNoise) or not _is_multiple_of_identity(hop.matrix) or np.any(hop.noise.mean):
         raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
     radius, law = (0.0, 0.0), hop.law
     if isinstance(law, Discrete):
@@ -224,7 +225,8 @@ def _hop_range(hop: AbstractRandomAffine) -> HopRange:
     return HopRange(amplitude, mean, radius[0], second + radius[1], np.asarray(hop.noise.covariance))
 
 
-def _is_scalar(matrix: jax.Array | np.ndarray) -> bool:
+def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
+    """True if the matrix is a number times the identity."""
     return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
 
 
@@ -233,7 +235,7 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
 
     `variance` is the bound on var g of a hop.
     """
-    hops = [_hop_range(hop) for hop in maps_in_series(channel)]
+    hops = [_describe_hop(hop) for hop in maps_in_series(channel)]
     # The recursion over the hops.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:

@@ -1,4 +1,4 @@
-"""What a linear filter knows: the estimate, and the state's moments before any data, both moved with the plant."""
+"""State of a linear filter: the estimate, and the plant's moments without any data, both predicted with the plant."""
 
 from typing import Any, NamedTuple
 
@@ -14,8 +14,8 @@ from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.types import Float
 
 
-class Move(NamedTuple):
-    """A step x+ = A x + b + w.
+class PlantMotion(NamedTuple):
+    """Plant over one step, x+ = A x + b + w.
 
     Shapes: matrix A (n, n), shift b (n,), covariance Cov w (n, n), noise (n, columns) its factors with the rounding
     of x.
@@ -27,9 +27,11 @@ class Move(NamedTuple):
     noise: Columns
 
 
-def move_of(plant: LinearPlant, u: jax.Array, start: jax.Array) -> Move:
-    """The plant's move under the input u; `start` are E[x_i^2] before the first step, (n,)."""
-    return Move(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u), process_noise(plant, u, start))
+def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> PlantMotion:
+    """Return the plant's motion under the input u; `start` is E[x_i^2] before the first step, (n,)."""
+    return PlantMotion(
+        plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u), process_noise(plant, u, start)
+    )
 
 
 class LinearBelief(NamedTuple):
@@ -62,8 +64,8 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
     return LinearBelief(*given(start.initial_mean, start.initial_covariance), mean, covariance)
 
 
-def predict_belief(belief: LinearBelief, step: Move) -> LinearBelief:
-    """Estimate and state before data after x+ = A x + b + w."""
+def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
+    """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
     estimate = move(belief.estimate, step.matrix, step.shift, step.noise)
     mean = step.matrix @ belief.state_mean + step.shift
     covariance = step.matrix @ belief.state_covariance @ step.matrix.T + step.covariance
@@ -71,13 +73,14 @@ def predict_belief(belief: LinearBelief, step: Move) -> LinearBelief:
 
 
 def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Moments that stay finite numbers: those before any data of an unstable plant, which only its inputs hold, do not.
+    """Limit moments without data to finite numbers: those of an unstable plant grow for ever.
 
     Behind a known gain nothing depends on them.
     """
     largest = float(np.finfo(covariance.dtype).max) ** 0.5
-    return _clip(mean, largest**0.5), _clip(covariance, largest)
+    return _clip_to(mean, largest**0.5), _clip_to(covariance, largest)
 
 
-def _clip(a: jax.Array, largest: float) -> jax.Array:
+def _clip_to(a: jax.Array, largest: float) -> jax.Array:
+    """Clip the entries of a to [-largest, largest]."""
     return jnp.maximum(jnp.minimum(a, largest), -largest)

@@ -8,18 +8,18 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.gaussian import correct_signal, describe
-from heliograph.filters.gaussian.signal import Signal, size_of
+from heliograph.filters.gaussian.belief import second_moments_at_start
+from heliograph.filters.gaussian.gaussian import correct_signal, describe_channel
+from heliograph.filters.gaussian.signal import Signal, signal_size_at_start
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, move_of, predict_belief, prior_belief
-from heliograph.filters.linear.plan import plan
+from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
+from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.modes.additive import additive_modal_filter, independent_terms
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
 from heliograph.filters.modes.uncertain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.wrappers.delay import as_current, behind_delays
+from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
@@ -70,12 +70,14 @@ class LinearFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
-        return predict_belief(state, move_of(at(self.plant, k), jnp.asarray(u), start_of(self.plant)))
+        return predict_belief(
+            state, motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
+        )
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Correct with the components of z that arrived."""
-        sensor, channel, start = at(self.sensor, k), at(self.channel, k), start_of(self.plant)
+        sensor, channel, start = at(self.sensor, k), at(self.channel, k), second_moments_at_start(self.plant)
         return correct_linear(state, sensor, channel, self.rule, jnp.asarray(z), start)
 
     @estimates
@@ -88,7 +90,7 @@ class LinearFilter(AbstractSizedFilter):
 
         That no random gain and no draw of the past tells of, so that Rauch's recursion is the best linear one.
         """
-        move = move_of(at(self.plant, step.k), jnp.asarray(step.u), start_of(self.plant))
+        move = motion_of_plant(at(self.plant, step.k), jnp.asarray(step.u), second_moments_at_start(self.plant))
         moved = move.matrix @ step.before.estimate.root, move.noise
         claim: Claim = self.claim if self.mean_known else "nominal"
         return smoother_step_of(step.before, step.prior, step.after, moved, claim)
@@ -100,7 +102,7 @@ class LinearFilter(AbstractSizedFilter):
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
-        return plan(self, inputs)
+        return plan_filter(self, inputs)
 
 
 def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Array) -> Signal:
@@ -113,7 +115,7 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     mean = matrix @ state.state_mean + law.mean
     second = matrix @ state.state_covariance @ matrix.T + law.covariance + jnp.outer(mean, mean)
     slopes = matrix @ state.estimate.root
-    return Signal(state.estimate, mean, slopes, law.columns, symmetric(second), size_of(sensor, start))
+    return Signal(state.estimate, mean, slopes, law.columns, symmetric(second), signal_size_at_start(sensor, start))
 
 
 def correct_linear(
@@ -156,7 +158,7 @@ def linear_filter(
     """
     # Delays: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(channel)])[0].past:
-        return behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
+        return build_behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
     check_linear("linear filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
     # Memory: the modes are estimated jointly with the state.
@@ -175,7 +177,7 @@ def linear_filter(
         return modal_filter(plant, sensor, channel)
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
-    described = describe(channel, rule)
+    described = describe_channel(channel, rule)
     whole = described.values if isinstance(described, OverTime) else described
     start = first(plant)
     return LinearFilter(
@@ -216,11 +218,11 @@ def memoryless_filter(
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
         ignoring = linear_filter(plant, sensor, channel, update)
         assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
-        return _nominal(ignoring) if matters else ignoring
+        return _claim_nominal(ignoring) if matters else ignoring
 
     # Delays: the same filter for the system enlarged by past signals.
     late = check_maps("channel", [first(forgets)])[0].past
-    return behind_delays(plant, sensor, forgets, make) if late else make(plant, sensor, forgets)
+    return build_behind_delays(plant, sensor, forgets, make) if late else make(plant, sensor, forgets)
 
 
 def as_current_filter(
@@ -242,11 +244,11 @@ def as_current_filter(
 
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
-    ignoring = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
+    ignoring = linear_filter(plant, sensor, without_memory(deliver_line_as_current(channel)), update)
     assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
-    return _nominal(ignoring) if first(channel).past or memory_matters(channel) else ignoring
+    return _claim_nominal(ignoring) if first(channel).past or memory_matters(channel) else ignoring
 
 
-def _nominal(ignoring: LinearFilter) -> LinearFilter:
-    """The filter of a link that it takes for another one."""
+def _claim_nominal(ignoring: LinearFilter) -> LinearFilter:
+    """Return the same filter with claim nominal: it ignores delay or memory that the link has."""
     return believing(replace(ignoring, claim="nominal"), ignoring.premise)

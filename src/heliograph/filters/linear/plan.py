@@ -38,7 +38,7 @@ class LinearStep(NamedTuple):
         return jnp.asarray(self.transition @ mean + self.drift)
 
     def expect(self, mean: Float[Array, " N"]) -> Float[jax.Array, " m"]:
-        """C m- + c, the measurement that is expected."""
+        """Predict the measurement, C m- + c, from the predicted mean m-."""
         return jnp.asarray(self.output @ mean + self.offset)
 
     def correct(self, mean: Float[Array, " N"], innovation: Float[jax.Array, " m"]) -> Float[jax.Array, " N"]:
@@ -46,7 +46,7 @@ class LinearStep(NamedTuple):
         return jnp.asarray(mean + self.gain @ innovation)
 
     def keep(self) -> Float[jax.Array, "*node N N"]:
-        """I - K C, what a correction leaves of the predicted mean, and of its error."""
+        """I - K C, which maps the predicted mean, and its error, to the corrected one."""
         return jnp.asarray(jnp.eye(self.gain.shape[-2]) - self.gain @ self.output)
 
 
@@ -128,7 +128,7 @@ def _stage(state: PlannedMean, stage: Step) -> jax.Array:
     return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
 
 
-def plan(
+def plan_filter(
     filter: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
 ) -> PlannedFilter:
     """Run a filter over complete data and record its matrices; its state has a `mean` and a `covariance`.
@@ -137,10 +137,15 @@ def plan(
     `projection` (n, N) maps the filter's mean to the plant's states.
     """
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
-    return _plan(*arguments) if is_traced(arguments) else compute_once(_plan, _plan_by_xla, arguments, SHORT)
+    return (
+        _record_matrices(*arguments)
+        if is_traced(arguments)
+        else compute_once(_record_matrices, _plan_by_xla, arguments, SHORT)
+    )
 
 
-def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
+def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
+    """Scan a filter over zeros and return the gains and covariances of every step as a `PlannedFilter`."""
     # Complete data of zeros: the matrices do not depend on their values.
     quiet = jnp.zeros(filter.received)
 
@@ -163,7 +168,7 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
     )
 
 
-_plan_by_xla = quickly_compiled(_plan)
+_plan_by_xla = quickly_compiled(_record_matrices)
 
 
 def plan_step(
@@ -247,4 +252,5 @@ def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.A
 
 
 def _seen(covariance: jax.Array, projection: Array | None) -> jax.Array:
+    """Return the covariance of the plant's state, by the projection if there is one."""
     return covariance if projection is None else jnp.asarray(projection) @ covariance @ jnp.asarray(projection).T

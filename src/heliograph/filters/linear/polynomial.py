@@ -39,7 +39,7 @@ Part = TypeVar("Part", AbstractPlant, AbstractSensor, AbstractRandomAffine)
 T = TypeVar("T")
 
 
-class Centre(Module):
+class MeanBeforeData(Module):
     """Mean of the state before any data, E[x_0] and E[x+] = A E[x] + b, and the matrix G C with which it is received.
 
     Shapes: start (n,), transition A (n, n), drift b (n,), received G C (m, n); each at every step, or constant.
@@ -52,7 +52,7 @@ class Centre(Module):
 
 
 @in_float64
-def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | None:
+def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBeforeData | None:
     """Return the mean of a linear model's state; None where it is zero throughout or a gain is random."""
     plants, sensors, channels = unstack(plant), unstack(sensor), unstack(channel)
     if not all(has_known_gain(c) for c in channels):
@@ -64,7 +64,7 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | 
     count = max(len(sensors), len(channels))
     pairs = zip(_repeat(sensors, count), _repeat(channels, count), strict=False)
     received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix(s) for s, c in pairs]
-    return Centre(start, _series([_matrix(p) for p in plants]), _series(drifts), _series(received))
+    return MeanBeforeData(start, _series([_matrix(p) for p in plants]), _series(drifts), _series(received))
 
 
 def centre_plant(plant: AnyPlant) -> AnyPlant:
@@ -91,8 +91,8 @@ def _series(values: list[np.ndarray]) -> Array | OverTime:
     return values[0] if len(values) == 1 else OverTime(np.array(values))
 
 
-class Centred(NamedTuple):
-    """State of the inner filter, and the mean (n,) of x that is subtracted before it."""
+class CentredState(NamedTuple):
+    """State of the inner filter, which estimates x - E[x], and the mean E[x] (n,)."""
 
     inner: PyTree
     mean: Float[Array, " n"]
@@ -115,11 +115,11 @@ class PolynomialFilter(AbstractSizedFilter):
     """
 
     inner: AbstractFilter
-    centre: Centre | None
+    centre: MeanBeforeData | None
     degree: int = eqx.field(static=True)
     endless: bool = eqx.field(static=True)
 
-    def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: Centre | None = None):
+    def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: MeanBeforeData | None = None):
         instance("inner filter", inner, AbstractFilter, "a filter")
         check_count("degree of the filter", degree)
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
@@ -140,26 +140,26 @@ class PolynomialFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> PyTree:
         """Return the inner filter's state, and the mean that is subtracted before it."""
-        return Centred(self.inner.init(), _start(self.centre, len(self.states)))
+        return CentredState(self.inner.init(), _initial_mean(self.centre, len(self.states)))
 
     @predicts
-    def predict(self, state: Centred, u: ArrayLike = (), k: Step = 0) -> Centred:
+    def predict(self, state: CentredState, u: ArrayLike = (), k: Step = 0) -> CentredState:
         """Predict with the inner filter, and move the mean."""
-        return Centred(self.inner.predict(state.inner, u, k), _mean_moved(self.centre, state.mean, k))
+        return CentredState(self.inner.predict(state.inner, u, k), _predict_mean(self.centre, state.mean, k))
 
     @corrects
-    def correct(self, state: Centred, z: ArrayLike, k: Step = 0) -> tuple[Centred, Innovation]:
+    def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
         """Lift z and correct the inner filter."""
         z = _subtract_mean(self.centre, z, state.mean, k)
         after, innovation = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
-        return Centred(after, state.mean), _select_degree_one(innovation, z, self.degree)
+        return CentredState(after, state.mean), _select_degree_one(innovation, z, self.degree)
 
     @estimates
-    def estimate(self, state: Centred) -> Estimate:
+    def estimate(self, state: CentredState) -> Estimate:
         """Estimate of the inner filter, plus the mean."""
         return _add_mean(self.inner.estimate(state.inner), state.mean)
 
-    def after_step(self, state: Centred, k: Step) -> Estimate:
+    def after_step(self, state: CentredState, k: Step) -> Estimate:
         """Estimate of the inner filter after step k, plus the mean."""
         return _add_mean(self.inner.after_step(state.inner, k), state.mean)
 
@@ -179,12 +179,13 @@ class PolynomialFilter(AbstractSizedFilter):
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 
 
-def _start(centre: Centre | None, n: int) -> jax.Array:
+def _initial_mean(centre: MeanBeforeData | None, n: int) -> jax.Array:
+    """Mean of the state at the start (n,), zeros where nothing is subtracted."""
     return jnp.zeros(n) if centre is None else jnp.asarray(centre.start)
 
 
-def _mean_moved(centre: Centre | None, mean: Array, k: Step) -> Array:
-    """E[x+] = A E[x] + b."""
+def _predict_mean(centre: MeanBeforeData | None, mean: Array, k: Step) -> Array:
+    """E[x+] = A E[x] + b over step k."""
     if centre is None:
         return mean
     c = at(centre, k)
@@ -192,12 +193,13 @@ def _mean_moved(centre: Centre | None, mean: Array, k: Step) -> Array:
     return moved
 
 
-def _subtract_mean(centre: Centre | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
+def _subtract_mean(centre: MeanBeforeData | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
     """z - G C E[x]."""
     return jnp.asarray(z) if centre is None else jnp.asarray(z) - at(centre, k).received @ mean
 
 
 def _add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
+    """Add the mean of the state to an estimate of x - E[x]."""
     return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)
 
 
@@ -236,17 +238,17 @@ def polynomial_filter(
 
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
-    centre, system = _lift(plant, sensor, channel, degree, horizon)
-    claim = lmmse(system, claim_of(plant, sensor, channel, degree)).claim
+    centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
+    claim = lmmse(system, polynomial_claim(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
     filter = PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
     return believing(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
-def _lift(
+def _lift_about_mean(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
-) -> tuple[Centre | None, LinearSystem]:
-    """Lifted system of the model, about its mean where the gain is known."""
+) -> tuple[MeanBeforeData | None, LinearSystem]:
+    """Lift the model to monomials up to `degree`, about its mean where the gain is known."""
     check_model(plant, sensor, channel)
     centre = centre_of(plant, sensor, channel)
     about = plant if centre is None else centre_plant(plant)
@@ -279,8 +281,8 @@ def scheduled_polynomial_filter(
 
     Source: as `polynomial_filter`.
     """
-    centre, system = _lift(plant, sensor, channel, degree, horizon)
-    inner = ScheduledFilter(lmmse(system, claim_of(plant, sensor, channel, degree)), first(plant).states)
+    centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
+    inner = ScheduledFilter(lmmse(system, polynomial_claim(plant, sensor, channel, degree)), first(plant).states)
     return believing(PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree))
 
 
@@ -301,9 +303,11 @@ class MemoryFilter(AbstractSizedFilter):
 
     linear: ScheduledFilter
     products: ScheduledFilter
-    centre: Centre | None
+    centre: MeanBeforeData | None
 
-    def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: Centre | None = None):
+    def __init__(
+        self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: MeanBeforeData | None = None
+    ):
         self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
         self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
         self.kept = products.kept
@@ -311,13 +315,13 @@ class MemoryFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> MemoryState:
         """Return the initial states of both filters, and the mean that is subtracted before them."""
-        return MemoryState(self.linear.init(), self.products.init(), _start(self.centre, len(self.states)))
+        return MemoryState(self.linear.init(), self.products.init(), _initial_mean(self.centre, len(self.states)))
 
     @predicts
     def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
         """Predict with both filters, and move the mean."""
         linear, products = self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k)
-        return MemoryState(linear, products, _mean_moved(self.centre, state.mean, k))
+        return MemoryState(linear, products, _predict_mean(self.centre, state.mean, k))
 
     @corrects
     def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
@@ -355,9 +359,9 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
     """
     check_forgets("channel of a memory filter", check_maps("channel", [first(channel)])[0])
-    claim = claim_of(plant, sensor, channel, 2)
+    claim = polynomial_claim(plant, sensor, channel, 2)
     # The linear filter's gains are needed for the moments of its products with z.
-    centre, system = _lift(plant, sensor, channel, 1, horizon)
+    centre, system = _lift_about_mean(plant, sensor, channel, 1, horizon)
     linear = lmmse(system, claim)
     about = plant if centre is None else centre_plant(plant)
     products = lmmse(memory_system(about, sensor, channel, linear), linear.claim)
@@ -366,7 +370,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     return believing(filter, Premise(plant, sensor, channel, order=4))
 
 
-def claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:
+def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:
     """ "exact" if all laws are known, "nominal" if some probability is uncertain.
 
     Where noise is known by a bound of its covariance alone, "upper" at degree 1, and "nominal" beyond, since no higher

@@ -11,9 +11,9 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, given, move
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.gaussian.signal import condition
+from heliograph.filters.gaussian.signal import condition_on_measurement
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.linear.plan import plan
+from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -61,7 +61,7 @@ class ScheduledFilter(AbstractSizedFilter):
     def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
         instance("schedule", schedule, Schedule, "a Schedule")
         g = schedule.gains
-        self.gains = OverTime(_if_expected(g))
+        self.gains = OverTime(_gains_for_expected_measurement(g))
         self.unused = np.all(g.gain == 0, axis=1) & np.all(g.direct == 0, axis=1)
         known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
         self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
@@ -118,8 +118,8 @@ class ScheduledFilter(AbstractSizedFilter):
         return Estimate(state.mean, claimed, self.claim)
 
 
-def _if_expected(g: Gains) -> Gains:
-    """Gains with e = G s + g in place of z: (F + K G) s + c + K g, (L + J G) s + d + J g."""
+def _gains_for_expected_measurement(g: Gains) -> Gains:
+    """Gains of a step without data: e = G s + g takes the place of z in s+ = F s + K z + c and xhat = L s + J z + d."""
     return g._replace(
         transition=g.transition + g.gain @ g.expected,
         offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
@@ -171,7 +171,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         s: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
         expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
-        return condition(state, slopes, noise, z, expected)
+        return condition_on_measurement(state, slopes, noise, z, expected)
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
@@ -186,7 +186,7 @@ class LinearSystemFilter(AbstractSizedFilter):
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
-        return plan(self, inputs, self.projection)
+        return plan_filter(self, inputs, self.projection)
 
 
 class SystemNoises(NamedTuple):
@@ -200,7 +200,7 @@ class SystemNoises(NamedTuple):
 def _factor_noises(system: LinearSystem) -> SystemNoises:
     """Factors of both noises at each step, with the rounding of numbers as large as the system makes them."""
     s = system.steps
-    moved, sent = _sizes(system)
+    moved, sent = _second_moments_of_steps(system)
 
     def columns(covariances: np.ndarray, seconds: np.ndarray) -> Columns:
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
@@ -215,8 +215,8 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
     return SystemNoises(columns(np.asarray(s.process), moved), columns(np.asarray(s.noise), sent))
 
 
-def _sizes(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
-    """(|A| root E[y y'] + |a|)^2 of what the state becomes at each step (time, N), and the same of what is received.
+def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
+    """(|A| root E[y y'] + |a|)^2 of each next state (time, N), and the same of what is received: sizes for rounding.
 
     By the moments before any data, since parts of a system that start at zero do not stay there.
     """

@@ -24,17 +24,17 @@ from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.modal import (
     AbstractModalFilter,
+    MeasurementModel,
     ObservationModel,
-    Output,
+    centred_measurement,
+    centred_transition,
     claim_of_modes,
+    concatenate_modes,
     covariance_of_mode,
     kron,
-    measure_about,
     observation_models,
     observe_modes,
-    pad,
-    place_beside,
-    predict_about,
+    pad_with_zeros,
     predict_by_mode,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
@@ -97,25 +97,30 @@ class AdditiveModalFilter(AbstractModalFilter):
     def init(self) -> AdditiveBelief:
         """Return the prior, independent of the modes: Cov(zeta) = Gamma x E[x~ x~'], less E[x~] E[x~]' of x~ itself."""
         start = at(self.plant, 0)
-        spread, laws = pad(jnp.asarray(start.initial_covariance)), tuple(jnp.asarray(law) for law in self.initial)
+        spread, laws = (
+            pad_with_zeros(jnp.asarray(start.initial_covariance)),
+            tuple(jnp.asarray(law) for law in self.initial),
+        )
         second = spread.at[-1, -1].set(1.0)
-        parts = [spread, *(jnp.kron(_variance(law), second) for law in laws if len(law) > 1)]
+        parts = [spread, *(jnp.kron(_indicator_covariance(law), second) for law in laws if len(law) > 1)]
         centre = jnp.asarray(start.initial_mean)
-        mean = self._whole(jnp.append(centre, 1.0))
+        mean = self._embed_first_block(jnp.append(centre, 1.0))
         return AdditiveBelief(*given(mean, block_diag(*parts)), second, laws, centre, jnp.asarray(False))
 
     @predicts
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
         """Move x~ by the plant and each mode by its chain; at the first prediction the modes have their initial law."""
-        move, noise, centre = predict_about(at(self.plant, k), u, state.centre)
-        rows = self._rows(state, k)
+        move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
+        rows = self._transition_matrices(state, k)
         # F zeta about the moving centre.
-        centred = state.mean - self._known(state.centre)
-        mean = predict_by_mode(centred[:, None], move, _between(rows).T)[:, 0] + self._known(centre)
-        root, fresh = self._moves(state, u, k)
+        centred = state.mean - self._mean_from_centre(state.centre)
+        mean = predict_by_mode(centred[:, None], move, _function_transition(rows).T)[:, 0] + self._mean_from_centre(
+            centre
+        )
+        root, fresh = self._transition_factors(state, u, k)
         after = of_columns(mean, join_columns(Columns(root, state.variances), fresh))
         second = move @ state.second @ move.T + noise
-        return AdditiveBelief(*after, second, _next(state.laws, rows), centre, jnp.asarray(True))
+        return AdditiveBelief(*after, second, _next_laws(state.laws, rows), centre, jnp.asarray(True))
 
     @corrects
     def correct(self, state: AdditiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdditiveBelief, Innovation]:
@@ -124,107 +129,116 @@ class AdditiveModalFilter(AbstractModalFilter):
         Cov(z - E[z | zeta]) = T(C~ E[x~ x~'] C~' + R~) + sum_ab Gamma_ab D_a R D_b' + Cov n, T the mean spread of the
         gains given the modes, D_0 = Hbar.
         """
-        output = self._output(state, k)
-        after, innovation = observe_modes(state.gaussian, state.mean - self._known(state.centre), output, z)
+        output = self._measurement_model(state, k)
+        after, innovation = observe_modes(state.gaussian, state.mean - self._mean_from_centre(state.centre), output, z)
         return state._replace(mean=after.mean, lower=after.lower, variances=after.variances), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step given its prediction."""
-        slopes, fresh = self._moves(step.before, step.u, step.k)
-        moved, projection = (slopes, triangular(fresh)), self._projection()
+        slopes, fresh = self._transition_factors(step.before, step.u, step.k)
+        moved, projection = (slopes, triangular(fresh)), self._projection_to_state()
         return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
 
-    def _projection(self) -> Float[np.ndarray, "n N"]:
+    def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
         """Matrix (n, N) that maps zeta to x."""
-        return np.eye(len(self.states), (len(self.states) + 1) * self._parts)
+        return np.eye(len(self.states), (len(self.states) + 1) * self._function_count)
 
     @property
-    def _parts(self) -> int:
-        """1 + sum_i (m_i - 1)."""
+    def _function_count(self) -> int:
+        """Number of functions of the modes, 1 + sum_i (m_i - 1)."""
         return 1 + sum(len(law) - 1 for law in self.initial)
 
-    def _whole(self, first: jax.Array) -> jax.Array:
-        """Zeta of zeros behind its first part."""
-        return jnp.pad(first, (0, (self._parts - 1) * len(first)))
+    def _embed_first_block(self, first: jax.Array) -> jax.Array:
+        """Embed a vector as the first block of zeta, with zeros for the blocks of the other functions."""
+        return jnp.pad(first, (0, (self._function_count - 1) * len(first)))
 
-    def _known(self, centre: jax.Array) -> jax.Array:
-        """Return what c is of E zeta."""
-        return self._whole(jnp.append(centre, 0.0))
+    def _mean_from_centre(self, centre: jax.Array) -> jax.Array:
+        """Part of E zeta that the centre c makes: (c, 0) in the first block."""
+        return self._embed_first_block(jnp.append(centre, 0.0))
 
-    def _rows(self, state: AdditiveBelief, k: Step) -> Laws:
-        """Transition matrix of the chain of each term."""
+    def _transition_matrices(self, state: AdditiveBelief, k: Step) -> Laws:
+        """Transition matrix of each term's chain; the identity before the first prediction."""
         chains = [jnp.asarray(term.transition) for term in at(self.terms, k)]
         return tuple(jnp.where(state.moved, chain, jnp.eye(len(chain))) for chain in chains)
 
-    def _moves(self, state: AdditiveBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
-        """Return F L of zeta = E zeta + L xi, and the columns of Cov(zeta+ - F zeta).
+    def _transition_factors(self, state: AdditiveBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
+        """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta).
 
         They are those of C x A~ E[x~ x~'] A~' + Gamma+ x Q~, with C = sum_i P(i) Cov(1{next} | i) of each chain.
         """
-        move, rows = predict_about(at(self.plant, k), u, state.centre)[0], self._rows(state, k)
+        move, rows = centred_transition(at(self.plant, k), u, state.centre)[0], self._transition_matrices(state, k)
         random = [
             jnp.einsum("i,ijl->jl", law, covariance_of_mode(chain)[:, 1:, 1:])
             for law, chain in zip(state.laws, rows, strict=True)
         ]
-        jumps, carried = _beside(np.zeros((1, 0)), random), factor_spread(move @ state.second @ move.T)
+        jumps, carried = _block_diagonal_columns(np.zeros((1, 0)), random), factor_spread(move @ state.second @ move.T)
         by_jumps = Columns(kron(jumps.matrix, carried.matrix), outer(jumps.weights, carried.weights).reshape(-1))
-        fresh = join_columns(by_jumps, self.moved_noise(u, k, _gamma(_next(state.laws, rows))))
-        return predict_by_mode(state.gaussian.root, move, _between(rows).T), fresh
+        fresh = join_columns(
+            by_jumps, self.process_noise_by_mode(u, k, _second_moment_of_functions(_next_laws(state.laws, rows)))
+        )
+        return predict_by_mode(state.gaussian.root, move, _function_transition(rows).T), fresh
 
-    def _output(self, state: AdditiveBelief, k: Step) -> Output:
-        """Return what is measured of zeta, less the mean output."""
+    def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
+        """Return z = common + H zeta + v, H from Hbar and the D_a, and columns of Cov v."""
         terms: tuple[ObservationModel, ...] = at(self.terms, k)
         sensor = at(self.sensor, k)
-        measure, noise = measure_about(sensor, state.centre)
-        gains = _gains(terms, state.laws)
+        # H: the gain of each function, times C~ of the centred state.
+        measure, noise = centred_measurement(sensor, state.centre)
+        gains = _gains_by_function(terms, state.laws)
         matrix = gains @ measure
         common = matrix[0, :, -1]
-        sent, gamma = measure @ state.second @ measure.T + noise, _gamma(state.laws)
-        # D_a R D_b' of the sensor's noise, and the links' own noise and spread, over their modes.
-        heard = jnp.einsum("ac,amp->cmp", gamma.matrix, gains)
-        loud = jnp.asarray(heard[:, :, :-1] @ sensor.noise.columns.matrix)
-        weights = jnp.broadcast_to(sensor.noise.columns.weights, (len(loud), loud.shape[-1]))
-        plain = [side_by_side(Columns(loud, weights), gamma.weights)]
-        plain += [side_by_side(term.noise, law) for term, law in zip(terms, state.laws, strict=True)]
-        random = sum(
+        # E[y~ y~'] of what is sent (p + 1, p + 1), and Gamma.
+        sent, gamma = measure @ state.second @ measure.T + noise, _second_moment_of_functions(state.laws)
+        # Sensor noise through the gains, sum_ab Gamma_ab D_a R D_b': one gain for each column c of Gamma (c, m, p + 1).
+        mean_gain_by_function = jnp.einsum("ac,amp->cmp", gamma.matrix, gains)
+        sensor_columns = jnp.asarray(mean_gain_by_function[:, :, :-1] @ sensor.noise.columns.matrix)
+        weights = jnp.broadcast_to(sensor.noise.columns.weights, (len(sensor_columns), sensor_columns.shape[-1]))
+        known_noise = [side_by_side(Columns(sensor_columns, weights), gamma.weights)]
+        # Noise of the links themselves, in the mean over the modes j of each.
+        known_noise += [side_by_side(term.noise, law) for term, law in zip(terms, state.laws, strict=True)]
+        # Spread of the gains given the mode, on what is sent, in the mean over the modes (m, m).
+        gain_noise = sum(
             jnp.einsum("j,jmlab,ab->ml", law, jnp.asarray(term.gain_spread), sent)
             for term, law in zip(terms, state.laws, strict=True)
         )
-        rounding = rounding_of(jnp.einsum("c,cma,ab,cmb->m", gamma.weights, heard, sent, heard))
-        whole = join_columns(*plain, rounding, factor_spread(jnp.asarray(random)))
-        return Output(place_beside(matrix.at[0, :, -1].set(0.0)), common, whole)
+        # Rounding of z, by its second moments (m,).
+        by_function = mean_gain_by_function
+        rounding = rounding_of(jnp.einsum("c,cma,ab,cmb->m", gamma.weights, by_function, sent, by_function))
+        noise_columns = join_columns(*known_noise, rounding, factor_spread(jnp.asarray(gain_noise)))
+        return MeasurementModel(concatenate_modes(matrix.at[0, :, -1].set(0.0)), common, noise_columns)
 
 
-def _gains(terms: Sequence[ObservationModel], laws: Laws) -> jax.Array:
-    """Return Hbar and D_a, (1 + functions, m, p + 1)."""
+def _gains_by_function(terms: Sequence[ObservationModel], laws: Laws) -> jax.Array:
+    """Return Hbar and all D_a, stacked: (1 + functions, m, p + 1)."""
     means = [jnp.asarray(term.mean) for term in terms]
     whole = sum(jnp.einsum("j,jmp->mp", law, mean) for law, mean in zip(laws, means, strict=True))
     return jnp.concatenate([jnp.asarray(whole)[None], *(mean[1:] - mean[:1] for mean in means)])
 
 
-def _next(laws: Laws, rows: Laws) -> Laws:
+def _next_laws(laws: Laws, rows: Laws) -> Laws:
+    """Probabilities of each term's modes one step later."""
     return tuple(law @ chain for law, chain in zip(laws, rows, strict=True))
 
 
-def _between(rows: Laws) -> jax.Array:
-    """Return T of E[phi+ | phi] = T phi: 1 beside Pi_ij - Pi_first,j of each chain."""
+def _function_transition(rows: Laws) -> jax.Array:
+    """Return T of E[phi+ | phi] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j."""
     parts = [(chain[1:, 1:] - chain[:1, 1:]).T for chain in rows if len(chain) > 1]
     matrix: jax.Array = block_diag(np.eye(1), *parts)
     return matrix
 
 
-def _variance(law: jax.Array) -> jax.Array:
-    """Covariance of the indicators of all modes but the first."""
+def _indicator_covariance(law: jax.Array) -> jax.Array:
+    """Covariance of the indicators of all modes but the first, diag(p) - p p'."""
     return jnp.diag(law[1:]) - jnp.outer(law[1:], law[1:])
 
 
-def _gamma(laws: Laws) -> Columns:
-    """Return Gamma = E[phi phi'] of (1, phi_1, ...)."""
-    return _beside(np.eye(1), [_variance(law) for law in laws])
+def _second_moment_of_functions(laws: Laws) -> Columns:
+    """Return Gamma = E[phi phi'] of (1, phi_1, ...) as columns."""
+    return _block_diagonal_columns(np.eye(1), [_indicator_covariance(law) for law in laws])
 
 
-def _beside(one: np.ndarray, covariances: Sequence[jax.Array]) -> Columns:
-    """Columns of block-diagonal covariances, behind these of weight 1 of the first function, 1."""
+def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -> Columns:
+    """Columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i."""
     factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
     weights = jnp.concatenate([jnp.ones(one.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)

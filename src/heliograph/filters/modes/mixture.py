@@ -18,7 +18,7 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.belief import process_noise, start_of
+from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel, check_link, find_received_angles
@@ -41,7 +41,7 @@ from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
 
 
-class Components(Module):
+class AtomCombinations(Module):
     """All combinations of atoms of one step, each with its `mode` of the links and its probability in that mode.
 
     weight: P(combination | mode). transition: of the modes from the step before; a single mode for links without
@@ -95,7 +95,7 @@ class MixtureFilter(AbstractSizedFilter):
     """
 
     plant: AnyPlant
-    components: Components | OverTime
+    components: AtomCombinations | OverTime
     initial: Float[Array, " M"]
     observed_angles: Angles = eqx.field(static=True)
 
@@ -119,7 +119,7 @@ class MixtureFilter(AbstractSizedFilter):
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
         """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        noise = process_noise(plant, u, start_of(self.plant))
+        noise = process_noise(plant, u, second_moments_at_start(self.plant))
         moved = move(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
         return MixtureBelief(*moved, law, jnp.asarray(True))
@@ -128,7 +128,7 @@ class MixtureFilter(AbstractSizedFilter):
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
         """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching."""
         c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
-        prior, size = state.law[c.mode] * jnp.asarray(c.weight), square_root(start_of(self.plant))
+        prior, size = state.law[c.mode] * jnp.asarray(c.weight), square_root(second_moments_at_start(self.plant))
         present = ~jnp.isnan(z)
 
         # Kalman update of one combination, with the rounding of what it says of the state.
@@ -141,7 +141,7 @@ class MixtureFilter(AbstractSizedFilter):
             return after, (likelihood, jnp.sum(present & innovations.determined), value, total)
 
         after, (likelihood, certain, value, total) = jax.vmap(condition)(c.gain, c.offset, c.noise)
-        weight, density, excluded = posterior_weights(prior, sharpest(likelihood, certain))
+        weight, density, excluded = posterior_weights(prior, drop_below_point_mass(likelihood, certain))
         # Innovation of the mixture, angles near that of the most probable combination.
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
         total = jnp.where(present[:, None] & present, total, jnp.nan)
@@ -158,12 +158,15 @@ class MixtureFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of the state before the step given its prediction."""
         plant, u, (before, prior, after, *_) = at(self.plant, step.k), jnp.asarray(step.u), step
-        moved = plant.transition_matrix(u) @ before.gaussian.root, process_noise(plant, u, start_of(self.plant))
+        moved = (
+            plant.transition_matrix(u) @ before.gaussian.root,
+            process_noise(plant, u, second_moments_at_start(self.plant)),
+        )
         return smoother_step_of(before, prior, after, moved, "nominal", plant.angles)
 
 
-def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
-    """Set to -inf the likelihood of combinations outweighed by one that agrees with z with a point mass.
+def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
+    """Set to -inf the log-likelihood of combinations whose density another one's point mass outweighs.
 
     `certain` counts the components that a combination determines exactly: it has a point mass there, against which a
     density is negligible.
@@ -206,14 +209,14 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     angles = find_received_angles(plant, sensor, channel)
     floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
     if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):
-        modes = [_modes(channel)]
-        components: Components | OverTime = _components(sensor, modes[0], modes[0], floor)
+        modes = [_joint_modes_of(channel)]
+        components: AtomCombinations | OverTime = _list_combinations(sensor, modes[0], modes[0], floor)
     else:
         steps = min(model.steps for model in (sensor, channel) if isinstance(model, OverTime))
         sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
-        modes = [_modes(c) for c in channels if isinstance(c, AbstractRandomAffine)]
+        modes = [_joint_modes_of(c) for c in channels if isinstance(c, AbstractRandomAffine)]
         items = zip(sensors, modes, [modes[0], *modes[:-1]], strict=True)
-        components = over_time([_components(s, now, before, floor) for s, now, before in items])
+        components = over_time([_list_combinations(s, now, before, floor) for s, now, before in items])
     return MixtureFilter(
         plant=plant,
         components=components,
@@ -223,13 +226,15 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     )
 
 
-def _modes(channel: AbstractRandomAffine) -> JointModes:
+def _joint_modes_of(channel: AbstractRandomAffine) -> JointModes:
+    """Combine a channel's memories in one chain; raise ValueError for a gain that drifts."""
     if any(isinstance(memory, Autoregression) for memory in memories(channel).values()):
         raise fail("mixture filter", "gains of finitely many values", "one that drifts")
     return joint_modes(channel)
 
 
-def _components(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> Components:
+def _list_combinations(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> AtomCombinations:
+    """List all atoms of z = G (C x + v) + n by mode, with the variance `floor` added to each noise."""
     assert isinstance(sensor, LinearSensor)  # checked before
     received = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
     atoms = [(c, i) for i, m in enumerate(now.maps) for c in list_atoms(Series([received, m]))]
@@ -239,4 +244,4 @@ def _components(sensor: AnySensor, now: JointModes, before: JointModes, floor: f
     mode = np.array([i for _, i in parts])
     weight, gain, offset, noise = (stack_parts(column) for column in zip(*(c for c, _ in parts), strict=True))
     noise = noise + floor * np.eye(noise.shape[-1])
-    return Components(weight, gain, offset, columns_of_each(noise), mode, before.transition)
+    return AtomCombinations(weight, gain, offset, columns_of_each(noise), mode, before.transition)

@@ -26,9 +26,9 @@ from heliograph.factors.columns import (
 )
 from heliograph.factors.gaussian import Gaussian, given, of_columns
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import process_noise, start_of
-from heliograph.filters.gaussian.signal import condition, factor_spread
-from heliograph.filters.linear.plan import plan
+from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
+from heliograph.filters.gaussian.signal import condition_on_measurement, factor_spread
+from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -98,8 +98,8 @@ class ModalBelief(NamedTuple):
         return self.moments[:, -1, -1]
 
 
-class Output(NamedTuple):
-    """A measurement z = common + H zeta + noise of zeta.
+class MeasurementModel(NamedTuple):
+    """Model of a measurement of zeta: z = common + H zeta + noise.
 
     Shapes: matrix H (m, N), common (m,), noise (m, columns).
     """
@@ -118,20 +118,20 @@ class AbstractModalFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """Return x, a projection of zeta, and the covariance of its error."""
-        projection, x = self._projection(), state.gaussian
+        projection, x = self._projection_to_state(), state.gaussian
         return Estimate(projection @ x.mean, Columns(projection @ x.root, x.variances).covariance, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
-        return plan(self, inputs, self._projection())
+        return plan_filter(self, inputs, self._projection_to_state())
 
-    def moved_noise(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
-        """Covariance (N, N) of the process noise and of the rounding of zeta, by E[phi phi'] of the next functions."""
-        parts = noise_in_mode(at(self.plant, k), u, start_of(self.plant))
+    def process_noise_by_mode(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
+        """Columns of zeta's process noise and rounding, from `of_mode` = E[phi phi'] of the next functions."""
+        parts = noise_in_mode(at(self.plant, k), u, second_moments_at_start(self.plant))
         return Columns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
 
     @abstractmethod
-    def _projection(self) -> Float[np.ndarray, "n N"]:
+    def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
         """Matrix (n, N) that maps zeta to x."""
 
 
@@ -141,7 +141,7 @@ class AbstractJointModalFilter(AbstractModalFilter):
     channel: ObservationModel | OverTime
     initial: Float[Array, " M"]
 
-    def _projection(self) -> Float[np.ndarray, "n N"]:
+    def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
         """x = sum_j zeta^j."""
         return sum_of_modes(len(self.states), len(self.initial))
 
@@ -169,12 +169,15 @@ class ModalFilter(AbstractJointModalFilter):
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
-        (move, noise, centre), rows = predict_about(at(self.plant, k), u, state.centre), self._rows(state, k)
+        (move, noise, centre), rows = (
+            centred_transition(at(self.plant, k), u, state.centre),
+            self._transition_matrix(state, k),
+        )
         law = state.law @ rows
         # F zeta about the moving centre.
-        centred = state.mean - known_part(state.law, state.centre)
-        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
-        root, fresh = self._moves(state, u, k)
+        centred = state.mean - mean_from_centre(state.law, state.centre)
+        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
+        root, fresh = self._transition_factors(state, u, k)
         after = of_columns(mean, join_columns(Columns(root, state.variances), fresh))
         moments = jnp.einsum("ij,iab->jab", rows, _propagate_moments(state, move)) + law[:, None, None] * noise
         return ModalBelief(*after, moments, centre, jnp.asarray(True))
@@ -186,36 +189,38 @@ class ModalFilter(AbstractJointModalFilter):
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j the spread of
         the gains in mode j.
         """
-        centred = state.mean - known_part(state.law, state.centre)
-        after, innovation = observe_modes(state.gaussian, centred, self._output(state, k), z)
+        centred = state.mean - mean_from_centre(state.law, state.centre)
+        after, innovation = observe_modes(state.gaussian, centred, self._measurement_model(state, k), z)
         return ModalBelief(*after, *state[3:]), innovation
 
-    def _rows(self, state: ModalBelief, k: Step) -> jax.Array:
-        """Transition matrix of the chain (M, M)."""
+    def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
+        """Transition matrix (M, M) of the chain; the identity before the first prediction."""
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
-    def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
-        """Return F L of zeta = E zeta + L xi, and the columns of Cov(zeta+ - F zeta)."""
-        move, rows = predict_about(at(self.plant, k), u, state.centre)[0], self._rows(state, k)
-        own = self.moved_noise(u, k, Columns(jnp.eye(len(rows)), state.law @ rows))
-        fresh = join_columns(spread_of_moves(_propagate_moments(state, move), rows), own)
+    def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
+        """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta)."""
+        move, rows = centred_transition(at(self.plant, k), u, state.centre)[0], self._transition_matrix(state, k)
+        own = self.process_noise_by_mode(u, k, Columns(jnp.eye(len(rows)), state.law @ rows))
+        fresh = join_columns(mode_transition_covariance(_propagate_moments(state, move), rows), own)
         return predict_by_mode(state.gaussian.root, move, rows), fresh
 
-    def _output(self, state: ModalBelief, k: Step) -> Output:
-        """Return what is measured of zeta, less the mean output."""
+    def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
+        """Return z = common + H zeta + v, H from the modes' gains, and columns of Cov v."""
         channel, sensor = at(self.channel, k), at(self.sensor, k)
-        (measure, noise), law = measure_about(sensor, state.centre), state.law
-        matrix, common = without_common(jnp.asarray(channel.mean) @ measure, law)
+        (measure, noise), law = centred_measurement(sensor, state.centre), state.law
+        matrix, common = subtract_mean_output(jnp.asarray(channel.mean) @ measure, law)
+        # E[y~ y~' 1{mode j}] of what is sent (M, p + 1, p + 1), and the spread of the gains on it (m, m).
         sent = jax.vmap(lambda a: measure @ a @ measure.T)(state.moments) + law[:, None, None] * noise
-        random = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent)
+        gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent))
+        # Noise of sensor and links, in the mean over the modes, and rounding.
         plain = known_noise(channel, sensor.noise.columns, law)
         rounding = rounding_of_received(jnp.asarray(channel.mean), sent)
-        return Output(place_beside(matrix), common, join_columns(plain, rounding, factor_spread(random)))
+        return MeasurementModel(concatenate_modes(matrix), common, join_columns(plain, rounding, gain_noise))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step given its prediction."""
-        slopes, fresh = self._moves(step.before, step.u, step.k)
-        moved, projection = (slopes, triangular(fresh)), self._projection()
+        slopes, fresh = self._transition_factors(step.before, step.u, step.k)
+        moved, projection = (slopes, triangular(fresh)), self._projection_to_state()
         return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
 
 
@@ -239,8 +244,8 @@ def predict_by_mode(columns: jax.Array, move: jax.Array, rows: jax.Array) -> jax
     return jnp.reshape(rows.T @ moved, columns.shape)
 
 
-def spread_of_moves(carried: jax.Array, rows: jax.Array) -> Columns:
-    """Covariance (N, N) of zeta+ by the random move of the mode, sum_i Cov(1{next} | i) x E_i, of E_i (M, s, s)."""
+def mode_transition_covariance(carried: jax.Array, rows: jax.Array) -> Columns:
+    """Covariance (N, N) of zeta+ by the modes' random transition, sum_i Cov(1{next} | i) x E_i, of E_i (M, s, s)."""
     return separate_modes(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], carried))
 
 
@@ -283,22 +288,24 @@ def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
-def observe_modes(x: Gaussian, centred: jax.Array, output: Output, z: ArrayLike) -> tuple[Gaussian, Innovation]:
+def observe_modes(
+    x: Gaussian, centred: jax.Array, output: MeasurementModel, z: ArrayLike
+) -> tuple[Gaussian, Innovation]:
     """Condition zeta on the components of z that arrived; `centred` is its mean less P(mode) c."""
     expected = output.common + output.matrix @ centred
-    return condition(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
+    return condition_on_measurement(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
 
 
-def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0)."""
-    move = pad(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
-    return move, pad(plant.noise_covariance(u))
+def transition_with_constant(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) of x~ = (x, 1)."""
+    move = pad_with_zeros(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
+    return move, pad_with_zeros(plant.noise_covariance(u))
 
 
-def measure_matrix(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
-    """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0)."""
-    measure = pad(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
-    return measure, pad(jnp.asarray(sensor.noise.covariance))
+def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
+    """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0) of y~ = (y, 1)."""
+    measure = pad_with_zeros(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+    return measure, pad_with_zeros(jnp.asarray(sensor.noise.covariance))
 
 
 def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
@@ -306,38 +313,38 @@ def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]
 
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
     """
-    spread, law = pad(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
+    spread, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
     state = given(start.initial_mean, start.initial_covariance)
     mode = separate_modes((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
     # Factors of both, x before the indicator in each part.
     last = np.zeros((len(spread), len(spread)))
     last[-1, -1] = 1.0
     ends = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
-    root = jnp.kron(np.eye(len(law)), pad(state.root)) + jnp.kron(ends, last)
+    root = jnp.kron(np.eye(len(law)), pad_with_zeros(state.root)) + jnp.kron(ends, last)
     variances = jnp.concatenate([jnp.outer(law, state.variances), jnp.append(mode.weights, 0.0)[:, None]], axis=1)
     prior = Gaussian(jnp.kron(law, jnp.append(state.mean, 1.0)), below_diagonal(root), variances.reshape(-1))
     return prior, spread + last
 
 
-def known_part(law: jax.Array, centre: jax.Array) -> jax.Array:
-    """P(mode) c, mode after mode."""
+def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
+    """P(mode) c, mode after mode: the part of E zeta that the centre makes."""
     return jnp.kron(law, jnp.append(centre, 0.0))
 
 
-def predict_about(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def centred_transition(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A~ and Q~ of x - c, which no known input moves, and c one step later."""
-    move, noise = move_matrix(plant, jnp.asarray(u))
+    move, noise = transition_with_constant(plant, jnp.asarray(u))
     return move.at[:-1, -1].set(0.0), noise, move[:-1] @ jnp.append(centre, 1.0)
 
 
-def measure_about(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
+def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
     """C~ and R~ of the centred state: y = C (x - c) + C c + E v."""
-    measure, noise = measure_matrix(sensor)
+    measure, noise = measurement_with_constant(sensor)
     return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
 
 
-def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Subtract the mean output over the modes, which says nothing of the mode as the indicators sum to 1; return both.
+def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Subtract the mean output over the modes, as the indicators sum to 1; return what is left and the mean output.
 
     Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
     """
@@ -345,12 +352,12 @@ def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Ar
     return output.at[:, :, -1].add(-common), common
 
 
-def place_beside(output: jax.Array) -> jax.Array:
-    """Put output matrices (M, m, n + 1) side by side as one matrix (m, N) that acts on zeta."""
+def concatenate_modes(output: jax.Array) -> jax.Array:
+    """Concatenate output matrices (M, m, n + 1) to one matrix (m, N) that acts on zeta."""
     return jnp.concatenate(list(output), axis=1)
 
 
-def pad(a: jax.Array) -> jax.Array:
+def pad_with_zeros(a: jax.Array) -> jax.Array:
     """Pad A by a row and a column of zeros: [[A, 0], [0, 0]]."""
     return jnp.pad(a, ((0, 1), (0, 1)))
 
@@ -360,10 +367,10 @@ M = TypeVar("M", bound=AbstractJointModalFilter)
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
     """Best linear filter behind links with memory; `linear_filter` has checked that the parts fit."""
-    return built_of_modes(ModalFilter, plant, sensor, channel, claim_of_modes(channel))
+    return build_from_modes(ModalFilter, plant, sensor, channel, claim_of_modes(channel))
 
 
-def built_of_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> M:
+def build_from_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> M:
     """Build a filter of this kind with the channel's observation models."""
     start, (initial, described) = first(plant), observation_models(channel)
     return kind(

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, Move, move_of, predict_belief, prior_belief
+from heliograph.filters.linear.belief import LinearBelief, PlantMotion, motion_of_plant, predict_belief, prior_belief
 from heliograph.filters.linear.linear import correct_linear
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.patterns import append_flag
@@ -46,7 +46,7 @@ class ModeObservedBelief(NamedTuple):
     belief: LinearBelief
     before: LinearBelief
     z: Float[jax.Array, " m"]
-    move: Move
+    move: PlantMotion
     begun: Bool[jax.Array, ""]
 
     @property
@@ -77,13 +77,13 @@ class ModeObservedFilter(AbstractSizedFilter):
         nothing = jnp.full(first(self.channel).outputs, jnp.nan)
         n = len(belief.mean)
         none = jnp.zeros((n, n))
-        still = Move(jnp.eye(n), jnp.zeros(n), none, Columns(none, jnp.zeros(n)))
+        still = PlantMotion(jnp.eye(n), jnp.zeros(n), none, Columns(none, jnp.zeros(n)))
         return ModeObservedBelief(belief, belief, nothing, still, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
         """Predict both pairs of moments over step k."""
-        move = move_of(at(self.plant, k), jnp.asarray(u), start_of(self.plant))
+        move = motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
         return state._replace(belief=predict_belief(state.belief, move), move=move)
 
     @corrects
@@ -95,17 +95,20 @@ class ModeObservedFilter(AbstractSizedFilter):
         z, published = observed[:m], observed[m:]
         is_known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         certain = jnp.nan_to_num(published)
-        start, rule = start_of(self.plant), Polytope()
+        start, rule = second_moments_at_start(self.plant), Polytope()
         if self.late:
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
-            then = _condition(at(self.channel, last), certain)
+            then = _condition_channel(at(self.channel, last), certain)
             redone, _ = correct_linear(state.before, at(self.sensor, last), then, rule, state.z, start)
             redone = predict_belief(redone, state.move)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
-            then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
+            then, begins = (
+                _predict_channel(at(self.channel, last), channel, certain),
+                _predict_channel(None, channel, certain),
+            )
             described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
         else:
-            prior, described = state.belief, _condition(channel, certain)
+            prior, described = state.belief, _condition_channel(channel, certain)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
         after, innovation = correct_linear(prior, sensor, described, rule, z, start)
@@ -124,24 +127,29 @@ class ModeObservedFilter(AbstractSizedFilter):
         return Estimate(state.belief.mean, state.belief.covariance, self.claim)
 
 
-def _condition(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
+def _condition_channel(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
+    """Condition the channel on the memories' states, given as numbers; return its second moments."""
     held = memories(channel).values()
-    return _nominal(condition_on_memories(channel, [m.read(number) for m, number in zip(held, numbers, strict=True)]))
+    return _nominal_moments(
+        condition_on_memories(channel, [m.read(number) for m, number in zip(held, numbers, strict=True)])
+    )
 
 
-def _following(last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
-    """Law of the channel given the memories' states at the step before; without them, of the first step."""
+def _predict_channel(
+    last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array
+) -> SecondOrder:
+    """Moments of the channel given the memories' states one step before; without them, of the first step."""
     choices = []
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
         choices.append(memory.following(None if last is None else memory.read(number), degree_in(channel, identity)))
     chosen = list(product(*(range(len(weights)) for _, weights in choices)))
     maps = [condition_on_memories(channel, [choices[i][0][j] for i, j in enumerate(places)]) for places in chosen]
     weights = [prod(choices[i][1][j] for i, j in enumerate(places)) for places in chosen]
-    return _nominal(Mixture(maps, jnp.stack([jnp.asarray(w) for w in weights])))
+    return _nominal_moments(Mixture(maps, jnp.stack([jnp.asarray(w) for w in weights])))
 
 
-def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
-    """Mean and spread under the nominal law, for numbers that may be traced."""
+def _nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
+    """Mean and spread of the channel under the nominal law, for numbers that may be traced."""
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
     none = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
@@ -166,7 +174,7 @@ def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> M
 
     Source: the Kalman filter given the modes, with the spread of De Koning (1984) within each.
     """
-    return _mode_observed(plant, sensor, channel, late=False)
+    return _make_mode_observed_filter(plant, sensor, channel, late=False)
 
 
 def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
@@ -186,10 +194,11 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Mo
 
     Source: the Kalman filter given the modes, and one update with the law of the mode that follows the last.
     """
-    return _mode_observed(plant, sensor, channel, late=True)
+    return _make_mode_observed_filter(plant, sensor, channel, late=True)
 
 
-def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> ModeObservedFilter:
+def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> ModeObservedFilter:
+    """Check the parts and build the filter that receives the memories' states with z, of this step or one `late`."""
     check_linear("filter that observes the mode", plant, sensor)
     # Erasures are side information of another kind.
     if any(step.erases for step in unstack(channel) if isinstance(step, AbstractRandomAffine)):

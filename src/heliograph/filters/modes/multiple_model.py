@@ -25,11 +25,16 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.belief import predict_gaussian, process_noise, smoother_step_by_transform, start_of
-from heliograph.filters.gaussian.signal import Signal, condition, noise_through, signal_of
+from heliograph.filters.gaussian.belief import (
+    predict_gaussian,
+    process_noise,
+    second_moments_at_start,
+    smoother_step_by_transform,
+)
+from heliograph.filters.gaussian.signal import Signal, condition_on_measurement, noise_behind_gain, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
-from heliograph.filters.modes.patterns import SideInformation, by_pattern, pattern_of
+from heliograph.filters.modes.patterns import SideInformation, describe_by_pattern, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
@@ -46,7 +51,7 @@ from heliograph.random_affine.modes import joint_modes
 T = TypeVar("T", bound=PyTree)
 
 
-def receive(
+def correct_in_every_mode(
     signal: Signal,
     channel: SideInformation,
     mode: jax.Array,
@@ -54,7 +59,7 @@ def receive(
     z: jax.Array,
     angles: Angles = (),
 ) -> tuple[Gaussian, jax.Array, Innovation]:
-    """Correct the prior of each signal in its mode; return them, their weights, and the mixture's innovation.
+    """Correct each signal's prior in its mode; return posteriors, their weights, and the mixture's innovation.
 
     weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
     """
@@ -81,15 +86,15 @@ def _correct_in_mode(
     """Correct the prior of a signal in one mode of the channel, of moments as in `SecondOrder`."""
     expected = mean[:, :-1] @ signal.mean + mean[:, -1]
     z = nearest(z, expected, angles)
-    slopes, noise = mean[:, :-1] @ signal.slopes, noise_through(signal, mean[:, :-1], gain_spread, link)
-    return condition(signal.prior, slopes, noise, z, expected)
+    slopes, noise = mean[:, :-1] @ signal.slopes, noise_behind_gain(signal, mean[:, :-1], gain_spread, link)
+    return condition_on_measurement(signal.prior, slopes, noise, z, expected)
 
 
 def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
     """Return the initial law of the modes, and the channel by mode and pattern of arrivals, at each step."""
     steps = [joint_modes(c, nodes) for c in unstack(channel)]
     no_flags = np.ones((len(steps[0].initial), 1))
-    parts = by_pattern(steps, no_flags)
+    parts = describe_by_pattern(steps, no_flags)
     for step in parts if len(no_flags) > 1 else []:
         _check_random(step)
     return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]
@@ -136,14 +141,14 @@ class ModalBeliefs(NamedTuple):
 class AbstractMerging(Module):
     """Rule that decides when the Gaussians of modes are merged."""
 
-    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Weights (M, K) of the components in K mixtures that replace them, and those after the chain's transition.
 
         K is M, or 1 where all components become the same.
         """
         raise unwritten(self, "mixing")
 
-    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (component, mode) of the measurement update: all that can have a weight."""
         places = np.arange(modes)
         return places, places
@@ -156,7 +161,7 @@ class AbstractMerging(Module):
 class MergeAll(AbstractMerging):
     """One Gaussian for all modes (GPB1)."""
 
-    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Replace every component by the whole mixture."""
         return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ rows, axis=0))
 
@@ -164,7 +169,7 @@ class MergeAll(AbstractMerging):
 class MergeByNextMode(AbstractMerging):
     """One Gaussian per mode, mixed by the mode that the chain comes from (IMM)."""
 
-    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Component j becomes the mixture of all components that lead to mode j."""
         mixed = weight @ rows
         return mixed, jnp.diag(jnp.sum(mixed, axis=0))
@@ -173,23 +178,23 @@ class MergeByNextMode(AbstractMerging):
 class MergeByMode(AbstractMerging):
     """One Gaussian per mode, each updated in every next mode (GPB2)."""
 
-    def mixing(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Components keep the mode of their last update."""
         return weight, jnp.sum(weight, axis=0)[:, None] * rows
 
-    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Pair every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
     def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
         """One component for each present mode."""
         modes = math.isqrt(len(weight))
-        pairs = weight[:, None] * (self.pairs(modes)[1][:, None] == np.arange(modes))
-        return jax.vmap(partial(merge, parts), in_axes=1)(shares(pairs)), jnp.sum(pairs, axis=0)
+        pairs = weight[:, None] * (self.update_pairs(modes)[1][:, None] == np.arange(modes))
+        return jax.vmap(partial(merge, parts), in_axes=1)(normalise_columns(pairs)), jnp.sum(pairs, axis=0)
 
 
-def shares(weight: jax.Array) -> jax.Array:
-    """Return weights (components, mixtures) of which each column sums to 1: equal ones where a mixture has none."""
+def normalise_columns(weight: jax.Array) -> jax.Array:
+    """Divide weights (components, mixtures) by their column sums; equal weights where a column is zero."""
     law = jnp.sum(weight, axis=0)
     some = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
     return jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
@@ -204,7 +209,7 @@ def mix_and_predict(
     start: jax.Array,
 ) -> Gaussian:
     """f(x, u) + w of each mixture (components, mixtures), by two moments; a linear plant moves the parts first."""
-    share = shares(weight)
+    share = normalise_columns(weight)
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge, parts), in_axes=1)(share)
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
@@ -245,7 +250,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes."""
         start = at(self.plant, 0)
-        parts = repeat(given(start.initial_mean, start.initial_covariance), len(self.initial))
+        parts = replicate(given(start.initial_mean, start.initial_covariance), len(self.initial))
         return ModalBeliefs(*parts, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
 
     @predicts
@@ -253,22 +258,24 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
-        mixing, weight = self.merging.mixing(state.weight, rows)
-        moved = mix_and_predict(plant, self.transform, state.parts, mixing, u, start_of(self.plant))
+        mixing, weight = self.merging.mixing_weights(state.weight, rows)
+        moved = mix_and_predict(plant, self.transform, state.parts, mixing, u, second_moments_at_start(self.plant))
         parts: Gaussian = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(rows), leaf.shape[1])), moved)
-        parts = parts._replace(mean=together(plant, parts.mean, jnp.sum(weight, axis=1)))
+        parts = parts._replace(mean=align_angles(plant, parts.mean, jnp.sum(weight, axis=1)))
         return ModalBeliefs(*parts, weight, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
         """Correct each component in each mode with z, and weight them by their likelihood."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
-        i, j = self.merging.pairs(len(self.initial))
-        start = start_of(self.plant)
+        i, j = self.merging.update_pairs(len(self.initial))
+        start = second_moments_at_start(self.plant)
         signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
         signal = jax.tree.map(lambda leaf: leaf[i], signals)
-        after, weight, mixed = receive(signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles)
-        parts, law = self.merging.kept(after._replace(mean=together(plant, after.mean, weight)), weight)
+        after, weight, mixed = correct_in_every_mode(
+            signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles
+        )
+        parts, law = self.merging.kept(after._replace(mean=align_angles(plant, after.mean, weight)), weight)
         return ModalBeliefs(*parts, jnp.diag(law), state.moved), mixed
 
     @estimates
@@ -279,29 +286,29 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return that of the whole mixture's moments around the update; modes are not smoothed."""
-        return smoother_step_by_transform(self, step, first(self.plant), _whole)
+        return smoother_step_by_transform(self, step, first(self.plant), _merge_mixture)
 
 
-def _whole(state: ModalBeliefs) -> Gaussian:
-    """Return the mean and covariance of the whole mixture."""
+def _merge_mixture(state: ModalBeliefs) -> Gaussian:
+    """Merge the mixture: mean and covariance of the state."""
     return merge(state.parts, jnp.sum(state.weight, axis=1))
 
 
-def repeat(x: T, count: int) -> T:
-    """Repeat the same so many times, along a new first axis."""
+def replicate(x: T, count: int) -> T:
+    """Replicate an object `count` times along a new first axis."""
     every: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
     return every
 
 
-def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
-    """Means (components, n) with angles near those of the most probable component, so that they can be averaged."""
+def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
+    """Unwrap the angles of means (components, n) to lie near those of the most probable, so that they average."""
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
-def by_mode(
+def fields_of_mode_filters(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None, nodes: int
 ) -> dict[str, Any]:
-    """Return the fields that filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
+    """Fields that all filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
     angles, (initial, described) = find_received_angles(plant, sensor, channel), describe_modes(channel, nodes)
@@ -337,7 +344,9 @@ def imm_filter(
 
     Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
     """
-    return MultipleModelFilter(merging=MergeByNextMode(), **by_mode(plant, sensor, channel, transform, nodes))
+    return MultipleModelFilter(
+        merging=MergeByNextMode(), **fields_of_mode_filters(plant, sensor, channel, transform, nodes)
+    )
 
 
 @believes
@@ -363,7 +372,7 @@ def gpb1_filter(
 
     Source: Ackerson and Fu, On state estimation in switching environments (1970).
     """
-    return MultipleModelFilter(merging=MergeAll(), **by_mode(plant, sensor, channel, transform, nodes))
+    return MultipleModelFilter(merging=MergeAll(), **fields_of_mode_filters(plant, sensor, channel, transform, nodes))
 
 
 @believes
@@ -388,4 +397,6 @@ def gpb2_filter(
 
     Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
     """
-    return MultipleModelFilter(merging=MergeByMode(), **by_mode(plant, sensor, channel, transform, nodes))
+    return MultipleModelFilter(
+        merging=MergeByMode(), **fields_of_mode_filters(plant, sensor, channel, transform, nodes)
+    )

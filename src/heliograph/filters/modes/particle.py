@@ -16,10 +16,15 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import predict_gaussian, start_of
+from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.multiple_model import by_mode, receive, repeat, together
+from heliograph.filters.modes.multiple_model import (
+    align_angles,
+    correct_in_every_mode,
+    fields_of_mode_filters,
+    replicate,
+)
 from heliograph.filters.modes.patterns import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
@@ -90,8 +95,8 @@ class ParticleFilter(AbstractSizedFilter):
     def init(self) -> Particles:
         """Return the prior in every particle, with modes in proportion to their initial law."""
         start, n = at(self.plant, 0), self.particles
-        parts = repeat(given(start.initial_mean, start.initial_covariance), n)
-        mode = _chosen(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
+        parts = replicate(given(start.initial_mean, start.initial_covariance), n)
+        mode = _invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
         return Particles(*parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
 
     @predicts
@@ -100,24 +105,26 @@ class ParticleFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
-        drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
-        start = start_of(self.plant)
+        drawn = jax.vmap(_invert_distribution)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
+        start = second_moments_at_start(self.plant)
         parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.parts)
         mode = jnp.where(state.moved, drawn, state.mode)
-        parts = parts._replace(mean=together(plant, parts.mean, state.weight))
+        parts = parts._replace(mean=align_angles(plant, parts.mean, state.weight))
         return Particles(*parts, mode, state.weight, key, jnp.asarray(True))
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
-        start = start_of(self.plant)
+        start = second_moments_at_start(self.plant)
         signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
-        after, weight, mixed = receive(signals, channel, state.mode, state.weight, z, self.observed_angles)
-        after = after._replace(mean=together(plant, after.mean, weight))
+        after, weight, mixed = correct_in_every_mode(
+            signals, channel, state.mode, state.weight, z, self.observed_angles
+        )
+        after = after._replace(mean=align_angles(plant, after.mean, weight))
         # Systematic resampling.
         key = _fold_in_bits(state.key, z)
-        chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))
+        chosen = _resample_systematically(weight, jax.random.uniform(key, (), weight.dtype))
         poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
         which = jnp.where(poor, chosen, jnp.arange(self.particles))
         weight = jnp.where(poor, 1 / self.particles, weight)
@@ -131,14 +138,14 @@ class ParticleFilter(AbstractSizedFilter):
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
 
-def _chosen(law: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Invert the distribution function."""
+def _invert_distribution(law: jax.Array, uniform: jax.Array) -> jax.Array:
+    """Invert each distribution function at a uniform number: the index that it draws."""
     return jnp.searchsorted(jnp.cumsum(law)[:-1], uniform)
 
 
-def _systematic(weight: jax.Array, start: jax.Array) -> jax.Array:
-    """Indices at (start + 0 ... N - 1) / N of the distribution function: each within one of N times its weight."""
-    return _chosen(weight, (start + jnp.arange(len(weight))) / len(weight))
+def _resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
+    """Systematic resampling: indices where the distribution function passes (start + 0 ... N - 1) / N."""
+    return _invert_distribution(weight, (start + jnp.arange(len(weight))) / len(weight))
 
 
 def _fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
@@ -185,5 +192,5 @@ def particle_filter(
     return ParticleFilter(
         particles=check_count("particles", particles),
         seed=np.asarray(check_count("seed", seed, 0)),
-        **by_mode(plant, sensor, channel, transform, nodes),
+        **fields_of_mode_filters(plant, sensor, channel, transform, nodes),
     )

@@ -40,18 +40,21 @@ class SideInformation(Module):
         return undivided(self.gain_spread, self.noise)
 
 
-def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
-    """Moments of the channel at each step by mode and pattern of arrivals, with the patterns of all steps."""
+def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
+    """Moments of the channel at each step by mode and pattern of arrivals, the patterns being those of all steps."""
     by_step = [[outcomes(m) for m in step.maps] for step in steps]
     distinct = {tuple(o.arrived) for modes in by_step for parts in modes for o in parts}
     patterns = sorted(distinct, key=lambda kind: (sum(kind), kind))
     before = [steps[0], *steps[:-1]]
-    return [_side_information(modes, patterns, last, flags) for modes, last in zip(by_step, before, strict=True)]
+    return [
+        _describe_step_by_pattern(modes, patterns, last, flags) for modes, last in zip(by_step, before, strict=True)
+    ]
 
 
-def _side_information(
+def _describe_step_by_pattern(
     outcomes: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
 ) -> SideInformation:
+    """Probability and conditional moments of one step, from each mode's list of loss patterns."""
     m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
     shape = (len(outcomes), len(kinds))
     # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].

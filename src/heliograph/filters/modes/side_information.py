@@ -22,19 +22,19 @@ from heliograph.factors.columns import (
 )
 from heliograph.factors.gaussian import Innovations, given
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import start_of
-from heliograph.filters.gaussian.signal import factor_spread, size_of
+from heliograph.filters.gaussian.belief import second_moments_at_start
+from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
 from heliograph.filters.modes.modal import (
+    centred_measurement,
+    centred_transition,
+    concatenate_modes,
     kron,
-    measure_about,
     noise_in_mode,
-    place_beside,
-    predict_about,
     predict_by_mode,
+    subtract_mean_output,
     sum_of_modes,
-    without_common,
 )
-from heliograph.filters.modes.patterns import SideInformation, append_flag, by_pattern, pattern_of
+from heliograph.filters.modes.patterns import SideInformation, append_flag, describe_by_pattern, pattern_of
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import uncertain_chain, with_flag
@@ -123,10 +123,10 @@ class SideInformationFilter(AbstractSizedFilter):
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
         """Predict s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
         plant, channel = at(self.plant, k), at(self.channel, k)
-        move, _, centre = predict_about(plant, u, state.centre)
-        modes, (errors, x, weights) = len(self.initial), _parts(state)
+        move, _, centre = centred_transition(plant, u, state.centre)
+        modes, (errors, x, weights) = len(self.initial), _split_columns(state)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
-        law = _law(x, weights) @ rows
+        law = _mode_probabilities(x, weights) @ rows
         # F e and A~ x~ of each mode, then e+ and x~+ of each transition.
         errors = jax.vmap(lambda e: predict_by_mode(e, move, rows))(errors)
         x = jax.vmap(lambda x: move @ x)(x)
@@ -135,7 +135,7 @@ class SideInformationFilter(AbstractSizedFilter):
             return jnp.concatenate([e + kron(chosen[:, None], x), x])
 
         # From all modes to each: their columns side by side, and the process noise.
-        noise = noise_in_mode(plant, u, start_of(self.plant))
+        noise = noise_in_mode(plant, u, second_moments_at_start(self.plant))
 
         def into(j: jax.Array, chances: jax.Array, law: jax.Array) -> Columns:
             moved = Columns(jax.vmap(to)(j - rows, errors, x), weights)
@@ -160,15 +160,20 @@ class SideInformationFilter(AbstractSizedFilter):
         pattern = pattern_of(channel, arrived)
         weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
         # Moments given the side information, then the projection.
-        _, x, weights = _parts(state)
-        weight = weight / (weight @ _law(x, weights))
+        _, x, weights = _split_columns(state)
+        weight = weight / (weight @ _mode_probabilities(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
         excess = jnp.asarray(weight - 1)[:, None] * state.variances
         links = jax.tree.map(
             lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
         )
-        after, innovations, innovation = _project(
-            prior, excess, _describe_received(prior, sensor, size_of(sensor, start_of(self.plant)), *links), z
+        after, innovations, innovation = _project_on_data(
+            prior,
+            excess,
+            _describe_received(
+                prior, sensor, signal_size_at_start(sensor, second_moments_at_start(self.plant)), *links
+            ),
+            z,
         )
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
         value = jnp.where(arrived, innovation.mean, jnp.nan)
@@ -186,8 +191,8 @@ class SideInformationFilter(AbstractSizedFilter):
         return Estimate(mean, covariance, self.claim)
 
 
-class Received(NamedTuple):
-    """What arrives: z = common + output zeta + noise, with its noise in each mode times the mode's probability.
+class ReceivedModel(NamedTuple):
+    """Model of what arrives: z = common + output zeta + noise, its noise in each mode times the mode's probability.
 
     Shapes: output (m, N), common (m,), noise (M, m, m) columns.
     """
@@ -197,15 +202,15 @@ class Received(NamedTuple):
     noise: Columns
 
 
-class Expected(NamedTuple):
+class PredictedInnovation(NamedTuple):
     """Innovation z - E[z | 1, s] (m,) and its covariance (m, m)."""
 
     mean: jax.Array
     covariance: jax.Array
 
 
-def _parts(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the columns of e (M, N, q) and of x~ (M, n + 1, q) in each mode, and their weights (M, q)."""
+def _split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Split into columns of e (M, N, q) and of x~ (M, n + 1, q) in each mode, and their weights (M, q)."""
     root, count = jnp.asarray(state.moments.matrix), len(state.mean)
     return root[:, :count], root[:, count:], jnp.asarray(state.variances)
 
@@ -216,7 +221,7 @@ def _make_belief(mean: jax.Array, moments: Columns, centre: jax.Array, moved: ja
     return SideInformationBelief(mean, lower, jnp.asarray(moments.weights), centre, moved)
 
 
-def _law(x: jax.Array, weights: jax.Array) -> jax.Array:
+def _mode_probabilities(x: jax.Array, weights: jax.Array) -> jax.Array:
     """Probabilities of the modes (M,), E[1^2 1{mode}]."""
     return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
 
@@ -228,13 +233,13 @@ def _describe_received(
     gains: jax.Array,
     gain_spread: jax.Array,
     link: Columns,
-) -> Received:
+) -> ReceivedModel:
     """Return what is received of zeta: the output matrix, the mean output, and the noise in each mode.
 
     Cov(z | zeta) in mode j is T_j(E[y y' 1{j}]) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), and the rounding of z.
     """
-    (measure, noise), (_, x, weights) = measure_about(sensor, state.centre), _parts(state)
-    law = _law(x, weights)
+    (measure, noise), (_, x, weights) = centred_measurement(sensor, state.centre), _split_columns(state)
+    law = _mode_probabilities(x, weights)
 
     def noise_of(gain: jax.Array, spread: jax.Array, link: Columns, x: Columns, p: jax.Array) -> Columns:
         sent = x.through(measure).covariance + p * noise
@@ -243,19 +248,19 @@ def _describe_received(
         return triangular(join_columns(plain, rounding, factor_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
 
     # Output matrix of zeta less the mean output; modes of probability zero have none.
-    output, common = without_common(gains @ measure, law)
-    output = place_beside(jnp.where(law[:, None, None] > 0, output, 0.0))
-    return Received(output, common, jax.vmap(noise_of)(gains, gain_spread, link, Columns(x, weights), law))
+    output, common = subtract_mean_output(gains @ measure, law)
+    output = concatenate_modes(jnp.where(law[:, None, None] > 0, output, 0.0))
+    return ReceivedModel(output, common, jax.vmap(noise_of)(gains, gain_spread, link, Columns(x, weights), law))
 
 
-def _project(
-    state: SideInformationBelief, excess: jax.Array, received: Received, z: jax.Array
-) -> tuple[SideInformationBelief, Innovations, Expected]:
+def _project_on_data(
+    state: SideInformationBelief, excess: jax.Array, received: ReceivedModel, z: jax.Array
+) -> tuple[SideInformationBelief, Innovations, PredictedInnovation]:
     """Project zeta on (1, s, z): what these say of e goes from e to s, column by column.
 
     Before the side information (1, s) said nothing of e: what they say now is by what the weights grew, `excess`.
     """
-    errors, x, weights = _parts(state)
+    errors, x, weights = _split_columns(state)
     m, count, modes, arrived = len(z), len(state.mean), len(weights), ~jnp.isnan(z)
     # Columns of the state and of the noise of z, in each mode.
     errors, x = (jnp.pad(part, ((0, 0), (0, 0), (0, m))) for part in (errors, x))
@@ -270,13 +275,13 @@ def _project(
     # Directions of s that rounding decides, eps of x~ and more where it was divided by little, say nothing.
     size = jnp.tile(jnp.square(_join_modes(x)) @ weights, modes) + jnp.square(basis[1:]) @ weights
     smallest = jnp.append(0.0, np.sqrt(unit_of(weights)) * size)
-    basis, basis_values, variances = uncorrelated(basis, jnp.append(1.0, state.mean), weights, 1 + count)
+    basis, basis_values, variances = gram_schmidt_first(basis, jnp.append(1.0, state.mean), weights, 1 + count)
     inverses = reciprocal(jnp.where(variances > smallest, variances, 0.0))
     gains = (rows @ (excess * basis).T) * inverses
     rows, values = rows - gains @ basis, jnp.append(values, -state.mean) - gains @ basis_values
-    expected = Expected(values[:m], Columns(rows[:m], weights).covariance)
+    expected = PredictedInnovation(values[:m], Columns(rows[:m], weights).covariance)
     # Then what z says of e.
-    rows, values, variances = uncorrelated(rows, values, weights, m)
+    rows, values, variances = gram_schmidt_first(rows, values, weights, m)
     innovations = Innovations(values[:m], variances, jnp.diagonal(expected.covariance))
     # Factors of each mode.
     left = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
@@ -290,10 +295,10 @@ def _join_modes(*parts: jax.Array) -> jax.Array:
     return rows.reshape(len(rows), -1)
 
 
-def uncorrelated(
+def gram_schmidt_first(
     rows: jax.Array, numbers: jax.Array, weights: jax.Array, count: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Take from all rows, and from their numbers, what each of the first ones, in turn, says of those below it.
+    """Weighted Gram-Schmidt: orthogonalise all rows against the first `count`, in turn, with the same on `numbers`.
 
     Returns rows, numbers and the variances (count,) of the first ones given those above them.
     """
@@ -329,7 +334,7 @@ def side_information_filter(
     """
     check_linear("side-information filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
-    initial, steps, is_known = _describe(channel)
+    initial, steps, is_known = _describe_channel_by_mode(channel)
     # P(flag | mode); one flag that is always the same where there are none.
     if flags is not None:
         chances = array("flags", flags, (len(initial), None))
@@ -352,8 +357,8 @@ def side_information_filter(
 
 
 @cache_by_object
-def _describe(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
-    """Describe a channel: law of the first mode, moments at each step, and whether all probabilities are known."""
+def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
+    """Describe a channel: modes' initial probabilities, moments at each step, and whether all is known."""
     steps = [joint_modes(c) for c in unstack(channel)]
     is_known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
-    return steps[0].initial, by_pattern(steps, np.ones((len(steps[0].initial), 1))), is_known
+    return steps[0].initial, describe_by_pattern(steps, np.ones((len(steps[0].initial), 1))), is_known

@@ -16,19 +16,19 @@ from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.modal import (
     AbstractJointModalFilter,
-    Output,
-    built_of_modes,
+    MeasurementModel,
+    build_from_modes,
+    centred_measurement,
+    centred_transition,
     claim_of_modes,
-    known_part,
-    measure_about,
+    concatenate_modes,
+    mean_from_centre,
     observe_modes,
-    place_beside,
-    predict_about,
     predict_by_mode,
     prior_of_modes,
     rounding_of_received,
     separate_modes,
-    without_common,
+    subtract_mean_output,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
@@ -86,25 +86,30 @@ class UncertainModalFilter(AbstractJointModalFilter):
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
         """Propagate the bound on Sigma-; at the first prediction the mode has its initial law."""
-        (rows, radius), x = self._chain(state, k), state.gaussian
-        move, noise, centre = predict_about(at(self.plant, k), u, state.centre)
-        root, young, fresh = self._moves(state, u, k)
-        centred, law = x.mean - known_part(state.law, state.centre), state.law @ rows
-        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + known_part(law, centre)
+        (rows, radius), x = self._chain_and_radius(state, k), state.gaussian
+        move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
+        root, young, fresh = self._transition_factors(state, u, k)
+        centred, law = x.mean - mean_from_centre(state.law, state.centre), state.law @ rows
+        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
         after = of_columns(mean, join_columns(Columns(root, (1 + young) * x.variances), fresh))
         # E[x~ x~'] and nominal law one step later.
         second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
         return UncertainBelief(*after, second, centre, law, low, high, jnp.asarray(True))
 
-    def _chain(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
+    def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
         """Chain of the modes and the radius of its entries; before the first prediction the mode stays as it is."""
         channel = at(self.channel, k)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
         return rows, jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
 
-    def _moves(self, state: UncertainBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, jax.Array, Columns]:
+    def _transition_factors(
+        self, state: UncertainBelief, u: ArrayLike, k: Step
+    ) -> tuple[jax.Array, jax.Array, Columns]:
         """Return F L, b, and the columns of (1 + 1/b) D + W, of Sigma- = (1 + b) F Sigma F' + (1 + 1/b) D + W."""
-        move, (rows, radius) = predict_about(at(self.plant, k), u, state.centre)[0], self._chain(state, k)
+        move, (rows, radius) = (
+            centred_transition(at(self.plant, k), u, state.centre)[0],
+            self._chain_and_radius(state, k),
+        )
         # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
         carried = move @ state.second @ move.T
         chosen, wandering = (
@@ -112,38 +117,39 @@ class UncertainModalFilter(AbstractJointModalFilter):
         )
         # Young's inequality, b = root(tr D / tr F Sigma F').
         root = predict_by_mode(state.gaussian.root, move, rows)
-        young = jnp.sqrt(_ratio(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ state.variances)))
+        young = jnp.sqrt(_divide_or_zero(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ state.variances)))
         wide = chosen + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * wandering
         # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
         low, high = _bound_next_law(rows, radius, state.low, state.high)
         among = separate_modes(jnp.einsum("jl,ab->jalb", wide[:-1, :-1], carried))
-        own = self.moved_noise(u, k, factor_spread(_bound_diagonal(low, high)))
+        own = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
         return root, young, join_columns(among, own)
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
         """Correct with z; the covariance of z given zeta is bounded over the laws of the modes."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        gains, (measure, noise) = jnp.asarray(channel.mean), measure_about(sensor, state.centre)
+        gains, (measure, noise) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
         random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
         added = _bound_mean(random + gains @ noise @ gains.swapaxes(1, 2), *_middle_law(state.low, state.high))
-        matrix, common = without_common(gains @ measure, state.law)
+        matrix, common = subtract_mean_output(gains @ measure, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * second)
-        centred = state.mean - known_part(state.law, state.centre)
-        output = Output(place_beside(matrix), common, join_columns(rounding, factor_spread(added)))
+        centred = state.mean - mean_from_centre(state.law, state.centre)
+        output = MeasurementModel(concatenate_modes(matrix), common, join_columns(rounding, factor_spread(added)))
         after, innovation = observe_modes(state.gaussian, centred, output, z)
         return UncertainBelief(*after, *state[3:]), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step; the filter's bound is not proved for smoothed estimates."""
-        slopes, young, fresh = self._moves(step.before, step.u, step.k)
+        slopes, young, fresh = self._transition_factors(step.before, step.u, step.k)
         noise = triangular(join_columns(Columns(slopes, young * step.before.variances), fresh))
-        moved, projection = (slopes, noise), self._projection()
+        moved, projection = (slopes, noise), self._projection_to_state()
         return smoother_step_of(step.before, step.prior, step.after, moved, "nominal", projection=projection)
 
 
-def _ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+    """Quotient, 0 where the denominator is 0."""
     return jnp.where(denominator > 0, numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0)
 
 
@@ -211,4 +217,4 @@ def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.A
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
     """Build the filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
     claim: Claim = "upper" if claim_of_modes(channel) == "exact" else "nominal"
-    return built_of_modes(UncertainModalFilter, plant, sensor, channel, claim)
+    return build_from_modes(UncertainModalFilter, plant, sensor, channel, claim)

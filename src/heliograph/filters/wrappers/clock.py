@@ -18,7 +18,7 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
@@ -115,7 +115,7 @@ class ClockFilter(AbstractSizedFilter):
         # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
         sensor, prior = at(base.sensor, k), state.gaussian
-        signal = signal_of(at(base.plant, k), sensor, base.transform, prior, start_of(base.plant, base))
+        signal = signal_of(at(base.plant, k), sensor, base.transform, prior, second_moments_at_start(base.plant, base))
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
         z = nearest(jnp.asarray(z), expected, base.observed_angles)
         # Innovation covariance S, for all components.
@@ -154,13 +154,15 @@ class ClockFilter(AbstractSizedFilter):
         """Return the share of the outputs' derivatives by each offset that is independent of the others'."""
         plant, n = at(self.base.plant, k), len(self.states)
 
-        def follow(carry: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        def add_derivative(
+            carry: tuple[jax.Array, jax.Array], _: None
+        ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
             x, reach = carry
             observed = jax.jacfwd(observe)(x) @ reach
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
             return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
 
-        _, squares = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
+        _, squares = jax.lax.scan(add_derivative, (state.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
     @estimates

@@ -22,8 +22,8 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.filters.gaussian.signal import link_noise
-from heliograph.filters.linear.belief import LinearBelief, Move, predict_belief
-from heliograph.filters.linear.plan import PlannedFilter, plan
+from heliograph.filters.linear.belief import LinearBelief, PlantMotion, predict_belief
+from heliograph.filters.linear.plan import PlannedFilter, plan_filter
 from heliograph.filters.modes.patterns import append_flag
 from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link, delayed
@@ -65,9 +65,10 @@ class AbstractPartFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """Mean and covariance of the first states."""
-        return self._part(self.base.estimate(state))
+        return self._select_first_states(self.base.estimate(state))
 
-    def _part(self, whole: Estimate) -> Estimate:
+    def _select_first_states(self, whole: Estimate) -> Estimate:
+        """Select mean and covariance of the first states."""
         n = len(self.states)
         return Estimate(whole.mean[..., :n], whole.covariance[..., :n, :n], self.claim)
 
@@ -88,10 +89,10 @@ class PartFilter(AbstractPartFilter):
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
         """Mean and covariance of the first states after step k."""
-        return self._part(self.base.after_step(state, k))
+        return self._select_first_states(self.base.after_step(state, k))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all that does not depend on data."""
+        """Plan the larger filter, and keep the rows of its plan that belong to the first n states."""
         plan, n = self.base.planned(inputs), len(self.states)
         if not isinstance(plan, PlannedFilter):
             return PartFilter(plan, n)
@@ -145,7 +146,7 @@ class HeldFilter(AbstractPartFilter):
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
-        return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
+        return plan_filter(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
 def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
@@ -160,7 +161,7 @@ def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int,
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
     spread = link_noise(link, covariance + jnp.outer(mean, mean), mean)
     noise = Columns(jnp.zeros((total, spread.matrix.shape[1])).at[place].set(spread.matrix), spread.weights)
-    return predict_belief(state, Move(matrix, shift, noise.covariance, noise))
+    return predict_belief(state, PlantMotion(matrix, shift, noise.covariance, noise))
 
 
 def enlarge_by_relays(
@@ -326,8 +327,8 @@ Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 
 
 @believes
-def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
-    """Build a filter for a link that may be late, where `make` builds it for links without delay."""
+def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
+    """Build a filter for a link that may be late from `make`, which builds one for a link without delay."""
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
     if isinstance(start, Delayed) and start.timestamped:
@@ -335,11 +336,12 @@ def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
     if isinstance(channel, Delayed) and channel.constant:
         return LateFilter(make(plant, sensor, channel.link), channel.past)
     if isinstance(start, Relayed):
-        return _behind_relays(plant, sensor, channel, make)
+        return _build_behind_relays(plant, sensor, channel, make)
     return PartFilter(make(*with_past(plant, sensor, channel)), n)
 
 
-def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> HeldFilter:
+def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> HeldFilter:
+    """Build the filter behind relays that store what they received."""
     if not isinstance(channel, Relayed):
         raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
     larger, last, link, lines = enlarge_by_relays(plant, sensor, channel)
@@ -347,6 +349,7 @@ def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: M
 
 
 def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
+    """Build the filter that receives each value's delay with it, one channel description for every delay."""
     if not isinstance(channel, Delayed):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
@@ -360,8 +363,8 @@ def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Chann
     )
 
 
-def as_current(channel: Channel) -> Channel:
-    """Return the channel for a filter that takes late signals as current: all signals of its line are y_k."""
+def deliver_line_as_current(channel: Channel) -> Channel:
+    """Return the channel for a filter that takes late signals as current: all signals of its delay line are y_k."""
     current: Channel = at_each_step(_deliver_at_once, channel)
     return current
 

@@ -15,7 +15,7 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import start_of
+from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal, gaussian_filter
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
@@ -33,7 +33,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 
-class Ahead(NamedTuple):
+class BeliefAndPrior(NamedTuple):
     """Corrected belief, and the prediction before the correction."""
 
     belief: Gaussian
@@ -57,24 +57,24 @@ class PredictionFilter(AbstractSizedFilter):
         return self.base.angles_used()
 
     @in_float64
-    def init(self) -> Ahead:
+    def init(self) -> BeliefAndPrior:
         """Return the prior of the filter, twice."""
-        return Ahead(self.base.init(), self.base.init())
+        return BeliefAndPrior(self.base.init(), self.base.init())
 
     @predicts
-    def predict(self, state: Ahead, u: ArrayLike = (), k: Step = 0) -> Ahead:
+    def predict(self, state: BeliefAndPrior, u: ArrayLike = (), k: Step = 0) -> BeliefAndPrior:
         """Predict with the filter; the correction will not change the stored prior."""
         prior = self.base.predict(state.belief, u, k)
-        return Ahead(prior, prior)
+        return BeliefAndPrior(prior, prior)
 
     @corrects
-    def correct(self, state: Ahead, z: ArrayLike, k: Step = 0) -> tuple[Ahead, Innovation]:
+    def correct(self, state: BeliefAndPrior, z: ArrayLike, k: Step = 0) -> tuple[BeliefAndPrior, Innovation]:
         """Correct the belief for the next step; the estimate stays the prediction."""
         belief, innovation = self.base.correct(state.belief, z, k)
-        return Ahead(belief, state.prior), innovation
+        return BeliefAndPrior(belief, state.prior), innovation
 
     @estimates
-    def estimate(self, state: Ahead) -> Estimate:
+    def estimate(self, state: BeliefAndPrior) -> Estimate:
         """Mean and covariance of the prediction."""
         return self.base.estimate(state.prior)
 
@@ -154,7 +154,13 @@ class FedBackFilter(AbstractSizedFilter):
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
         """Correct with the measurement of y - r."""
         base = self.base
-        y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, state.gaussian, start_of(base.plant, base))
+        y = signal_of(
+            at(base.plant, k),
+            at(base.sensor, k),
+            base.transform,
+            state.gaussian,
+            second_moments_at_start(base.plant, base),
+        )
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
         after, innovation = correct_signal(sent, at(base.channel, k), base.rule, jnp.asarray(z))

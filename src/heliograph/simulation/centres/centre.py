@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.signal import homogeneous
+from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import Linearised, LinearStep, linear_step
 from heliograph.fusion.all_reports import ReportsBelief, begin, estimate_state, propagate_errors, receive_reports
@@ -71,7 +71,7 @@ def _linear_observation(
     """M = E[G] C, o = E[G] E v + E n, and Cov(z - M x): the noise through the mean gain, and the spread of the gain."""
     c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
     signal = c @ mean + sensor.noise.mean
-    second = homogeneous(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
+    second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
     spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
     return Observation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)

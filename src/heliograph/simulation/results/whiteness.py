@@ -9,8 +9,8 @@ import scipy
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.filter_data import check_data
 from heliograph.filters.innovation import HALF
-from heliograph.filters.rows import data_of
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance, rank
 from heliograph.numerics.float64 import quickly_compiled
@@ -137,7 +137,7 @@ def whitened_innovations(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     if filter.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
-    return np.asarray(score_innovations(filter, *data_of(filter, data, inputs))[1])
+    return np.asarray(score_innovations(filter, *check_data(filter, data, inputs))[1])
 
 
 def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:

@@ -1,4 +1,4 @@
-"""Rows of data through a filter: one scan, and the estimates and innovations that come of it."""
+"""Run a filter over rows of data: one scan, and the estimates and innovations that it returns."""
 
 import warnings
 from collections.abc import Callable
@@ -21,8 +21,8 @@ from heliograph.numerics.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 
-class Steps(Protocol):
-    """A filter as a scan over rows reads it."""
+class SteppedFilter(Protocol):
+    """Filter as a scan over rows reads it."""
 
     @property
     def claim(self) -> Claim:
@@ -85,23 +85,23 @@ class Filtered:
         return float(np.sum(self.log_likelihoods))
 
 
-def over_rows(
-    filter: Steps,
+def scan_inside_jit(
+    filter: SteppedFilter,
     z: Float[Array, "steps received"],
     u: Float[Array, "steps inputs"],
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> PyTree:
-    """Step a filter over rows inside a compiled computation: output(state, innovation, k) of each, stacked."""
-    return scan_rows(filter, z, u, output)[1]
+    """Step a filter over rows inside a compiled computation; return output(state, innovation, k) of each, stacked."""
+    return scan_with_last_state(filter, z, u, output)[1]
 
 
-def scan_rows(
-    filter: Steps,
+def scan_with_last_state(
+    filter: SteppedFilter,
     z: Float[Array, "steps received"],
     u: Float[Array, "steps inputs"],
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> tuple[PyTree, PyTree]:
-    """Step a filter over rows like `over_rows`; return its last state too, before the outputs."""
+    """Step a filter over rows like `scan_inside_jit`; return its last state too, before the outputs."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         k, z_k, u_k = row
@@ -113,10 +113,10 @@ def scan_rows(
     return last, outputs
 
 
-def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
-    """Run a filter over rows of data, by native code where it supports the filter."""
-    rows_z, rows_u = data_of(filter, z, u)
-    state, (mean, covariance, innovation) = compute_once(_results, _by_xla, (filter, rows_z, rows_u))
+def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> Filtered:
+    """Run a filter over rows of data, by native code where the filter has it; return estimates and innovations."""
+    rows_z, rows_u = check_data(filter, z, u)
+    state, (mean, covariance, innovation) = compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u))
     lost = ~np.isfinite(mean).all(axis=1)
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
@@ -130,21 +130,23 @@ def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
     )  # fmt: skip
 
 
-def _results(filter: Steps, z: Array, u: Array) -> PyTree:
+def _compute_filtered(filter: SteppedFilter, z: Array, u: Array) -> PyTree:
+    """Compiled body of `run_over_data`."""
+
     def outputs_of(state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
         estimate = filter.after_step(state, k)
         return estimate.mean, estimate.covariance, innovation
 
-    return scan_rows(filter, z, u, outputs_of)
+    return scan_with_last_state(filter, z, u, outputs_of)
 
 
-_by_xla = quickly_compiled(_results)
+_by_xla = quickly_compiled(_compute_filtered)
 
 
-def data_of(
-    filter: Steps, measurements: ArrayLike, inputs: ArrayLike | None
+def check_data(
+    filter: SteppedFilter, measurements: ArrayLike, inputs: ArrayLike | None
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
-    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed.
+    """Return measurements and inputs of a filter as arrays of rows; without inputs the filter must take none.
 
     Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
     """

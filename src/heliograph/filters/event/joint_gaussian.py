@@ -1,4 +1,4 @@
-"""Gaussians of the state and of the sender's reference: moved, with the measurement as well, and given a value."""
+"""Joint Gaussians of state, sender's reference and measurement: predicted, augmented, conditioned on a value."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of, triangular
 from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns, sum_unexplained
-from heliograph.filters.event.parts import GaussianSum
+from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.gaussian.belief import image_of, process_noise
 from heliograph.filters.gaussian.signal import gain_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
@@ -24,8 +24,8 @@ class LinkMoments(NamedTuple):
     gain_spread: jax.Array
     noise: Columns
 
-    def of_sender(self, sender: slice, m: int) -> "LinkMoments":
-        """Take the outputs that carry a sender's components: all, unless each component has its own sender."""
+    def select_sender(self, sender: slice, m: int) -> "LinkMoments":
+        """Select the outputs that carry a sender's components: all, unless each component has its own sender."""
         rows = slice(None) if sender == slice(0, m) else sender
         noise = Columns(self.noise.matrix[rows], self.noise.weights)
         return LinkMoments(self.mean[rows], self.gain_spread[rows, rows], noise)
@@ -59,8 +59,8 @@ def predict_jointly(
     return of_columns(mean, join_columns(Columns(slopes, both.variances), fresh))
 
 
-def pin(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
-    """Set components that are known: these values, and no variance."""
+def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
+    """Set the components at `places` to known values, of variance zero."""
     root = x.root.at[places].set(np.eye(len(x.mean))[places])
     variances = x.variances.at[places].set(0.0)
     return Gaussian(x.mean.at[places].set(values), below_diagonal(root), variances)
@@ -75,25 +75,25 @@ def condition_parts(
     m: int,
     delivers: bool,
 ) -> GaussianSum:
-    """Condition each Gaussian of (x, r, y) on z = G y + n, and weigh it by its density."""
+    """Condition each Gaussian of (x, r, y) on z = G y + n, and multiply its weight by the density of z."""
     size = parts.gaussian.mean.shape[1]
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
-        expected, slopes, noise = _transform_by_link(x, link.of_sender(sender, m), m)
+        expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         after, innovations = observe(x, slopes, z - expected, noise, arrived)
         if delivers:  # y is z, to the last digit
-            after = pin(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
+            after = set_known_components(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
         return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
 
     after, density = jax.vmap(update_one)(parts.gaussian)
     return GaussianSum(parts.log_weight + density, after, parts.label)
 
 
-def arriving(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:
-    """Return the law of z = G y + n of each Gaussian of (x, r, y)."""
+def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:
+    """Predict z = G y + n from each Gaussian of (x, r, y)."""
 
     def receive_one(x: Gaussian) -> Gaussian:
-        expected, slopes, noise = _transform_by_link(x, link.of_sender(sender, m), m)
+        expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         return of_columns(expected, join_columns(Columns(slopes, x.variances), noise))
 
     received: Gaussian = jax.vmap(receive_one)(x)

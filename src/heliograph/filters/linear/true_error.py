@@ -97,16 +97,16 @@ def true_error(
     row = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
         rows = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
-        moments = _propagate(moments, at(plant, k), at(planned.steps, k), u[k], rows)
+        moments = _propagate_moments(moments, at(plant, k), at(planned.steps, k), u[k], rows)
         moments = _correct_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
         true.append(row @ moments.sum(axis=0) @ row.T)
     return TrueError(start.states, np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2], np.array(true))
 
 
-def _propagate(
+def _propagate_moments(
     moments: np.ndarray, plant: LinearPlant, step: LinearStep, u: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Propagate moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
+    """Propagate joint moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
     n, given, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
     move, noise = np.zeros((2, size, size))
     move[:n, :n], move[n, n] = plant.transition_matrix(given), 1.0

@@ -1,0 +1,402 @@
+"""A filter behind a sender that decides when to send: a sum of Gaussians over what the sender compares with."""
+
+from collections.abc import Sequence
+from copy import copy
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian, append_rows, given, leading
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
+from heliograph.filters.event.ball import truncate_to_ball
+from heliograph.filters.event.belief import EventBelief
+from heliograph.filters.event.gaussian_sum import (
+    FLOOR,
+    GaussianSum,
+    concatenate,
+    log_total,
+    merge_groups,
+    reduce_parts,
+    truncate_between,
+    truncate_outside,
+)
+from heliograph.filters.event.joint_gaussian import (
+    LinkMoments,
+    augment,
+    condition_parts,
+    predict_jointly,
+    predict_received,
+    set_known_components,
+)
+from heliograph.filters.gaussian.belief import second_moments_at_start, smoother_step_by_transform
+from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.modes.patterns import SideInformation, pattern_of
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.model.centred import predict_signal
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.model.trigger import AbstractThreshold
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+RIM = 1e-9  # share of delta by which a value may lie inside for rounding
+COUNTED = 16  # lost transmissions that are counted; more are as many
+
+
+class EventFilter(AbstractSizedFilter):
+    """The Gaussian sum of `event_filter`.
+
+    known: parts of the interval in which y - r lay last, one Gaussian each; lost: Gaussians whose reference is a value
+    that was lost; loses: transmissions may be lost; delivers: what arrives is y itself; alike: what arrives has the
+    same law in every mode; outputs: length of y; ages: numbers of steps since the last transmission that labels count.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: SideInformation | OverTime
+    trigger: AbstractThreshold
+    initial: Float[Array, " M"]
+    transform: AbstractTransform
+    known: int = eqx.field(static=True)
+    lost: int = eqx.field(static=True)
+    loses: bool = eqx.field(static=True)
+    delivers: bool = eqx.field(static=True)
+    alike: bool = eqx.field(static=True)
+    outputs: int = eqx.field(static=True)
+    ages: int = eqx.field(static=True)
+
+    @property
+    def reference_may_be_lost(self) -> bool:
+        """True if the value that the sender compares with may be one that the filter never received."""
+        return self.loses and self.trigger.reference == "sent"
+
+    def as_large_as(self, others: Sequence[AbstractFilter]) -> "EventFilter":
+        """Return the filter with room for the longest heartbeat of others that have one."""
+        ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
+        if self.trigger.heartbeat is None or ages <= self.ages:
+            return self
+        larger = copy(self)  # with what it knows of its world
+        object.__setattr__(larger, "ages", ages)
+        return larger
+
+    @property
+    def senders(self) -> list[slice]:
+        """Components of y that are sent together."""
+        m = self.outputs
+        return [slice(i, i + 1) for i in range(m)] if self.trigger.region == "each" else [slice(0, m)]
+
+    @property
+    def silence_tells(self) -> bool:
+        """Always true: silence is a measurement."""
+        return True
+
+    @compile_on_call
+    def init(self) -> EventBelief:
+        """The prior, and no reference yet."""
+        start, m = at(self.plant, 0), self.outputs
+        x = given(start.initial_mean, start.initial_covariance)
+        both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
+        counts = COUNTED if self.trigger.losses == "numbered" else 1
+        label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
+        label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
+        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
+        begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
+        return EventBelief.of(self._pad_sum(prior_sum), begun, jnp.asarray(False))
+
+    def _pad_sum(self, one: GaussianSum) -> GaussianSum:
+        """Pad a sum of one Gaussian with others that have no weight."""
+        count = self._count_known_references + (self.lost if self.reference_may_be_lost else 0)
+        every: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
+        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
+
+    @property
+    def _count_known_references(self) -> int:
+        """Count the Gaussians of known reference: pieces of the interval, and of the outside if it may be silent."""
+        return self.known + (self._count_outside_parts if self.loses and not self.reference_may_be_lost else 0)
+
+    @property
+    def _count_outside_parts(self) -> int:
+        """Count the pieces that what is outside of a sender's region is cut into."""
+        return 2 * len(range(self.outputs)[self.senders[0]]) + self.has_ball_region
+
+    @property
+    def has_ball_region(self) -> bool:
+        """True if the region is a ball of several components."""
+        return self.trigger.region == "ball" and self.outputs > 1
+
+    @predicts
+    def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
+        """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
+        plant, u, start = at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant)
+        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.parts.gaussian)
+        if self.trigger.reference == "prediction":
+            expected, places = (
+                self.reference(self._merge_state(state).mean, u, k),
+                len(self.states) + np.arange(self.outputs),
+            )
+            both = jax.vmap(lambda x: set_known_components(x, places, expected))(both)
+        rows = jnp.asarray(at(self.channel, k).transition)
+        label = jnp.einsum("hsiac,ij->hsjac", state.label, jnp.where(state.moved, rows, jnp.eye(len(rows))))
+        if self.trigger.heartbeat is not None:
+            older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
+            age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
+            label = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, label, 0.0)
+        return EventBelief(state.weight, *both, label, state.begun, jnp.asarray(True))
+
+    def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
+        """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
+        return predict_signal(at(self.plant, k), at(self.sensor, k), mean, u)
+
+    @corrects
+    def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:
+        """Correct with the values that came, and with the silence of the senders from which none came."""
+        plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        count = self.received - self.trigger.side_information(self.outputs)
+        values, losses = z[:count], z[count:]
+        parts, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
+        total, value, covariance = jnp.zeros(()), [], []
+        # Senders one after the other, each with its value or its silence.
+        for s, those in enumerate(self.senders):
+            mine = values[those] if len(self.senders) > 1 else values
+            lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
+            augmented = augment(plant, sensor, self.transform, parts, start)
+            arrived = jnp.any(~jnp.isnan(mine))
+            after, expected, spread = self._condition_on_sender(augmented, channel, mine, lost, s, begun[s])
+            whole = log_total(after.log_weight)
+            total, parts = total + whole, after.scale_weights(-whole)
+            begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
+            value.append(mine - expected)
+            covariance.append(spread)
+        innovation = Innovation(*_append_losses(jnp.concatenate(value), covariance, losses), total)
+        return EventBelief.of(parts, begun, state.moved), innovation
+
+    def _condition_on_sender(
+        self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+    ) -> tuple[GaussianSum, jax.Array, jax.Array]:
+        """Condition on a sender's value or silence; return the sum, and mean and covariance predicted of a value."""
+
+        def update_by_silence(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
+            """Update by silence; no value is expected."""
+            return (
+                self._condition_on_silence(augmented, channel, lost, s, begun),
+                jnp.zeros_like(z),
+                jnp.zeros((len(z), len(z))),
+            )
+
+        def update_by_value(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
+            """Update by the value z."""
+            return self._condition_on_value(augmented, channel, z, lost, s, begun)
+
+        used: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(
+            jnp.any(~jnp.isnan(z)), update_by_value, update_by_silence, augmented
+        )
+        return used
+
+    def _condition_on_silence(
+        self, augmented: GaussianSum, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array
+    ) -> GaussianSum:
+        """Condition the sum on silence: nothing was sent, or it was sent and lost."""
+        n, m, sender = len(self.states), self.outputs, self.senders[s]
+        as_it_was, label = np.r_[0 : n + m], augmented.label[:, s]
+        waiting, due = self._label_sending(label, begun)
+        loss = self._loss_probability(channel, s)[:, None, None]
+        dropped, forced = (_relabel_sent(which * loss, True) for which in (waiting, due))
+        if self.trigger.losses == "known":
+            waiting = jnp.where(lost > 0, 0.0, waiting)
+            dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
+
+        # Known reference: every Gaussian cut to each part of the line, and joined part by part.
+        if not self.reference_may_be_lost:
+            inside = augmented.relabel_sender(s, waiting + forced if self.loses else waiting)
+            slots, _ = self._truncate_inside(inside, inside.take(0, 0), sender)
+            if self.loses:
+                outside = self._truncate_outside(augmented.relabel_sender(s, dropped + forced), sender, 1.0)
+                slots = concatenate([slots, merge_groups(outside, self._count_outside_parts)])
+            return self._keep_if_impossible(slots.select_components(as_it_was), augmented)
+
+        # Reference that may be a value that was lost: not sent, with the reference as it was ...
+        unsent = augmented.relabel_sender(s, waiting)
+        slots, others = self._truncate_inside(unsent.take(0, self.known), unsent.take(self.known), sender)
+        # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
+        outside = merge_groups(
+            self._truncate_outside(augmented.relabel_sender(s, dropped), sender, 1.0), self._count_outside_parts
+        )
+        fresh = concatenate([outside, merge_groups(augmented.relabel_sender(s, forced))]).select_components(
+            self._find_new_reference(sender)
+        )
+        few = reduce_parts(
+            concatenate([others.select_components(as_it_was), fresh]),
+            self.lost,
+            slice(n + sender.start, n + sender.stop),
+        )
+        return self._keep_if_impossible(concatenate([slots.select_components(as_it_was), few]), augmented)
+
+    def _condition_on_value(
+        self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+    ) -> tuple[GaussianSum, jax.Array, jax.Array]:
+        """Condition on a value: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
+        # Probability that this pattern of values arrives, by mode.
+        sender, arrived = self.senders[s], ~jnp.isnan(z)
+        pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
+        kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
+        chance = jnp.asarray(channel.chance)[:, kind]
+        arrives = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
+        label = augmented.label[:, s] * arrives[:, None, None]
+        if self.trigger.losses == "numbered":
+            number = jnp.clip(jnp.where(jnp.isnan(lost), 0.0, lost).astype(int), 0, COUNTED - 1)
+            label = label * (jnp.isnan(lost) | (jnp.arange(COUNTED) == number))
+        # Each mode's Gaussians, updated by the value, and after them as they were.
+        used, before, links = [], [], []
+        for j in range(1 if self.alike else label.shape[1]):
+            only = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
+            mode = jnp.argmax(chance > 0) if self.alike else j
+            moments = channel.mean, channel.gain_spread, channel.noise
+            links.append(LinkMoments(*jax.tree.map(lambda part, at=(mode, kind): jnp.asarray(part)[at], moments)))
+            before.append(augmented.relabel_sender(s, only))
+            used.append(condition_parts(before[-1], z, arrived, links[-1], sender, self.outputs, self.delivers))
+        # Restricted to where the sender had to send.
+        count, size = len(links), len(label)
+        selected = self._select_sent(concatenate([*used, *before]), s, begun)
+        pieces = [selected.take(start, start + size) for start in range(0, len(selected.log_weight), size)]
+        by_mode = [concatenate(pieces[j :: 2 * count]) for j in range(2 * count)]
+        # What was to be expected of a value that comes.
+        signals = []
+        for sent, link in zip(map(merge_groups, by_mode[count:]), links, strict=True):
+            received = predict_received(sent.gaussian, link, sender, self.outputs)
+            signals.append(GaussianSum(sent.log_weight, received, jnp.zeros((1, 1))))
+        # One sum again, with a new reference.
+        whole = merge_groups(concatenate(by_mode[:count]).select_components(self._find_new_reference(sender)))
+        whole = whole.relabel_sender(s, _relabel_sent(whole.label[:, s], False))
+        signal = merge_groups(concatenate(signals)).gaussian
+        return self._pad_sum(whole), signal.mean[0], signal.covariance[0]
+
+    def _select_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
+        """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
+
+        Returns one sum of the pieces outside, of a floor where these have next to no probability, and of those due.
+        """
+        waiting, due = self._label_sending(used.label[:, s], begun)
+        event = used.relabel_sender(s, waiting)
+        outside = self._truncate_outside(event, self.senders[s], 1 - RIM)
+        mass = jnp.max(outside.log_weight.reshape(self._count_outside_parts, -1), axis=0)
+        lowest = event.log_weight + np.log(FLOOR)
+        floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
+        return concatenate([outside, floor, used.relabel_sender(s, due)])
+
+    def _label_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
+        heartbeat = self.trigger.heartbeat
+        oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
+        due = jnp.where(~begun | oldest, label, 0.0)
+        return label - due, due
+
+    def _loss_probability(self, channel: SideInformation, s: int) -> jax.Array:
+        """Probability that what a sender transmits is lost, for each mode of the link (M,)."""
+        mine = self.senders[s] if len(self.senders) > 1 else slice(None)
+        lost = ~jnp.any(jnp.asarray(channel.present)[:, mine], axis=1)
+        return jnp.asarray(channel.chance) @ lost.astype(float)
+
+    def _find_new_reference(self, sender: slice) -> np.ndarray:
+        """Places in (x, r, y) of the next (x, r): y in place of r for the components that the sender transmits."""
+        n, m = len(self.states), self.outputs
+        places: np.ndarray = np.r_[0 : n + m]
+        if self.trigger.needs_reference:
+            places[n + sender.start : n + sender.stop] = n + m + np.r_[sender]
+        return places
+
+    def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
+        """For each component of a sender, the row d with d'(x, r, y) = y - r, and its threshold delta."""
+        n, m = len(self.states), self.outputs
+        delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
+        unit = jnp.eye(n + 2 * m)
+        return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
+
+    def _truncate_inside(
+        self, known: GaussianSum, unknown: GaussianSum, sender: slice
+    ) -> tuple[GaussianSum, GaussianSum]:
+        """Truncate to |y - r| <= delta: `known` piece by piece of the interval, then merged; `unknown` as a whole."""
+        (direction, delta), *rest = self._error_directions(sender)
+        size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
+        low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
+        every = concatenate([known] * self.known)
+        if self.has_ball_region:
+            every = truncate_between(every, direction, low * delta, high * delta) if self.known > 1 else every
+            every = self._truncate_to_ball(concatenate([every, unknown]), sender, 1.0, True)
+        else:
+            whole = np.ones(len(unknown.log_weight))
+            low, high = np.append(low, -whole), np.append(high, whole)
+            every = truncate_between(concatenate([every, unknown]), direction, low * delta, high * delta)
+            for direction, delta in rest:
+                every = truncate_between(every, direction, -delta, delta)
+        count = size * self.known
+        return merge_groups(every.take(0, count), self.known), every.take(count)
+
+    def _truncate_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
+        """Truncate each Gaussian to |y - r| > delta, as `_count_outside_parts` pieces, one after the other.
+
+        The first component that is, above or below, those before it inside; of a ball these are what is outside of the
+        box around it, and then what the ball leaves of the box.
+        """
+        outside, errors = [], self._error_directions(sender)
+        for i, (direction, delta) in enumerate(errors, 1):
+            edge = scale * delta
+            outside.append(truncate_outside(parts, direction, edge))
+            if i < len(errors) or self.has_ball_region:
+                parts = truncate_between(parts, direction, -edge, edge)
+        return concatenate(
+            [*outside, self._truncate_to_ball(parts, sender, scale, False)] if self.has_ball_region else outside
+        )
+
+    def _truncate_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
+        """Truncate each Gaussian to |y - r| <= scale delta (`inside`), or to where it is more."""
+        directions, deltas = zip(*self._error_directions(sender), strict=True)
+        return truncate_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
+
+    def _keep_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
+        """Return the updated sum; where all its weights are 0, the sum `before`, with FLOOR as likelihood."""
+        stays = before.select_components(np.arange(parts.gaussian.mean.shape[1]))
+        stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
+        forbidden = ~jnp.isfinite(log_total(parts.log_weight))
+        either: GaussianSum = jax.tree.map(lambda x, y: jnp.where(forbidden, x, y), stays, parts)
+        return either
+
+    @estimates
+    def estimate(self, state: EventBelief) -> Estimate:
+        """Mean and covariance of the whole sum."""
+        whole = self._merge_state(state)
+        return Estimate(whole.mean, whole.covariance, self.claim)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """The one of the joined sums' moments around the update."""
+        return smoother_step_by_transform(self, step, first(self.plant), self._merge_state)
+
+    def _merge_state(self, state: EventBelief) -> Gaussian:
+        """Merge the sum into one Gaussian of the plant's state."""
+        whole = leading(merge_groups(state.parts).gaussian, len(self.states))
+        first: Gaussian = jax.tree.map(lambda leaf: leaf[0], whole)
+        return first
+
+
+def _relabel_sent(label: jax.Array, lost: bool) -> jax.Array:
+    """Relabel a sender (K, M, A, C) after a transmission: no step since then, and one more lost or none."""
+    label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
+    if label.shape[-1] == 1:
+        return label
+    if not lost:
+        return jnp.zeros_like(label).at[..., 0].set(jnp.sum(label, axis=-1))
+    more = jnp.concatenate([jnp.zeros_like(label[..., :1]), label[..., :-1]], axis=-1)
+    return more.at[..., -1].add(label[..., -1])
+
+
+def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Append the reported losses to the innovation: known numbers, so value 0 (NaN if missing) and covariance 0."""
+    loss_values = jnp.where(jnp.isnan(losses), jnp.nan, 0.0)
+    value = jnp.concatenate([value, loss_values])
+    arrived = ~jnp.isnan(value)
+    whole = jax.scipy.linalg.block_diag(*(jnp.nan_to_num(block) for block in blocks), jnp.zeros((len(losses),) * 2))
+    return value, jnp.where(arrived[:, None] & arrived, whole, jnp.nan)
