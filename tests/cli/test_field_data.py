@@ -7,13 +7,13 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.files.network_file import load_module
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import NetworkProgram
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from tests.cli.walk import WALK, agrees, kalman, run
+from tests.files.module import load_module
 
 
 @pytest.fixture

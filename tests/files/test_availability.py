@@ -189,7 +189,7 @@ def test_run_uses_what_a_log_says(file, tmp_path, network, form):
     }  # fmt: skip
     path = tmp_path / ("log.csv" if form == "csv" else "log.jsonl")
     path.write_text(texts[form])
-    from heliograph.files.network_file import load_module
+    from tests.files.module import load_module
 
     events = hg.files.read_messages(path, network, load_module(str(file))[1]["sources"])
     assert [event.values[0] for event in events.in_order()] == [20.0, 21.0]

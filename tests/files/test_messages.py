@@ -12,9 +12,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import heliograph as hg
-from heliograph.files.network_file import load_module
 from heliograph.live.recorded import play
 from tests.files import bags
+from tests.files.module import load_module
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ import heliograph as hg
 from heliograph.model.channel import carry_angles
 from heliograph.model.over_time import at
 from heliograph.model.plant import JointNoise
-from heliograph.numerics.types import unit_of
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 
 PAGE = Path(__file__).parents[2] / "docs" / "names.md"
@@ -22,6 +21,11 @@ KINDS = (
     r"AbstractRandomAffine|GainAndNoise|Erasure|Mixture|Series|Stack|Modes|OverTime|\w*Filter"
 )
 MODEL = re.compile(rf"\b({KINDS})\b")
+
+
+def unit_of(name):
+    """The unit of a name of a state, output or input; none of plain text."""
+    return getattr(name, "unit", "")
 
 
 def public():

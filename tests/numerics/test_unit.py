@@ -9,7 +9,11 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.recording import estimate_columns, read_recording
-from heliograph.numerics.types import unit_of
+
+
+def unit_of(name):
+    """The unit of a name of a state, output or input; none of plain text."""
+    return getattr(name, "unit", "")
 
 
 def plant(states: object) -> hg.LinearPlant:

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from heliograph import cli
-from heliograph.cli.studies import print_list, studies_of
 
 ROOT = Path(__file__).parents[2]
 MODULE = '''
@@ -45,19 +44,22 @@ def package(tmp_path, monkeypatch):
     return tmp_path
 
 
+def listed(capsys, command):
+    """The names that a command lists when it is given none, with what they say."""
+    assert cli.main([command]) == 0
+    return dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if len(line.split()) > 1)
+
+
 def test_a_study_of_another_package_is_listed_and_runs(package, capsys):
-    assert cli.main(["example"]) == 0
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("number "))
-    assert line.split(maxsplit=1)[1] == "Says a number."
-    assert "number" not in studies_of("publication")
+    assert listed(capsys, "example")["number"] == "Says a number."
+    assert "number" not in listed(capsys, "reproduce")
     assert cli.main(["example", "number", "--seed", "3", "--set", "mean=0.3", "--out", "out"]) == 0
     assert json.loads((package / "out" / "number" / "summary.json").read_text()) == {"seed": "3", "mean": "0.3"}
 
 
 def test_a_list_runs_no_study(package, capsys):
     (package / "my_study.py").write_text(MODULE.strip().format(imports="raise RuntimeError"))
-    print_list("example")
-    assert "Says a number." in capsys.readouterr().out
+    assert listed(capsys, "example")["number"] == "Says a number."
 
 
 def test_one_name_has_one_study(package, capsys):
@@ -68,16 +70,17 @@ def test_one_name_has_one_study(package, capsys):
     assert "heliograph_studies.demo:example" in said and "other:example" in said and said.count("\n") == 1
 
 
-def test_every_study_says_what_it_shows():
-    known = {**studies_of("example"), **studies_of("publication")}
+def test_every_study_says_what_it_shows(capsys):
+    known = listed(capsys, "example") | listed(capsys, "reproduce")
     assert "demo" in known and "quadratic-bias" in known and "hello" not in known
     with pytest.raises(ValueError, match=r"example: expected one of .*demo, .*, got 'nothing'"):
         cli.studies.run(["nothing"], None, {}, "example")
 
 
 def test_what_is_a_page_now_is_named(capsys):
+    examples = listed(capsys, "example")
     for name, page in cli.studies.PAGES.items():
-        assert name not in studies_of("example") and (ROOT / "docs" / page).exists()
+        assert name not in examples and (ROOT / "docs" / page).exists()
         assert cli.main(["example", name, "--out", "out"]) == 2
         said = capsys.readouterr().err
         assert said.endswith(f"got '{name}', a page now: docs/{page}\n") and said.count("\n") == 1

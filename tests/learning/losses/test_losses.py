@@ -10,7 +10,6 @@ import heliograph as hg
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses, Runs
 from heliograph.learning.losses.loss_law import IndependentLosses, MarkovLosses
 from heliograph.learning.losses.losses import loss_memory
-from heliograph.numerics.shares import wilson
 
 NAN = np.nan
 LOGITS = logit([0.1, 0.6, 0.05, 0.2])  # loss when good, when bad, fail, recover
@@ -108,7 +107,8 @@ def test_a_past_is_used_as_far_as_it_is_known():
 @pytest.mark.parametrize("hits, of", [(3, 20), (0, 10), (10, 10), (37, 400)])
 def test_intervals_of_counts_are_wilsons(hits, of):
     expected = binomtest(hits, of).proportion_ci(0.95, "wilson")
-    np.testing.assert_allclose(wilson(hits, of), (hits / of, *expected), atol=1e-14)
+    share = IndependentLosses.fit([np.arange(of) < hits]).shares()["loss"]
+    np.testing.assert_allclose((share.estimate, share.low, share.high), (hits / of, *expected), atol=1e-14)
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def translator(file: Path) -> Translator:
-    from heliograph.files.network_file import load_module
+    from tests.files.module import load_module
 
     network, module = load_module(str(file))
     return Translator(module["sources"], network)
@@ -124,7 +124,7 @@ def test_lines_with_a_topic_are_those_of_mosquitto_sub(translator):
 
 def test_lines_without_a_topic_are_of_the_only_one(file):
     """`serve < lines.jsonl` reads what `run --measurements lines.jsonl` reads; with several topics none is guessed."""
-    from heliograph.files.network_file import load_module
+    from tests.files.module import load_module
 
     network, _ = load_module(str(file))
     source = hg.files.json_field("t", node="garden", time="time", sequence=hg.files.Count("count", 8))
@@ -179,7 +179,7 @@ def test_subjects_of_nats_are_the_same_sources(server, translator):
 @pytest.mark.real("MQTT")
 def test_the_stored_word_of_a_device_holds_for_a_service_that_begins_later(server, file):
     """zigbee2mqtt stores "offline" at the broker; a service that comes afterwards leaves values out until "online"."""
-    from heliograph.files.network_file import load_module
+    from tests.files.module import load_module
 
     network, _ = load_module(str(file))
     here = hg.files.Available("den2mqtt/+/availability")
