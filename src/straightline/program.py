@@ -227,6 +227,26 @@ def varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     return results
 
 
+def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
+    """Return what of these items, in order, differs between runs: what varies with these inputs, and some memory more.
+
+    Runs read what they share after it is computed, when of an array that a loop carries in memory the last turn is
+    left: where they need it within a turn, each has its own.
+    """
+    spread = varying(items, inputs)
+    carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
+    while within := (carried and _read_within(crossing(items, spread)) & carried - spread):
+        spread = varying(items, [*inputs, *within, *(carried & spread)])
+    return spread
+
+
+def _read_within(items: Iterable[Any]) -> set[Buffer]:
+    """Return the memory of which items read a part that is filled in a block inside its own."""
+    used = (n for x in items if not isinstance(x, Buffer) for n in (x, *_arguments(x)) if isinstance(n, Node))
+    parts = {n.value[0] for n in used if n.op == "load"}
+    return {part.owner[0] for part in parts if part.block is not part.owner[0].block}
+
+
 def crossing(items: Iterable[Any], spread: set[Any]) -> set[Any]:
     """Return which of the items are needed to compute those that differ between runs: these, and statements."""
     results = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}

@@ -23,12 +23,12 @@ from straightline.program import (
     Program,
     Summed,
     crossing,
+    find_differing,
     in_order,
     needed,
     products_of,
     row_length,
     uses,
-    varying,
 )
 from straightline.rules.loops import copied
 from straightline.rules.random_bits import hash_function
@@ -36,6 +36,7 @@ from straightline.vectors.elementary import functions
 
 LINE = 64  # bytes: where vectors of any width may start
 WIDEST = 8  # runs of a vector of doubles: one register of the widest processors, two of others; more only spill
+FILLED = ("scratch", "carried")  # kinds of memory that the program fills
 SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
 
 
@@ -151,8 +152,7 @@ def written(
         raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
     width = width or widest(items)
     # Numbers that differ between runs; all others are computed once.
-    carried = [x for x in items if isinstance(x, Buffer) and x.kind == "carried"]
-    spread = {*items, *program.inputs} if alone else varying(items, [*lanes, *carried])
+    spread = {*items, *program.inputs} if alone else find_differing(items, lanes)
     products = products_of(items) if fuse else set()
     tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
     common = [b not in spread for b in outputs]
@@ -172,9 +172,9 @@ def written(
     )
     mine = crossing(items, spread)
     # What blocks read of memory that is filled anew in each turn of a loop has a place for each turn.
-    turning = {b for b in owners if b not in spread and b.kind == "scratch" and loops_of(b.block)}
+    turning = {b for b in owners if b not in spread and b.kind in FILLED and loops_of(b.block)}
     turning &= _read(mine) if turning else turning
-    shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0, turning)
+    shared, in_shared = _places([b for b in owners if b not in spread and b.kind in FILLED], 1, 0, turning)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = Slots(shared)
     pointers = [*program.inputs, *tables, *outputs]
@@ -183,7 +183,7 @@ def written(
     blocks.flushes = flushes = _is_single(items)
     text, movers = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, width, summed)
     # The other function fills these slots, once for all runs.
-    roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
+    roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind in FILLED)]
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
     once = None
     if roots:

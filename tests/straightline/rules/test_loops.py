@@ -40,7 +40,22 @@ def repeated(a, b):
     return jax.lax.scan(turn, a, b[:4])
 
 
-@pytest.mark.parametrize("function", [eliminated, exchanged, repeated])
+def beside(a, b):
+    """A carried array that is changed by each turn of another one: of what runs share, a turn's numbers are needed."""
+
+    def turn(j, carry):
+        a, b = carry
+        return a - jnp.outer(a[:, j], a[j]) * 0.01, b + a[j] * b[j][0] + a[:, 3]
+
+    return jax.lax.fori_loop(0, 5, turn, (a, b))
+
+
+def after(a, b):
+    """What only the end of a loop decides."""
+    return jax.lax.fori_loop(0, 5, lambda j, a: a - jnp.outer(a[:, j], a[j]) * 0.01, a) @ b[0]
+
+
+@pytest.mark.parametrize("function", [eliminated, exchanged, repeated, beside, after])
 @pytest.mark.parametrize("shared", [(), (0,)])
 def test_a_long_array_is_carried_in_memory(function, shared):
     """As JAX computes it, to the rounding of some products; also where all runs share what the loop begins with."""
@@ -51,6 +66,12 @@ def test_a_long_array_is_carried_in_memory(function, shared):
     ours = compile(function, MATRICES[0, 0], MATRICES[1, 0], shared=shared)(a, b)
     for x, y in zip(jax.tree.leaves(ours), jax.tree.leaves(expected), strict=True):
         assert np.allclose(x, np.asarray(y), rtol=0, atol=1e-14 * np.abs(x).max())
+
+
+def test_what_all_runs_share_is_computed_once():
+    """The loop of an array that all share, however its turns change it; a run has a product with a vector left."""
+    alone, shared = (compile(after, *MATRICES[:, 0], shared=shared).code for shared in ((), (0,)))
+    assert shared.blocks.work < 3 * SIDE**2 < alone.blocks.work / 10
 
 
 def test_a_product_of_many_terms_is_a_loop_over_rows():
