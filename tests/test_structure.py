@@ -24,6 +24,7 @@ ORDER = [
     ["model"],
     [
         "filters.vector",
+        "filters.calls",
         "filters.base",
         "filters.plausibility",
         "filters.filter_data",

@@ -92,6 +92,22 @@ def test_a_stream_names_the_function_of_a_live_input():
         stream.push([1.0], np.array([2.0]))
 
 
+@pytest.mark.parametrize("door", ["step", "predict", "step_with_smoother"])
+def test_a_step_of_a_filter_alone_judges_what_the_functions_return(door):
+    """Also after others that are right, of whichever step; what is right, and what is traced, passes."""
+    filter = network_of(lambda u: u[0] * jnp.eye(2), lambda u: jnp.eye(2) / u[0], "s").nodes["a"].filters["k"]
+    state, data = filter.init(), () if door == "predict" else ([1.0],)
+    getattr(filter, door)(state, *data, [0.5], 3)
+    for s, said in ((-1.0, "process noise covariance.* step 3, for s = -1"), (0.0, "plant matrix.* step 3, for s = 0")):
+        with pytest.raises(ValueError, match=said):
+            getattr(filter, door)(state, *data, [s], 3)
+    with jax.enable_x64(True):
+        slope = jax.grad(
+            lambda s: filter.predict(state, s[None]).mean.sum() + filter.step(state, [1.0], s[None])[1].mean[0]
+        )
+        assert np.isfinite(slope(2.0))
+
+
 def test_a_timeline_uses_no_event_to_whose_time_there_is_no_prediction():
     """Q is indefinite from an interval of 1.5 on; the events after it are at 1 of the last that was used."""
     network = network_of(lambda u: 0.1 * u[0] * jnp.array([[1.0, u[0] / 1.5], [u[0] / 1.5, 1.0]]))

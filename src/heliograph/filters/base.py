@@ -10,6 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
+from heliograph.filters.calls import call_with_inputs, call_with_state
 from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
@@ -23,7 +24,6 @@ from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
@@ -120,7 +120,7 @@ class AbstractFilter(Module):
                 that is NaN.
         """
         z, u = self.check_measurement(z), self.check_input(u)
-        return _call_with_state(self, state, _step, z, u, step_number(self, k))
+        return call_with_inputs(self, state, _step, z, u, step_number(self, k))
 
     def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
         """Run the filter over rows of data from its initial state: for each row predict, then correct.
@@ -162,7 +162,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses.
         """
         z, u = self.check_measurement(z), self.check_input(u)
-        return _call_with_state(self, state, step_with_judgement, z, u, step_number(self, k))
+        return call_with_state(self, state, step_with_judgement, z, u, step_number(self, k))
 
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
@@ -173,7 +173,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses; a filter that cannot be smoothed.
         """
         z, u = self.check_measurement(z), self.check_input(u)
-        return _call_with_state(self, state, _step_with_smoother, z, u, step_number(self, k))
+        return call_with_inputs(self, state, _step_with_smoother, z, u, step_number(self, k))
 
     def check_measurement(self, z: ArrayLike) -> Float[Array, " received"]:
         """Return z as a measurement of the filter's length, NaN where a component did not arrive.
@@ -297,22 +297,6 @@ def make_sizes(claim: Claim, like: HasStates, received: int) -> Sizes:
     return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
 
 
-def _call_with_state(filter: AbstractFilter, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
-    """Call `function(filter, state, *data)`; where it fails with no state of the filter, say so."""
-    try:
-        return function(filter, state, *data)
-    except (AttributeError, IndexError, TypeError, ValueError):
-        # A user's call says it, of the state that was given; those within its trace only fail.
-        if is_traced(state) or _describe_structure(state) == _describe_structure(filter.init()):
-            raise
-        raise fail("state", "one of the filter's, as its init() returns", show_value(state)) from None
-
-
-def _describe_structure(state: PyTree) -> PyTree:
-    """Return the structure of a state, and the shapes of its arrays."""
-    return jax.tree.structure(state), [np.shape(leaf) for leaf in jax.tree.leaves(state)]
-
-
 @compile_on_call
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
     """Compiled body of `AbstractFilter.step`."""
@@ -350,7 +334,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(predict, AbstractFilter.check_input)
+    return _check_calls(predict, AbstractFilter.check_input, call_with_inputs)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
@@ -359,7 +343,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(correct, AbstractFilter.check_measurement)
+    return _check_calls(correct, AbstractFilter.check_measurement, call_with_state)
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
@@ -372,20 +356,22 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(estimate)
     def call(filter: AbstractFilter, state: PyTree) -> R:
-        return _call_with_state(filter, state, run)
+        return call_with_state(filter, state, run)
 
     return cast(Callable[P, R], call)
 
 
 def _check_calls(
-    function: Callable[P, R], check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]]
+    function: Callable[P, R],
+    check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]],
+    call_checked: Callable[..., R],
 ) -> Callable[P, R]:
     """Make a filter's method check its data and its step number, name a wrong state, and run compiled."""
     run = cast(Callable[..., R], compile_on_call(function))
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
-        return _call_with_state(filter, state, run, check(filter, data), step_number(filter, k))
+        return call_checked(filter, state, run, check(filter, data), step_number(filter, k))
 
     return cast(Callable[P, R], call)
 

@@ -1,0 +1,62 @@
+"""Calls of a filter's methods by a user: what is no state is said, and inputs of which a plant makes what is none."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, TypeVar, cast
+
+import jax
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.model.inputs import check_inputs, inputs_spoil
+from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import Array, PyTree
+
+R = TypeVar("R")
+
+
+def call_with_state(filter: Any, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
+    """Call `function(filter, state, *data)`; where it fails with no state of the filter, say so.
+
+    Raises:
+        ValueError: a state of another form than the filter's.
+    """
+    try:
+        return function(filter, state, *data)
+    except (AttributeError, IndexError, TypeError, ValueError):
+        # A user's call says it, of the state that was given; those within its trace only fail.
+        if is_traced(state) or _describe_structure(state) == _describe_structure(filter.init()):
+            raise
+        raise fail("state", "one of the filter's, as its init() returns", show_value(state)) from None
+
+
+def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
+    """Call `function(filter, state, *data)`, of which u and k are the last, and judge what the plant makes of u.
+
+    The plant's functions are judged in the same compiled call; what is traced is judged by whoever traces it.
+
+    Raises:
+        ValueError: a state of another form than the filter's; a covariance of the noise, or a matrix, that is none.
+    """
+    if not filter.inputs or is_traced(filter, state, *data):
+        return call_with_state(filter, state, function, *data)
+    result, spoilt = call_with_state(filter, state, _judge_inputs_too(function), *data)
+    u, k = data[-2:]
+    if spoilt:
+        check_inputs(filter.inputs, np.asarray(u)[None], filter, int(k))
+    return cast(R, result)
+
+
+@cache
+def _judge_inputs_too(function: Callable[..., R]) -> Callable[..., tuple[R, Array]]:
+    @compile_on_call
+    def call(filter: Any, state: PyTree, *data: PyTree) -> tuple[R, Array]:
+        return function(filter, state, *data), inputs_spoil(filter, filter.inputs, *data[-2:])
+
+    return call
+
+
+def _describe_structure(state: PyTree) -> PyTree:
+    """Return the structure of a state, and the shapes of its arrays."""
+    return jax.tree.structure(state), [np.shape(leaf) for leaf in jax.tree.leaves(state)]
