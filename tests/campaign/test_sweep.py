@@ -6,7 +6,7 @@ from heliograph import cli
 from heliograph.campaign.failures import Failure
 from heliograph.campaign.page import NEES, RMSE, against, campaign_figures, campaign_page, plot_by_setting
 from heliograph.campaign.summary import read_summary
-from heliograph.report.progress import Countdown, spoken
+from heliograph.report.progress import Countdown, format_remaining
 from tests.campaign.example import CAMPAIGN, write
 
 
@@ -71,7 +71,7 @@ def test_the_time_left():
     assert countdown.left(20) == pytest.approx(2.0 * 6)
     now[0] = 40.0
     assert countdown.left(20) == pytest.approx(2.0 * 6 - 5)
-    assert [spoken(s) for s in (None, 90.0, 150.0, 9000.0)] == [
+    assert [format_remaining(s) for s in (None, 90.0, 150.0, 9000.0)] == [
         "time left unknown yet",
         "about 90 s left",
         "about 2 min left",

@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize
 
 import heliograph as hg
-from heliograph.learning.intervals import bartlett, block_sums, cosines, find_told_by_few, of_model, white
+from heliograph.learning.intervals import bartlett, block_sums, cosines, covariance_by_model, find_told_by_few, white
 from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.unidentified import find_confounded, product_text, rank_of, sum_text
 
@@ -130,6 +130,6 @@ def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():
     """s = L e, e white: of s - H_.K H_KK^-1 s_K and of what the model says of the rest the sum is H = L L'."""
     lower = np.array([[1.0, 0.0, 0.0], [0.7, 1.2, 0.0], [-0.4, 0.3, 0.8]])
     rows = np.linalg.qr(np.random.default_rng(1).normal(size=(50, 3)))[0] @ lower.T
-    rest, known = of_model([rows], lower @ lower.T, np.array([False, True, False]))
+    rest, known = covariance_by_model([rows], lower @ lower.T, np.array([False, True, False]))
     np.testing.assert_allclose(white(rest).covariance + known, lower @ lower.T, atol=1e-14)
     np.testing.assert_allclose(rest[0][:, 1], 0.0, atol=1e-15)

@@ -12,7 +12,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.health import FilterHealth, examine
-from heliograph.report.outputs import errors_of, rounded
+from heliograph.report.outputs import errors_of, round_to
 from heliograph.report.run_page import errors_table, run_figures, run_page, run_summary
 from heliograph.simulation.results.whiteness import MemoryTest
 from tests.losing import Tied
@@ -227,7 +227,7 @@ def test_the_title_is_the_result_and_doubts_follow(health):
     estimate = health.record.estimates["a"]["sure"]
     deviation = float(np.sqrt(estimate.covariance[-1, 0, 0]))
     assert page.title == (
-        f"level {rounded(estimate.mean[-1, 0], deviation)} ± {rounded(2 * deviation, deviation)} at the end, by sure"
+        f"level {round_to(estimate.mean[-1, 0], deviation)} ± {round_to(2 * deviation, deviation)} at the end, by sure"
     )
     many = replace(health, links=[replace(health.links[-1], component=f"c{i}") for i in range(9)])
     points = run_page(many, "net", {}).sections[0].blocks[1].points
@@ -301,4 +301,4 @@ def test_numbers_are_rounded_by_their_standard_error():
         (12.34567, 0.0123, "12.346"), (0.5, 0.2, "0.50"), (1234.5, 130.0, "1230"), (3.14159, 0.0, "3.142"),
         (np.nan, 1.0, "nan"), (1.0, np.inf, "1"),
     ]:  # fmt: skip
-        assert rounded(value, error) == text
+        assert round_to(value, error) == text

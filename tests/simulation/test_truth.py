@@ -6,7 +6,7 @@ import pytest
 import heliograph as hg
 from heliograph.cli.run import run as command
 from heliograph.report.health import examine
-from heliograph.report.outputs import errors_of, rounded
+from heliograph.report.outputs import errors_of, round_to
 from heliograph.report.run_page import errors_table, run_summary
 
 PLANT = hg.LinearPlant([[1.0, 0.2], [0.0, 0.9]], 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["place", "speed"])
@@ -93,8 +93,10 @@ def test_the_report_shows_the_errors():
     (of,) = errors_of(record)
     assert of.rmse == rmse
     for shown, (state, error) in zip(table.rows[0][2:4], of.rmse_error.items(), strict=True):
-        assert shown == rounded(rmse[state], error) and 0.05 < error / rmse[state] < 0.3  # 1/sqrt(2 n), n = 40 or fewer
-    assert table.rows[0][4] == rounded(size, of.nees_error) and 0.05 < of.nees_error / size < 0.5
+        assert (
+            shown == round_to(rmse[state], error) and 0.05 < error / rmse[state] < 0.3
+        )  # 1/sqrt(2 n), n = 40 or fewer
+    assert table.rows[0][4] == round_to(size, of.nees_error) and 0.05 < of.nees_error / size < 0.5
     errors = run_summary(health)["errors"]["a"]["f"]
     assert errors == {"rmse": rmse, "nees": pytest.approx(size)}
     assert errors_table(hg.run(NETWORK, single.measurements)) == []
@@ -109,6 +111,6 @@ def test_the_command_says_how_far_off(tmp_path, capsys):
     record = hg.run(NETWORK, *recording)
     rmse = record.rmse("a", "f")
     (of,) = errors_of(record)
-    place, speed = (rounded(value, of.rmse_error[state]) for state, value in rmse.items())
+    place, speed = (round_to(value, of.rmse_error[state]) for state, value in rmse.items())
     line = f"a/f: RMSE of place {place}, of speed {speed}; NEES per state "
     assert line in capsys.readouterr().out

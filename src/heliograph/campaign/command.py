@@ -19,7 +19,7 @@ from heliograph.campaign.run import CampaignRun, Progress, run_campaign
 from heliograph.campaign.summary import SUMMARY, Score, read_summary, score_headers, score_row
 from heliograph.disk.quoting import visible
 from heliograph.numerics.check import fail
-from heliograph.report.progress import Countdown, counting
+from heliograph.report.progress import Countdown, show_countdown
 
 FAILED = 1  # exit code: some work failed, the rest is there
 
@@ -91,7 +91,7 @@ ROWS = 30  # of the printed table; the file has all
 def showing(workers: int) -> Iterator[Progress]:
     """Show a progress bar on stderr; a line each minute where stderr is no terminal."""
     countdown = Countdown(workers)
-    with counting(countdown) as show:
+    with show_countdown(countdown) as show:
 
         def progress(what: str, done: int, total: int) -> None:
             if what == "simulating":

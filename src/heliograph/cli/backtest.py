@@ -61,9 +61,9 @@ def backtest(
         return heliograph.backtest(loaded, z, ahead, u, time, truth, skip)
 
     def results(found: "heliograph.forecasting.Backtest") -> "Results":
-        from heliograph.report.backtest_page import backtest_results
+        from heliograph.report.backtest_page import make_backtest_results
 
-        return backtest_results(found, network)
+        return make_backtest_results(found, network)
 
     found = write_results(target, 3, compute, results)
     for score in found.scores:

@@ -87,16 +87,16 @@ def learn(
     from dataclasses import replace
 
     from heliograph.files.fitted import NetworkAgain
-    from heliograph.learning.held_out import changes, uniformity
+    from heliograph.learning.held_out import compare_filters, transform_held_out
     from heliograph.learning.losses.losses import learn_losses
-    from heliograph.learning.senders import decides
+    from heliograph.learning.senders import has_deciding_sender
     from heliograph.numerics.check import fail
     from heliograph.report.fit_page import Learned
 
     # The network as it starts, and the data.
     build = NetworkAgain(network)
     start = build()
-    if decides(start):
+    if has_deciding_sender(start):
         again = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
         raise fail("network to be learned", f"no trigger of a node (in Python {again} learns it)", "one with a trigger")
     data = _data(measurements, network, start, advance, truth, reading)
@@ -109,8 +109,8 @@ def learn(
     # Predictions before and after the fit, then statistics of the losses.
     z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
-    judged = stop.unless_stopped(lambda: changes(start, fitted.network, z, u, cut) if cut < rows else []) or []
-    uniform = stop.unless_stopped(lambda: uniformity(fitted.network, judged, z, u, cut) if judged else []) or []
+    judged = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, cut) if cut < rows else []) or []
+    uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, judged, z, u, cut) if judged else []) or []
     advance("looking at losses")
     lossy = {name: fate for name, fate in _fates(start, recording).items() if any(0 < f.mean() < 1 for f in fate)}
     losses = stop.unless_stopped(lambda: {name: learn_losses(fate) for name, fate in lossy.items()}) or {}
@@ -123,10 +123,10 @@ def _fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
     None of a node that nobody knows to be due: where rows are messages, of one without a rate of its own.
     """
     from heliograph.learning.losses.fates import fates_of_measurements, fates_of_sequence
-    from heliograph.report.health import arrivals_of
+    from heliograph.report.health import list_arrivals
 
     fates = fates_of_measurements(recording.measurements)
-    for arrivals in arrivals_of(network, recording.time, recording.measurements):
+    for arrivals in list_arrivals(network, recording.time, recording.measurements):
         component = network.nodes[arrivals.node].received_names.index(arrivals.component)
         # The node's components are one packet, or each is one of its own.
         name = arrivals.node if arrivals.node in fates else f"{arrivals.node}.{component}"

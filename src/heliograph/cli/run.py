@@ -263,12 +263,12 @@ def _write_results(record: "Record", out: Path | None, report: Path | None) -> l
 
 def _errors(record: "Record") -> list[str]:
     """Compare each filter with the truth, a line each: RMSE by state, and NEES, which is 1 where the claim holds."""
-    from heliograph.report.outputs import errors_of, rounded
+    from heliograph.report.outputs import errors_of, round_to
 
     lines = []
     for errors in errors_of(record):
         rmse = ", ".join(
-            f"of {state} {rounded(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()
+            f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()
         )
         size = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
         lines.append(f"{errors.node}/{errors.filter}: RMSE {rmse}{size}")
@@ -324,10 +324,10 @@ def _write_report(
         }
 
     def results_of(health: dict[str, Health]) -> Results:
-        from heliograph.report.run_page import results_of_plants, run_results
+        from heliograph.report.run_page import make_run_results, results_of_plants
 
         (first, *more) = health.values()
-        return results_of_plants(health, name) if more else run_results(first, name)
+        return results_of_plants(health, name) if more else make_run_results(first, name)
 
     count = len(plants) * sum(map(len, network.claims().values()))
     write_results(report, count, examined, results_of)

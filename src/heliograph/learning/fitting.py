@@ -16,7 +16,7 @@ from heliograph.learning.likelihood.objective import Form, objectives
 from heliograph.learning.likelihood.search import AWAY, SPREAD, Search
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
-from heliograph.learning.senders import SenderFit, decides, fit_sender
+from heliograph.learning.senders import SenderFit, fit_sender, has_deciding_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_progress, check_seed, fail, scalar, show_value
 from heliograph.numerics.module import readable
@@ -184,14 +184,14 @@ def fit(
     check_progress(progress, "a line of text")
     description = describe(network)
     recording, delays = _rows_and_delays(recording)
-    if decides(description.start):
+    if has_deciding_sender(description.start):
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
         return replace(fit_sender(description, recording, inputs, starts, check_seed("seed", seed)), delays=delays)
     data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
     surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
-    points = _starts(surfaces[0], starts, check_seed("seed", seed))
+    points = _choose_starts(surfaces[0], starts, check_seed("seed", seed))
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     solutions, ends, stopped = _search_forms(surfaces, points, seed, identified.ridges, progress or (lambda line: None))
     try:
@@ -211,7 +211,7 @@ def _search_forms(
     """
     ends, solutions = np.zeros(0), list[Solution]()
     for surface in surfaces:
-        search = Search(surface, _progress(surface, progress))
+        search = Search(surface, _report_climbs(surface, progress))
         try:
             top, stopped = search.run(points, seed), False
         except KeyboardInterrupt:
@@ -242,7 +242,7 @@ def _rows_and_delays(recording: Any) -> tuple[object, dict[str, Delays]]:
     return [table.recording() if table in tables else table for table in several], delays
 
 
-def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
+def _choose_starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
     """Starts at which the likelihood is finite: the given one, and others around it.
 
     Raises:
@@ -273,7 +273,8 @@ def _check_dependence(surface: Surface, points: np.ndarray) -> None:
         raise fail(f"free number {lost[0]!r}", "one on which the measurements depend", "one on which nothing does")
 
 
-def _progress(surface: Surface, say: Progress) -> Callable[[Maximum], None]:
+def _report_climbs(surface: Surface, say: Progress) -> Callable[[Maximum], None]:
+    """Make the callback that says after each step how far the searches are."""
     form = surface.objective.form
 
     def watch(now: Maximum) -> None:
@@ -284,6 +285,7 @@ def _progress(surface: Surface, say: Progress) -> Callable[[Maximum], None]:
 
 
 def _describe_climb(fitted: Fit) -> list[str]:
+    """Sentences on searches that were stopped, did not converge, or ended below the best."""
     sentences = []
     if fitted.stopped:
         sentences.append("Stopped before the end: this is the best so far.")
@@ -301,10 +303,12 @@ def _describe_climb(fitted: Fit) -> list[str]:
 
 
 def _describe_boundaries(best: Solution) -> list[str]:
+    """Sentences on numbers at the end of their domain."""
     return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
 
 
 def _describe_forms(solutions: tuple[Solution, ...]) -> list[str]:
+    """Sentences on numbers for which the two forms of the likelihood disagree by more than their errors explain."""
     if len(solutions) < 2:
         return []
     sentences = []

@@ -86,7 +86,7 @@ class Uniformity:
     by_law: bool
 
 
-def changes(
+def compare_filters(
     before: Network, after: Network, measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Change]:
     """Compare every filter that claims a covariance, run over all rows and judged from row `cut` on."""
@@ -95,9 +95,7 @@ def changes(
         for key, old in before.nodes[name].filters.items():
             if old.claim == "none" or not old.received:
                 continue
-            single, other = (
-                _score_expected(filter, z, inputs, cut) for filter in (old, after.nodes[name].filters[key])
-            )
+            single, other = (_predict_rows(filter, z, inputs, cut) for filter in (old, after.nodes[name].filters[key]))
             received = ~np.all(np.isnan(single.white), axis=1)
             gain = (
                 compare_mean((other.log_likelihood - single.log_likelihood)[received])
@@ -108,10 +106,10 @@ def changes(
     return results
 
 
-def uniformity(
+def transform_held_out(
     network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Uniformity]:
-    """Probability integral transforms of each node: by its laws where known, else by its first filter's Gaussians."""
+    """Probability integral transforms of each node: by its laws where known, else by its first filter."""
     uniform = []
     for name, z in measurements.items():
         of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
@@ -124,6 +122,7 @@ def uniformity(
 
 
 def _integrate_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
+    """Transforms of measurements by the laws of its gains in full; None of laws without nodes or with memory."""
     parts = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in parts) or first(node.channel).remembers:
         return None
@@ -133,7 +132,8 @@ def _integrate_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarr
         return None
 
 
-def _score_expected(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
+def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
+    """Run a filter over all rows; return its predictions of those from `cut` on."""
     likelihood, white = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS

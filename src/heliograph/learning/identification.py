@@ -57,7 +57,7 @@ class Identifiability:
 
     def at(self, solution: "Solution") -> "Identifiability":
         """Identifiability with estimates and intervals of what is identified."""
-        return replace(self, sentences=sentences(self, solution))
+        return replace(self, sentences=describe_unidentified(self, solution))
 
     def __str__(self) -> str:
         """Sentences, a line for each."""
@@ -85,7 +85,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
     u = np.zeros((check_count("horizon", horizon), 0)) if inputs is None else np.asarray(inputs, dtype=float)
-    points = _points(description.parameters.start, seed)
+    points = _points_around(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):
         z = _draw_data(objective, x, u, check_seed("seed", seed) + i)
@@ -96,7 +96,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
 def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
     """Identifiability by a recording, at three points around a start."""
-    points = _points(start, seed)
+    points = _points_around(start, seed)
     late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
     if not sound:
@@ -105,7 +105,8 @@ def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed
     return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 
 
-def _points(start: np.ndarray, seed: int) -> list[np.ndarray]:
+def _points_around(start: np.ndarray, seed: int) -> list[np.ndarray]:
+    """Three points at which to look: a start, and two drawn near it."""
     rng = np.random.default_rng([seed, 1])
     return [
         start + rng.uniform(-AROUND, AROUND, len(start)) * np.minimum(1.0, 0.2 + np.abs(start)) for _ in range(POINTS)
@@ -113,21 +114,22 @@ def _points(start: np.ndarray, seed: int) -> list[np.ndarray]:
 
 
 def _judge_identifiability(parameters: Parameters, points: list[np.ndarray], ranks: list[Rank]) -> Identifiability:
+    """Sum up ranks at several points: groups that the data do not separate, and sentences on them."""
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
     identifiability = Identifiability(parameters, groups, ridges, weakest, ())
-    return replace(identifiability, sentences=sentences(identifiability, None))
+    return replace(identifiability, sentences=describe_unidentified(identifiability, None))
 
 
-def sentences(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
+def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
     """Sentences on what is not identified, and on what is in its place."""
     names = identifiability.parameters.coordinates
     lines = [_describe_group(identifiability.parameters, group, solution) for group in identifiability.groups]
     if solution is not None and any(
         group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups
     ):
-        lines += route_sentences(solution)
+        lines += describe_routes(solution)
     if identifiability.weakest < WEAK:
         lines.append(
             f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {identifiability.weakest:.1g}): "
@@ -137,6 +139,7 @@ def sentences(identifiability: Identifiability, solution: "Solution | None") -> 
 
 
 def _describe_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
+    """One sentence on a group of confounded numbers: which sums or products of them the data do tell."""
     names = [parameters.coordinates[i] for i in group.places]
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
     # products or sums that are identified, each with its interval
@@ -144,8 +147,14 @@ def _describe_group(parameters: Parameters, group: Confounded, solution: "Soluti
     if group.fix == len(names):
         return f"Nothing in the data tells {_join_names(names)}."
     outputs = [
-        *(product_text(names, row) + _interval(parameters, group, row, solution, log=True) for row in group.exponents),
-        *(sum_text(names, row) + _interval(parameters, group, row, solution, log=False) for row in group.weights),
+        *(
+            product_text(names, row) + _format_interval(parameters, group, row, solution, log=True)
+            for row in group.exponents
+        ),
+        *(
+            sum_text(names, row) + _format_interval(parameters, group, row, solution, log=False)
+            for row in group.weights
+        ),
     ]
     if not outputs:
         return f"The data tell only {_count_in_words(left, 'combination')} of {_join_names(names)}; {fix}."
@@ -161,7 +170,7 @@ def _count_in_words(count: int, what: str) -> str:
     return f"one {what}" if count == 1 else f"{count} {what}s"
 
 
-def _interval(
+def _format_interval(
     parameters: Parameters, group: Confounded, row: np.ndarray, solution: "Solution | None", log: bool
 ) -> str:
     """Interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum."""
@@ -193,6 +202,7 @@ def _draw_data(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) ->
 
 @quickly_compiled
 def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
+    """Draw a recording from the filter itself: each z from N(E z, S) given those before it."""
     filter = objective.filter(jnp.asarray(x))
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
@@ -214,7 +224,7 @@ if TYPE_CHECKING:
 KINDS = ("mean gain", "gain variance", "noise")
 
 
-def route_sentences(solution: "Solution") -> list[str]:
+def describe_routes(solution: "Solution") -> list[str]:
     """Sentences on the identified mean gain, gain variance and noise of each output, the sensor's noise included."""
     description = solution.surface.objective.description
     _, sensor, channel = joint_world(description.start)

@@ -35,7 +35,7 @@ class LongRun(NamedTuple):
     freedom: float
 
 
-def waves(steps: int) -> int:
+def count_cosines(steps: int) -> int:
     """Number of cosines, nu = floor(0.4 T^(2/3))."""
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
@@ -47,14 +47,14 @@ def find_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np
     tells all. Scores vary over time only where they are told of: cosines that hardly change there see next to nothing.
     """
     stretches = np.concatenate([
-        np.add.reduceat(rows, np.arange(waves(len(rows))) * len(rows) // waves(len(rows)), axis=0)
+        np.add.reduceat(rows, np.arange(count_cosines(len(rows))) * len(rows) // count_cosines(len(rows)), axis=0)
         for rows in information
     ])  # fmt: skip
     stretches = np.maximum(stretches, 0.0)
     return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
 
 
-def of_model(
+def covariance_by_model(
     scores: Scores, hessian: Float[np.ndarray, "p p"], few: Bool[np.ndarray, " p"]
 ) -> tuple[Scores, Float[np.ndarray, "p p"]]:
     """Scores less what is foretold of them by those of a few numbers, and the covariance of that by the model.
@@ -75,7 +75,7 @@ def cosines(scores: Scores) -> LongRun:
     parts, weights = [], []
     for s in scores:
         steps = len(s)
-        count = waves(steps)
+        count = count_cosines(steps)
         g = np.sqrt(1 / (2 * steps)) * scipy.fft.dct(s, axis=0)[1 : count + 1]
         parts.append(steps / count * g.T @ g)
         weights.append((steps, count))
@@ -137,7 +137,7 @@ def quantile(freedom: float, level: float = LEVEL) -> float:
     return float(scipy.stats.t.ppf((1 + level) / 2, freedom))
 
 
-def fall(level: float) -> float:
+def allowed_fall(level: float) -> float:
     """Nats by which the profile of a likelihood has fallen at the ends of an interval: half a chi-square's quantile."""
     return float(scipy.stats.chi2.ppf(level, 1)) / 2
 

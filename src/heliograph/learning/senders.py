@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
 from heliograph.learning.description import Description
-from heliograph.learning.intervals import LEVEL, fall
+from heliograph.learning.intervals import LEVEL, allowed_fall
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.losses.delays import DelaysByNode
 from heliograph.learning.solution import Row
@@ -87,7 +87,7 @@ class SenderFit:
         return "\n".join([*lines, *late, *self.sentences])
 
 
-def decides(network: Network) -> bool:
+def has_deciding_sender(network: Network) -> bool:
     """Return True if a sender of the network decides when to send."""
     return any(isinstance(node, Node) and node.trigger is not None for node in network.nodes.values())
 
@@ -133,7 +133,7 @@ def fit_sender(
     for i in range(len(parameters.entries)):
         row = _row_without_ends(description, x, i)
         try:
-            rows.append(row if stopped else _row(row, description, likelihood, x, total, i))
+            rows.append(row if stopped else _make_row(row, description, likelihood, x, total, i))
         except KeyboardInterrupt:
             stopped = True
             rows.append(row)
@@ -160,7 +160,7 @@ def _search_starts(
     ends = list[tuple[Float[np.ndarray, " p"], float, bool]]()
     try:
         for point in points:
-            ends.append(_highest(noted, np.asarray(point)))
+            ends.append(_climb_simplex(noted, np.asarray(point)))
     except KeyboardInterrupt:
         if seen is None:
             raise
@@ -176,7 +176,7 @@ def filter_at(network: Network) -> AbstractFilter:
     return event_filter(network.plant, node.sensor, node.channel, node.trigger)
 
 
-def _highest(
+def _climb_simplex(
     likelihood: Likelihood,
     start: Float[np.ndarray, " p"],
     enough: float = np.inf,
@@ -208,7 +208,7 @@ def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], inde
     return Row(description.parameters.entries[index].name, estimate, np.nan, np.nan, np.nan, "conditional", False, True)
 
 
-def _row(
+def _make_row(
     row: Row, description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int
 ) -> Row:
     """The row of an estimate, with how far the profile stays near its maximum to either side."""
@@ -217,9 +217,11 @@ def _row(
 
     # The profile at a value, searched from where it was highest at the last one, as far as the two are apart.
     def near(value: float) -> bool:
-        (known, rest), least = last, total - fall(LEVEL)
+        (known, rest), least = last, total - allowed_fall(LEVEL)
         size = float(np.clip(abs(value - known), 10 * NEAR, 0.2))
-        rest, top, _ = _highest(lambda other: likelihood(np.insert(other, coordinate, value)), rest, least, size, NEAR)
+        rest, top, _ = _climb_simplex(
+            lambda other: likelihood(np.insert(other, coordinate, value)), rest, least, size, NEAR
+        )
         last[:] = [value, rest]
         return top > least
 

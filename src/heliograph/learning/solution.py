@@ -11,11 +11,11 @@ from heliograph.learning.intervals import (
     LEVEL,
     Method,
     Scores,
+    allowed_fall,
     block_sums,
-    fall,
+    covariance_by_model,
     find_told_by_few,
     long_run,
-    of_model,
     quantile,
     sandwich,
 )
@@ -152,7 +152,9 @@ class Solution:
     @cached_property
     def rank(self) -> Rank:
         """Flat directions at the maximum, among active coordinates, as many as the ridges."""
-        return cut(self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges)
+        return rank_of_late_rows(
+            self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges
+        )
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
@@ -189,7 +191,7 @@ class Solution:
         scores, known = self.scores, np.zeros((len(self.few), len(self.few)))
         if self.few.any():
             back = np.linalg.inv(self.basis)
-            scores, known = of_model(scores, back.T @ self.hessian @ back, self.few)
+            scores, known = covariance_by_model(scores, back.T @ self.hessian @ back, self.few)
         estimate = long_run(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
             estimate = estimate._replace(covariance=estimate.covariance + self._reduce(known))
@@ -199,10 +201,11 @@ class Solution:
         """Table by this form, computed at the first call."""
         key = method, level
         if key not in self._tables:
-            self._tables[key] = self._new_rows(method, level)
+            self._tables[key] = self._make_rows(method, level)
         return self._tables[key]
 
-    def _new_rows(self, method: Method, level: float) -> tuple[Row, ...]:
+    def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
+        """One row for each entry: at a boundary, not identified, or with an interval by this method."""
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
         values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
         rows = []
@@ -213,11 +216,11 @@ class Solution:
             elif not self.identifies(slope):
                 rows.append(Row(entry.name, float(value), np.nan, np.nan, np.nan, self.form, False, False))
             else:
-                ends = self._ends(entry, float(value), slope, error, freedom, method, level)
-                rows.append(self._row(entry, float(value), error, ends))
+                ends = self._interval_ends(entry, float(value), slope, error, freedom, method, level)
+                rows.append(self._make_row(entry, float(value), error, ends))
         return tuple(rows)
 
-    def _ends(
+    def _interval_ends(
         self,
         entry: Entry,
         value: float,
@@ -234,7 +237,7 @@ class Solution:
         wide = entry.coordinate is not None and self.surface.domains.single[entry.coordinate] and error > WIDE
         if entry.coordinate is not None and (wide or method == "profile"):
             first = min(error, WIDE) * np.array([-2.0, 2.0])
-            low, high = self._cut(entry.coordinate, first, fall(level))
+            low, high = self._cut_profile(entry.coordinate, first, allowed_fall(level))
             return low, high
         center = float(link(entry.domain, value))
         few = entry.coordinate is not None and self.few[np.count_nonzero(self.active[: entry.coordinate])]
@@ -244,7 +247,8 @@ class Solution:
         half = quantile(freedom, level) * error
         return center - half, center + half
 
-    def _row(self, entry: Entry, value: float, error: float, ends: tuple[float, float]) -> Row:
+    def _make_row(self, entry: Entry, value: float, error: float, ends: tuple[float, float]) -> Row:
+        """The row of an identified number, with its interval."""
         least, most = sorted(float(unlink(entry.domain, end)) for end in ends)
         slope = abs(float(unlink_slope(entry.domain, link(entry.domain, value))))
         return Row(entry.name, value, least, most, error * slope, self.form, False, True)
@@ -268,17 +272,17 @@ class Solution:
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]
-        (end,) = self._cut(entry.coordinate, np.array([-outward * FURTHER]), fall(2 * level - 1))
+        (end,) = self._cut_profile(entry.coordinate, np.array([-outward * FURTHER]), allowed_fall(2 * level - 1))
         limit = float(unlink(entry.domain, end)) if np.isfinite(end) else float(unlink(entry.domain, -outward * np.inf))
         return Row(entry.name, value, min(value, limit), max(value, limit), np.nan, self.form, True, True)
 
-    def _cut(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
+    def _cut_profile(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
         """Where the profile of a coordinate has fallen by `drop`, from distances at which to look first."""
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
         return self.surface.crossings(self.top.x, self.total, coordinate, first, furthest, drop, self.active)
 
 
-def cut(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:
+def rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:
     """Rank of the second half's information, with as many flat directions as there are ridges.
 
     What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.

@@ -72,13 +72,13 @@ def samples_to_tell(
     level = float(scalar("error", error, 0.0, 0.5))
     if level in (0.0, 0.5):
         raise fail("error", "a number between 0 and 0.5", level)
-    name, node = _the_node(network)
+    name, node = _only_node(network)
     count = HORIZON if inputs is None else len(np.asarray(inputs))
     # mean and long-run deviation of the ratio under each law
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
     of_laws = []
     for channel, alternative in (channels, channels[::-1]):
-        ratio = _ratios(network, name, node, channel, alternative, inputs, count, seed, nodes)
+        ratio = _draw_likelihood_ratios(network, name, node, channel, alternative, inputs, count, seed, nodes)
         deviation = np.sqrt(np.mean([long_run_deviation(r) ** 2 for r in ratio]))
         of_laws.append((float(ratio.mean()), float(deviation)))
     (gain_a, deviation_a), (gain_b, deviation_b) = of_laws
@@ -88,7 +88,8 @@ def samples_to_tell(
     return SamplesToTell(float(needed), (gain_a, gain_b), (deviation_a, deviation_b))
 
 
-def _the_node(network: Network) -> tuple[str, Node]:
+def _only_node(network: Network) -> tuple[str, Node]:
+    """The network's only node, which receives its sensor through a channel."""
     instance("network", network, Network, "a Network")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(received) != 1 or len(network.nodes) != 1:
@@ -100,7 +101,9 @@ def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Ab
     """Channel with `law` in the place of the gain in question."""
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     laws = [
-        leaf for leaf in jax.tree.leaves(single, is_leaf=_is_law) if _is_law(leaf) and not isinstance(leaf, Constant)
+        leaf
+        for leaf in jax.tree.leaves(single, is_leaf=_is_law_leaf)
+        if _is_law_leaf(leaf) and not isinstance(leaf, Constant)
     ]
     of_pair = [leaf for leaf in laws if any(same(leaf, law) for law in pair)]
     chosen = of_pair or [leaf for leaf in laws if same(leaf, laws[0])]
@@ -110,15 +113,16 @@ def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Ab
     def placed(leaf: object) -> object:
         return law if any(leaf is gain for gain in chosen) else leaf
 
-    changed: AbstractRandomAffine = jax.tree.map(placed, single, is_leaf=_is_law)
+    changed: AbstractRandomAffine = jax.tree.map(placed, single, is_leaf=_is_law_leaf)
     return changed
 
 
-def _is_law(leaf: object) -> bool:
+def _is_law_leaf(leaf: object) -> bool:
+    """Test whether a leaf of a tree is a law of a number."""
     return isinstance(leaf, AbstractLaw)
 
 
-def _ratios(
+def _draw_likelihood_ratios(
     network: Network,
     name: str,
     node: Node,
@@ -129,7 +133,7 @@ def _ratios(
     seed: int,
     nodes: int,
 ) -> np.ndarray:
-    """Log-likelihood ratio log p_true - log p_other of each run and step, of data drawn under the first law."""
+    """Log-likelihood ratio log p_true - log p_other of each run and step, of data drawn under the true law."""
     plain = Node(node.sensor, true, {"open_loop": open_loop_filter(network.plant)})
     world = Network(network.plant, {name: plain})
     z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]

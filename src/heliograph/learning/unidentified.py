@@ -62,18 +62,19 @@ def find_confounded(
     if not count:
         return []
     used = [(x, rank) for x, rank in zip(points, ranks, strict=True) if rank.flat.shape[1] == count]
-    scales = [_scales(parameters, x) for x, _ in used]
+    scales = [_derivatives_by_coordinate(parameters, x) for x, _ in used]
     logs = [
-        _basis(log[:, None] * rank.unit[:, None] * rank.flat) for (_, rank), (_, log) in zip(used, scales, strict=True)
+        _orthonormalise(log[:, None] * rank.unit[:, None] * rank.flat)
+        for (_, rank), (_, log) in zip(used, scales, strict=True)
     ]
     plain = [
-        _basis(slopes[:, None] * rank.unit[:, None] * rank.flat)
+        _orthonormalise(slopes[:, None] * rank.unit[:, None] * rank.flat)
         for (_, rank), (slopes, _) in zip(used, scales, strict=True)
     ]
-    return [_describe_group(group, logs, plain) for group in _groups(logs)]
+    return [_make_confounded(group, logs, plain) for group in _group_connected(logs)]
 
 
-def _scales(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
+def _derivatives_by_coordinate(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives dv/dx and d log|v|/dx of each coordinate that is a number itself; 1 for the others."""
     slopes, log = np.ones(len(x)), np.ones(len(x))
     for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
@@ -83,13 +84,13 @@ def _scales(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndar
     return slopes, np.nan_to_num(log)
 
 
-def _basis(vectors: np.ndarray) -> np.ndarray:
+def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
     """Orthonormal columns."""
     left, size, _ = np.linalg.svd(vectors, full_matrices=False)
     return np.asarray(left[:, size > 1e-12 * max(size.max(initial=0.0), 1e-300)])
 
 
-def _groups(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
+def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
     """Coordinates connected by flat directions at any point."""
     joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
     count, labels = connected_components(joined, directed=False)
@@ -97,19 +98,20 @@ def _groups(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
     return [group for group in groups if joined[group, group].any()]
 
 
-def _describe_group(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
+def _make_confounded(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
+    """A group, with what the data do identify: products of whole powers if those fit all points, else sums."""
     places = list(group)
     size = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
     none = np.zeros((0, len(group)))
-    powers = _everywhere_known([b[places] for b in logs])
+    powers = _rows_known_everywhere([b[places] for b in logs])
     if len(powers):
         powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
         if np.all(np.abs(powers - np.round(powers)) < WHOLE) and np.max(np.abs(powers)) <= LARGEST + WHOLE:
             return Confounded(group, np.round(powers), none, size)
-    return Confounded(group, none, _everywhere_known([b[places] for b in plain]), size)
+    return Confounded(group, none, _rows_known_everywhere([b[places] for b in plain]), size)
 
 
-def _everywhere_known(bases: list[np.ndarray]) -> np.ndarray:
+def _rows_known_everywhere(bases: list[np.ndarray]) -> np.ndarray:
     """Rows orthogonal to the flat directions of all points, reduced."""
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))
@@ -141,8 +143,8 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
 
 def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
     """Text of a product: a * b^2 / c."""
-    above = [_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
-    below = [_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
+    above = [_format_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
+    below = [_format_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
     top = " * ".join(above) or "1"
     return " / ".join([top, *below])
 
@@ -157,5 +159,6 @@ def sum_text(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
     return text
 
 
-def _power(name: str, exponent: float) -> str:
+def _format_power(name: str, exponent: float) -> str:
+    """A factor of a product as text: a, a^2, a^0.5."""
     return name if exponent == 1 else f"{name}^{exponent:g}"

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, MUTED, STYLE, WIDTH, legend_above
-from heliograph.report.outputs import rounded
+from heliograph.report.outputs import round_to
 from heliograph.report.page import Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 
@@ -21,10 +21,10 @@ SHARES = ("50 %", "80 %", "95 %")
 CLAIMED = (0.5, 0.8, 0.95)
 
 
-def backtest_results(found: "heliograph.forecasting.Backtest", network: str) -> Results:
+def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str) -> Results:
     """Return the content of the results folder; `network` is the user's name of the network."""
     return Results(
-        {"coverage": _coverage(found)}, lambda drawings: backtest_page(found, network, drawings), _summary(found)
+        {"coverage": _draw_coverage(found)}, lambda drawings: backtest_page(found, network, drawings), _summarise(found)
     )
 
 
@@ -40,7 +40,7 @@ def doubts_of(found: "heliograph.forecasting.Backtest") -> list[str]:
 
 
 @matplotlib.rc_context(STYLE)
-def _coverage(found: "heliograph.forecasting.Backtest") -> Figure:
+def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
     """Share within the intervals of 80 and 95 % over the horizon, with two standard errors on each side."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     axes = figure.subplots()
@@ -71,26 +71,28 @@ def backtest_page(found: "heliograph.forecasting.Backtest", network: str, drawin
         "Share of what came within the intervals of 80 % (squares) and 95 % (dots), with two standard errors, which "
         "know that forecasts overlap; the lines are what was claimed."
     )
-    parts: list[Picture | Table] = [Picture(drawings["coverage"], caption, caption), _table(found)]
+    parts: list[Picture | Table] = [Picture(drawings["coverage"], caption, caption), _make_score_table(found)]
     none = "No coverage is further from its claim than chance explains."
     said = Points(doubts) if doubts else Text([none])
     return Page(f"Heliograph backtest: {visible(network)}", title, lead,
                 [Section("At a glance", [said]), Section("By horizon", parts)])  # fmt: skip
 
 
-def _table(found: "heliograph.forecasting.Backtest") -> Table:
+def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
+    """All scores, a row for each forecast and horizon, with their standard errors."""
     rows = [
         [visible(f"{s.node}/{s.filter} {s.part} {s.name}"), str(s.horizon), f"{s.compared:,}",
-         rounded(s.rmse, s.mse.error / (2 * s.rmse) if s.rmse > 0 else np.nan), rounded(s.bias.value, s.bias.error),
+         round_to(s.rmse, s.mse.error / (2 * s.rmse) if s.rmse > 0 else np.nan),
+         round_to(s.bias.value, s.bias.error),
          *(f"{share.value:.1%} ± {share.error:.1%}" for share in s.coverage),
-         rounded(s.log_score.value, s.log_score.error), rounded(s.crps.value, s.crps.error)]
+         round_to(s.log_score.value, s.log_score.error), round_to(s.crps.value, s.crps.error)]
         for s in found.scores
     ]  # fmt: skip
     headers = ["forecast of", "ahead", "compared", "RMSE", "bias", *SHARES, "log score", "CRPS"]
     return Table(headers, rows, "**Log score**: the larger the better. **CRPS**: the smaller the better, in its unit.")
 
 
-def _summary(found: "heliograph.forecasting.Backtest") -> dict[str, Json]:
+def _summarise(found: "heliograph.forecasting.Backtest") -> dict[str, Json]:
     """Return all numbers; what is no number is null."""
 
     def plain(value: object) -> Json:

@@ -141,22 +141,23 @@ def map_figure(sites: SiteMap) -> Figure:
 def page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     design = results.design
-    sections = [_result(results), _front(drawings), _powers(results, drawings)]
+    sections = [_result_section(results), _front_section(drawings), _powers_section(results, drawings)]
     if results.map is not None:
-        sections.append(_map(drawings))
+        sections.append(_map_section(drawings))
     return Page(
         kicker="Heliograph design",
-        title=_finding(results),
+        title=_headline(results),
         lead=(
             f"The network {visible(results.reference)} has the error {design.present:.4g} and sends "
             f"{sum(results.before.values()):.4g} as it is. Designed, it has the error {design.error:.4g} and sends "
             f"{design.total:.4g}."
         ),
-        sections=[*sections, _changes(results), _rerun()],
+        sections=[*sections, _changes_section(results), _rerun_section()],
     )
 
 
-def _finding(results: DesignResults) -> str:
+def _headline(results: DesignResults) -> str:
+    """The title: what the design saves, of error and of power."""
     design, before = results.design, sum(results.before.values())
     changed = [f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}"
                for what, now, then in (("error", design.error, design.present), ("power", design.total, before))
@@ -164,7 +165,8 @@ def _finding(results: DesignResults) -> str:
     return f"By design: {' with '.join(changed)}" if changed else "No design is better than the network as it is"
 
 
-def _result(results: DesignResults) -> Section:
+def _result_section(results: DesignResults) -> Section:
+    """Error, power and certificate of the design, beside those of the network as it is."""
     design = results.design
     keys = [
         KeyFigure("error", f"{design.error:.4g}", f"{design.present:.4g} as the network is", BLUE),
@@ -175,12 +177,14 @@ def _result(results: DesignResults) -> Section:
     return Section("The design", [KeyFigures(keys), Text([words])])
 
 
-def _front(drawings: Mapping[str, bytes]) -> Section:
+def _front_section(drawings: Mapping[str, bytes]) -> Section:
+    """The least error over total power, with the lower bound."""
     caption = "The least error found at each total power. Nothing lies in the grey region, whatever is tried."
     return Section("Error against power", [Picture(drawings["front"], "Error falling with total power.", caption)])
 
 
-def _powers(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
+def _powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
+    """Powers by transmitter, before and after, and what one more watt would save at each."""
     after, slope = mean_powers(results.design), results.design.sensitivity
     rows = [
         [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",
@@ -196,12 +200,14 @@ def _powers(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
     return Section("Who sends how much", [picture, Table(headers, rows, caption)])
 
 
-def _map(drawings: Mapping[str, bytes]) -> Section:
+def _map_section(drawings: Mapping[str, bytes]) -> Section:
+    """The map of errors over places for one more."""
     caption = "The least error at the design's total power, with the network standing as the map's function says."
     return Section("Where", [Picture(drawings["map"], "The error over places, with the best one.", caption)])
 
 
-def _changes(results: DesignResults) -> Section:
+def _changes_section(results: DesignResults) -> Section:
+    """What one more transmitter, relay or place would save."""
     unit = results.design.certificate.unit
     rows = [[visible(change.name), f"{change.value:.4g}", f"{change.saved:+.3g}"] for change in results.changes]
     caption = (
@@ -211,7 +217,8 @@ def _changes(results: DesignResults) -> Section:
     return Section("What one more would buy", [Table(("change", unit, "saved"), rows, caption)])
 
 
-def _rerun() -> Section:
+def _rerun_section() -> Section:
+    """How to run the designed network."""
     commands = f"heliograph run {DESIGNED} --measurements data.csv --out estimates.csv"
     text = (
         f"`{DESIGNED}` is the network with these powers and the best linear filters for them; it reads `{SOURCE}`, "

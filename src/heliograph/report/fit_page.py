@@ -53,18 +53,18 @@ class Learned:
 
 def fit_figures(learned: Learned) -> dict[str, Figure]:
     """Return figures by file name: estimates; correlations of innovations before and after; PITs."""
-    drawn = {"estimates": _estimates(learned)}
+    drawn = {"estimates": _draw_estimates(learned)}
     tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
     if tested:
-        drawn["innovations"] = _correlations(tested)
+        drawn["innovations"] = _draw_correlations(tested)
     received = [transforms for transforms in learned.uniform if np.any(~np.isnan(transforms.pit))][:MOST]
     if received:
-        drawn["pits"] = _pits(received)
+        drawn["pits"] = _draw_pits(received)
     return drawn
 
 
 @matplotlib.rc_context(STYLE)
-def _estimates(learned: Learned) -> Figure:
+def _draw_estimates(learned: Learned) -> Figure:
     """Plot each number on its own scale: start, estimates of both forms of the likelihood, intervals."""
     # One panel for each number, since their units differ.
     rows = learned.fit.rows()[:MOST]
@@ -93,7 +93,8 @@ def _estimates(learned: Learned) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
-def _correlations(tested: list[Change]) -> Figure:
+def _draw_correlations(tested: list[Change]) -> Figure:
+    """Correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
     figure, grid = stacked_panels(len(tested), 1.6, 0.7)
     # Correlation of innovations by lag, before and after, with 95 % intervals.
     for axes, change in zip(grid, tested, strict=True):
@@ -114,7 +115,8 @@ def _correlations(tested: list[Change]) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
-def _pits(received: list[Uniformity]) -> Figure:
+def _draw_pits(received: list[Uniformity]) -> Figure:
+    """Histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
     figure, grid = stacked_panels(len(received), 1.5, 0.7)
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]
@@ -135,27 +137,28 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
-        title=_finding(learned),
-        lead=_lead(learned),
+        title=_headline(learned),
+        lead=_summarise_gain(learned),
         sections=[
-            Section("At a glance", _glance(learned)),
-            Section("What was learned", _table(learned, drawings)),
-            Section("What to keep in mind", _words(learned)),
-            *_compare_fits(learned, drawings),
-            *_losses(learned),
-            *_delays(learned),
+            Section("At a glance", _list_key_figures(learned)),
+            Section("What was learned", _estimates_table(learned, drawings)),
+            Section("What to keep in mind", _list_sentences(learned)),
+            *_comparison_sections(learned, drawings),
+            *_losses_section(learned),
+            *_delays_section(learned),
             Section("Use it", [Code("heliograph run DIR/fitted_network.py --measurements data.csv --report report"),
                                Text(["DIR is this folder: `fitted_network.py` loads the numbers of `fitted.json`."])]),
         ],
     )  # fmt: skip
 
 
-def _finding(learned: Learned) -> str:
+def _headline(learned: Learned) -> str:
+    """The title: how many numbers were learned."""
     rows = learned.fit.rows()
     return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"
 
 
-def _lead(learned: Learned) -> str:
+def _summarise_gain(learned: Learned) -> str:
     """Summarise whether the filters predict the held-out rows better than before."""
     whence = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
     outputs = [(change, change.gain) for change in learned.changes if change.gain is not None]
@@ -171,7 +174,8 @@ def _lead(learned: Learned) -> str:
     )
 
 
-def _glance(learned: Learned) -> list[KeyFigures]:
+def _list_key_figures(learned: Learned) -> list[KeyFigures]:
+    """Numbers to remember: how many were learned, from how many rows, and the gain of the first filter."""
     outputs = [row for row in learned.fit.rows() if row.identified]
     keys = [
         KeyFigure("numbers learned", f"{len(outputs)}", f"of {len(learned.fit.rows())} free ones", BLUE),
@@ -185,7 +189,8 @@ def _glance(learned: Learned) -> list[KeyFigures]:
     return [KeyFigures(keys)]
 
 
-def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
+def _estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
+    """Start, estimate and interval of each number, with the figure of these."""
     starts = learned.starts
     # Start, estimate and interval of each number.
     rows = [
@@ -210,14 +215,16 @@ def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Ta
     return [picture, Table(["number", "start", "estimate", "95 %", "form"], rows, caption)]
 
 
-def _words(learned: Learned) -> list[Points | Text]:
+def _list_sentences(learned: Learned) -> list[Points | Text]:
+    """The fit's sentences, as points."""
     said = learned.fit.sentences
     if said:
         return [Points([visible(line) for line in said])]
     return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]
 
 
-def _compare_fits(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
+def _comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
+    """Sections on the held-out rows: each filter before and after, and whether the laws fit."""
     if not learned.changes:
         return []
     # One row for each filter: gain of the log-likelihood, size and correlation of its innovations.
@@ -258,7 +265,7 @@ def _compare_fits(learned: Learned, drawings: Mapping[str, bytes]) -> list[Secti
     return sections
 
 
-def _losses(learned: Learned) -> list[Section]:
+def _losses_section(learned: Learned) -> list[Section]:
     """Describe the statistics of lost measurements, where some were lost."""
     # One row for each law of each node: parameters, and gain on held-out packets.
     rows = []
@@ -280,7 +287,7 @@ def _losses(learned: Learned) -> list[Section]:
     return [Section("How measurements are lost", [table])] if rows else []
 
 
-def _delays(learned: Learned) -> list[Section]:
+def _delays_section(learned: Learned) -> list[Section]:
     """Describe how late the measurements of events were."""
     rows = [
         [visible(node), f"{steps * delays.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]

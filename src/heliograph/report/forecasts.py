@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from heliograph.disk.quoting import visible
 from heliograph.report.figures import COLOURS, MUTED
-from heliograph.report.outputs import rounded
+from heliograph.report.outputs import round_to
 from heliograph.report.page import Table, Text
 from heliograph.simulation.results.record import Record
 
@@ -53,15 +53,16 @@ def forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
     said = f"From what had arrived by the last row, as if nothing arrived any more. {inputs}".strip()
     parts: list[Table | Text] = [Text([said])]
     for node, filters in forecasts.items():
-        parts += [_table(record, f"{node}/{name}", forecast) for name, forecast in filters.items()]
+        parts += [_forecast_table(record, f"{node}/{name}", forecast) for name, forecast in filters.items()]
     return parts
 
 
-def _table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
+def _forecast_table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
+    """Mean and interval of each state and output at some of the horizons, a row each."""
     count = len(forecast.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
     predictions = [("", forecast.states)] + ([] if forecast.outputs is None else [("measured ", forecast.outputs)])
-    headers, columns = ["time"], [[_moment(forecast.time[row]) for row in rows]]
+    headers, columns = ["time"], [[_format_time(forecast.time[row]) for row in rows]]
     for kind, prediction in predictions:
         claims = prediction.claim != "none"
         low, high = prediction.interval(BOTH_SIDES) if claims else (prediction.mean, prediction.mean)
@@ -69,7 +70,9 @@ def _table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast
             headers.append(visible(f"{kind}{number}"))
             columns.append(
                 [
-                    _words(prediction.mean[row, i], low[row, i], high[row, i], prediction.deviation[row, i])
+                    _format_mean_and_interval(
+                        prediction.mean[row, i], low[row, i], high[row, i], prediction.deviation[row, i]
+                    )
                     for row in rows
                 ]
             )
@@ -77,11 +80,13 @@ def _table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast
     return Table(headers, [list(cells) for cells in zip(*columns, strict=True)], caption)
 
 
-def _words(mean: float, low: float, high: float, deviation: float) -> str:
+def _format_mean_and_interval(mean: float, low: float, high: float, deviation: float) -> str:
+    """Mean and interval in words, to two digits of the deviation."""
     if np.isnan(deviation):
         return f"{mean:.4g}"
-    return f"{rounded(mean, deviation)} ({rounded(low, deviation)} to {rounded(high, deviation)})"
+    return f"{round_to(mean, deviation)} ({round_to(low, deviation)} to {round_to(high, deviation)})"
 
 
-def _moment(time: np.generic) -> str:
+def _format_time(time: np.generic) -> str:
+    """A time in words."""
     return str(time)[:19] if isinstance(time, np.datetime64) else f"{time:g}"

@@ -66,7 +66,7 @@ class Health:
                 )
             elif link.contradicts(FALSE / len(self.links)):
                 lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
-        return lines + [line for doubted in self.doubted() for line in self._doubts(doubted)]
+        return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
     def held(self) -> dict[tuple[str, str], str]:
         """Return a line for each output that repeats one value for longer than its noise allows, by node and output."""
@@ -91,14 +91,14 @@ class Health:
             filter
             for filter in self.filters
             if filter.trusted and not (filter.node in nodes or (nodes and filter.node == Network.FUSED))
-            if any(self._doubts(filter))
+            if any(self._describe_doubts(filter))
         ]
 
     def remarks(self) -> list[str]:
         """Return one line for each doubt about a filter that is there to be compared with."""
-        return [line for filter in self.filters if not filter.trusted for line in self._doubts(filter)]
+        return [line for filter in self.filters if not filter.trusted for line in self._describe_doubts(filter)]
 
-    def _doubts(self, health: FilterHealth) -> Iterator[str]:
+    def _describe_doubts(self, health: FilterHealth) -> Iterator[str]:
         """Say which claims innovations contradict: the size of each output's, of all together, and their memory."""
         yield from self._describe_left_out(health)
         if health.test is None:
@@ -111,10 +111,13 @@ class Health:
         # Each output by itself, since a mean over outputs hides the one that is wrong; all together where none is.
         sizes = {e.judged.output: (e.judged.size, e.judged.size_error)
                  for e in outputs if e.judged.summary.received > LAGS}  # fmt: skip
-        wrong = {output: _departure(*size, level / len(sizes)) for output, size in sizes.items()}
+        wrong = {output: _compare_with_claim(*size, level / len(sizes)) for output, size in sizes.items()}
         if not any(wrong.values()):
-            sizes, wrong = {"": (test.power, test.power_error)}, {"": _departure(test.power, test.power_error, level)}
-        for sign, say in ((1, _too_sure), (-1, _too_large)):
+            sizes, wrong = (
+                {"": (test.power, test.power_error)},
+                {"": _compare_with_claim(test.power, test.power_error, level)},
+            )
+        for sign, say in ((1, _say_overconfident), (-1, _say_underconfident)):
             of = [output for output, departure in wrong.items() if departure == sign and not (weighs and sign < 0)]
             if of:
                 yield say(name, of if len(sizes) > 1 else [""], [sizes[output][0] for output in of])
@@ -136,7 +139,7 @@ class Health:
                 )
 
 
-def _departure(size: float, error: float, level: float) -> int:
+def _compare_with_claim(size: float, error: float, level: float) -> int:
     """Return 1 or -1 where a mean square is above or below its claim by its interval and by a tenth; else 0.
 
     The logarithm of a mean square is nearly Gaussian, with its relative error; one that came out small has a small
@@ -153,7 +156,8 @@ def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, 
     return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
 
 
-def _too_sure(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
+def _say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
+    """The sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
     of, times = _name_outputs(outputs, sizes)
     return (
         f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
@@ -161,8 +165,8 @@ def _too_sure(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
     )
 
 
-def _too_large(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """A filter that follows a slow error of its sensor has small innovations and large errors."""
+def _say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
+    """The sentence on a NIS below its interval, which a filter that follows a slow error of its sensor has, too."""
     of, times = _name_outputs(outputs, sizes)
     return (
         f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
@@ -184,16 +188,16 @@ def examine(
         if filter.claim != "none" and filter.received:
             white = whitened_innovations(z, filter, inputs)
             outputs += outputs_of(network, listener, record, inputs)
-            test = _test_of(about_mean(white) if weighs(filter) else white)
+            test = _test_innovations(about_mean(white) if weighs(filter) else white)
         lost = np.any(record.estimates[node][name].claims == "none")
         filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
     others = tuple(belief.words for belief in network.beliefs())
     return Health(
-        record, arrivals_of(network, record.time, record.measurements), filters, outputs, network.shared, others
+        record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
     )
 
 
-def arrivals_of(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
+def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
     """Return when each component arrived, by distinct times: of messages at one time each may be a row.
 
     Args:
@@ -213,7 +217,7 @@ def arrivals_of(network: Network, times: np.ndarray, received: Mapping[str, np.n
     for node, z in received.items():
         receiver = network.nodes[node]
         declared, may_be_lost = None, not receiver.complete
-        shares = _state_shares(receiver) if isinstance(receiver, Node) else None
+        shares = _arrival_shares(receiver) if isinstance(receiver, Node) else None
         if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
             declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
         for i, name in enumerate(receiver.received_names):
@@ -234,7 +238,7 @@ def about_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps 
     return np.asarray(white - np.nansum(white, axis=0) / there)
 
 
-def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
+def _test_innovations(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     """Test the innovations of one filter, from each message to the next; None of too few, or of nothing but zeros."""
     came = white[~np.isnan(white).all(axis=1)]
     lags = min(LAGS, len(came) // 10)
@@ -243,7 +247,7 @@ def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     return MemoryTest.of(came, lags, claimed=True)
 
 
-def _state_shares(receiver: Node) -> Float[np.ndarray, " received"] | None:
+def _arrival_shares(receiver: Node) -> Float[np.ndarray, " received"] | None:
     """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):

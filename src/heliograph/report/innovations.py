@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, stacked_panels
 from heliograph.report.health import FilterHealth, Health
-from heliograph.report.outputs import rounded
+from heliograph.report.outputs import round_to
 from heliograph.report.page import Choice, Picture, Section, Table, Text
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
@@ -38,7 +38,7 @@ def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
 def innovations_figure(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     """Draw the innovations of each filter over time, in claimed deviations, with lines at two of them."""
     figure, grid = stacked_panels(len(tested), 1.5, 0.6)
-    names = _components(health)
+    names = _name_components(health)
     for axes, judged in zip(grid, tested, strict=True):
         white = np.asarray(judged.white)
         # A colour for each output; of more outputs than colours, such as a centre's, one for all.
@@ -52,11 +52,11 @@ def innovations_figure(health: Health, tested: Sequence[FilterHealth]) -> Figure
         axes.set_title(quote_for_figure(f"{judged.node}/{judged.filter}"))
         axes.set_ylabel("in deviations")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, markerscale=2)
-    time_axis(health.record, grid[-1])
+    label_time_axis(health.record, grid[-1])
     return figure
 
 
-def _components(health: Health) -> dict[str, list[str]]:
+def _name_components(health: Health) -> dict[str, list[str]]:
     """Return the names of the measurement's components by node; of a central filter those of all nodes."""
     names: dict[str, list[str]] = {}
     for link in health.links:
@@ -87,8 +87,8 @@ def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Sectio
             f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
             "fuses are tested here, and itself on the live page of `heliograph serve`."
         )
-    missing = not_drawn(left, "Their numbers are in the table.")
-    return Section("Innovations", [Text([text]), table, *chosen(pictures), *missing, *_outputs_table(health)])
+    missing = say_not_drawn(left, "Their numbers are in the table.")
+    return Section("Innovations", [Text([text]), table, *choose_picture(pictures), *missing, *_outputs_table(health)])
 
 
 def _tests_table(health: Health) -> Table:
@@ -127,8 +127,8 @@ def _outputs_table(health: Health) -> list[Table]:
         doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
         half = (s.bias_high - s.bias_low) / 2
         error = half / 1.96
-        bias = f"{rounded(s.bias, error)} ± {rounded(half, error)}"
-        size = f"{rounded(judged.size, judged.size_error)} ± {rounded(1.96 * judged.size_error, judged.size_error)}"
+        bias = f"{round_to(s.bias, error)} ± {round_to(half, error)}"
+        size = f"{round_to(judged.size, judged.size_error)} ± {round_to(1.96 * judged.size_error, judged.size_error)}"
         said = ["to blame"] * judged.to_blame + ["stuck"] * (judged.held is not None)
         rows.append([output.name, f"{s.received} of {s.expected}", doubted, bias, size, ", ".join(said)])
     caption = (
@@ -141,7 +141,7 @@ def _outputs_table(health: Health) -> list[Table]:
     return [Table(["filter: output", "received", "down-weighted", "bias", "size", ""], rows, caption)] if rows else []
 
 
-def chosen(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
+def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
     """Return pictures by node one below the other, or as a choice where there are many."""
     return (
         [*pictures.values()]
@@ -150,14 +150,14 @@ def chosen(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
     )
 
 
-def not_drawn(names: Sequence[str], where: str) -> list[Text]:
+def say_not_drawn(names: Sequence[str], where: str) -> list[Text]:
     """Return what a figure leaves out for lack of room, by name, and where its numbers are."""
     if not names:
         return []
     return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]
 
 
-def time_axis(record: Record, axes: Axes) -> None:
+def label_time_axis(record: Record, axes: Axes) -> None:
     """Name the axis of time, with its unit."""
     units, dated = record.units, record.time.dtype.kind == "M"
     axes.set_xlabel(

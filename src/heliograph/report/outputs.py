@@ -64,7 +64,7 @@ def _rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]
     return {state: e / (2 * rmse[state]) if rmse[state] > 0 else np.nan for state, e in zip(rmse, means, strict=True)}
 
 
-def rounded(value: float, error: float) -> str:
+def round_to(value: float, error: float) -> str:
     """Return a number to two digits of its standard error, to four digits without one."""
     if not (np.isfinite(value) and 0 < error < np.inf):
         return f"{value:.4g}"
@@ -171,12 +171,12 @@ def outputs_of(network: Network, listener: Listener, record: Record, inputs: np.
         outcome = listener.filter.run(listener.measurements, inputs)
         variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
         innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
-    medians = law_medians(network, listener.node, _typical(np.asarray(innovations.variance)))
+    medians = law_medians(network, listener.node, _median_over_time(np.asarray(innovations.variance)))
     judged = judge_outputs(listener.outputs, listener.measurements, innovations, medians, weighed and listener.blames)
     return [OutputHealth(listener.node, listener.name, weighed, output) for output in judged]
 
 
-def _typical(variance: np.ndarray) -> np.ndarray:
+def _median_over_time(variance: np.ndarray) -> np.ndarray:
     """Median over time by output; 0 where none arrived."""
     came = ~np.isnan(variance)
     return np.array([np.median(column[there]) if there.any() else 0.0

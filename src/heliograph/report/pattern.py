@@ -26,7 +26,7 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
     may be lost: what arrives in the due rows is looked at again, so that the pattern is the finest that can be told.
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
-    while (places := _places(arrived[rows])) is not None:
+    while (places := _least_probable_rows(arrived[rows])) is not None:
         # A pattern among `due` of each `length` rows: both as far as the whole returns.
         turns = len(places) // np.gcd(due, len(places))
         due, length = int(places.sum()) * due * turns // len(places), length * turns
@@ -34,7 +34,7 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
     return None if length == 1 else Pattern(due, length, rows)
 
 
-def _places(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
+def _least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
     """Return which of the first rows are due, of the pattern that chance makes least; None of what chance may make."""
     came = np.flatnonzero(arrived)
     intervals = np.diff(came)

@@ -73,7 +73,7 @@ class Countdown:
         return max(pace * (total - self.last[0]) - (self.clock() - self.last[1]), 0.0)
 
 
-def spoken(seconds: float | None) -> str:
+def format_remaining(seconds: float | None) -> str:
     """Put a remaining time into words."""
     if seconds is None:
         return "time left unknown yet"
@@ -84,7 +84,7 @@ def spoken(seconds: float | None) -> str:
 
 
 @contextmanager
-def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
+def show_countdown(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar on stderr with the time left, or print a line each minute where stderr is no terminal.
 
     The context provides a function of (what is being done, how much is done, how much there is). The caller also has to
@@ -103,7 +103,7 @@ def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
         def show(what: str, done: int, total: int) -> None:
             nonlocal said
             # Remaining time, once the countdown has a first piece.
-            left = "" if countdown.first is None else spoken(countdown.left(total))
+            left = "" if countdown.first is None else format_remaining(countdown.left(total))
             bar.update(task, description=what, completed=done, total=total, left=left)
             if not bar.console.is_terminal and time.monotonic() - said >= LINE_EVERY:
                 said = time.monotonic()
@@ -117,7 +117,7 @@ def show_progress(what: str = "simulating") -> Iterator[Callable[[int, int], Non
     """Show a progress bar with the time left, for `monte_carlo(..., progress=...)`."""
     countdown = Countdown()
     countdown.note(0)
-    with counting(countdown) as show:
+    with show_countdown(countdown) as show:
 
         def progressed(done: int, total: int) -> None:
             countdown.note(done)

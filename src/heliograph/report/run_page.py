@@ -19,14 +19,14 @@ from heliograph.report.innovations import (
     COLOURS,
     LOOK,
     MOST,
-    chosen,
+    choose_picture,
     innovations_figure,
     innovations_section,
-    not_drawn,
+    label_time_axis,
+    say_not_drawn,
     tested_by_figure,
-    time_axis,
 )
-from heliograph.report.outputs import errors_of, output_numbers, rounded
+from heliograph.report.outputs import errors_of, output_numbers, round_to
 from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.position_map import coordinates_of, map_figure
 from heliograph.report.results import Json, Results, write_into
@@ -38,7 +38,7 @@ FIRST = ("links", "innovations", "innovations_0", "map", "estimates_0")  # figur
 DOUBTS = 3  # that the page shows; `summary.json` has all
 
 
-def run_results(health: Health, network: str) -> Results:
+def make_run_results(health: Health, network: str) -> Results:
     """Return the content of the results folder; `network` is the user's name of the network."""
     return Results(run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None)
 
@@ -51,13 +51,14 @@ def results_of_plants(examined: Mapping[str, Health], network: str) -> Results:
         for plant, health in examined.items():
             place = folder / folders[plant]
             place.mkdir()
-            write_into(run_results(health, f"{network}, {plant}"), place)
+            write_into(make_run_results(health, f"{network}, {plant}"), place)
 
     summary: dict[str, Json] = {plant: run_summary(health) for plant, health in examined.items()}
-    return Results({}, lambda _: _overview(examined, network, folders), summary, write)
+    return Results({}, lambda _: _make_overview(examined, network, folders), summary, write)
 
 
-def _overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
+def _make_overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
+    """The page of several plants: how many rows each has and what is doubted there, the most doubted first."""
     doubts = {plant: health.warnings() for plant, health in examined.items()}
     worst = sorted(examined, key=lambda plant: len(doubts[plant]), reverse=True)
     rows = []
@@ -82,17 +83,17 @@ def run_figures(health: Health) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
     if coordinates_of(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
-            node = _nodes(record)[0]
-            drawn[_map_of(kind)] = map_figure(record, node, list(record.estimates[node])[: len(COLOURS)])
+            node = _nodes_to_draw(record)[0]
+            drawn[_map_name(kind)] = map_figure(record, node, list(record.estimates[node])[: len(COLOURS)])
     for kind, record in _collect_estimates(health):
-        drawn |= {f"{kind}_{i}": _estimates(health, record, node) for i, node in enumerate(_nodes(record))}
+        drawn |= {f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_nodes_to_draw(record))}
     drawn |= {name: innovations_figure(health, tested) for name, tested in tested_by_figure(health).items()}
     if health.links:
-        drawn["links"] = _links(health)
+        drawn["links"] = _draw_deliveries(health)
     return drawn
 
 
-def _map_of(kind: str) -> str:
+def _map_name(kind: str) -> str:
     """Return the name of the map of filtered or of smoothed estimates."""
     return "map" if kind == "estimates" else f"map_{kind}"
 
@@ -103,7 +104,7 @@ def _collect_estimates(health: Health) -> list[tuple[str, Record]]:
     return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
 
 
-def _nodes(record: Record) -> list[str]:
+def _nodes_to_draw(record: Record) -> list[str]:
     """Return the nodes that are drawn, the fused estimate first."""
     return _sort_nodes(record)[:MOST]
 
@@ -115,19 +116,21 @@ def _sort_nodes(record: Record) -> list[str]:
 
 
 @matplotlib.rc_context(LOOK)
-def _estimates(health: Health, record: Record, node: str) -> Figure:
+def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
+    """Draw a node's estimates with their bands, one panel a state, and its forecasts behind them."""
     figure, grid = stacked_panels(len(record.states), 1.7, 0.8)
     names = list(record.estimates[node])[: len(COLOURS)]
     record.plot(node, names, axes=grid, sigmas=BAND)
     if record is health.record:
         draw_forecasts(grid, record, node, health.forecasts.get(node, {}), names, BAND)
     legend_above(figure, grid[0])
-    time_axis(health.record, grid[-1])
+    label_time_axis(health.record, grid[-1])
     return figure
 
 
 @matplotlib.rc_context(LOOK)
-def _links(health: Health) -> Figure:
+def _draw_deliveries(health: Health) -> Figure:
+    """Draw when each component arrived and when it was lost, a line each."""
     links = health.links[:MOST]
     figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
     axes = figure.subplots()
@@ -136,22 +139,22 @@ def _links(health: Health) -> Figure:
         came = link.time[link.arrived]
         axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
         axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
-    names = [quote_for_figure(f"{link.node}: {link.component}{_share(link, ' ({:.0%})', '')}") for link in links]
+    names = [quote_for_figure(f"{link.node}: {link.component}{_format_share(link, ' ({:.0%})', '')}") for link in links]
     axes.set_yticks(range(len(links)), names)
     axes.set_ylim(len(links) - 0.5, -0.5)
     axes.grid(visible=False)
-    time_axis(health.record, axes)
+    label_time_axis(health.record, axes)
     return figure
 
 
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG, of which those stay that fit into a page."""
-    record, doubts, drawings = health.record, health.warnings(), within(drawings, PAGE)
+    record, doubts, drawings = health.record, health.warnings(), limit_size(drawings, PAGE)
     shares = [link.share for link in health.links if link.due is not None]
     arrived = f"{np.mean(shares):.1%}" if shares else "–"
     # Three numbers to remember.
     keys = [
-        KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
+        KeyFigure("rows", f"{len(record.time):,}", _describe_span(record.time), BLUE),
         KeyFigure(
             "arrived", arrived, f"of what {_count_in_words(len(record.measurements), 'node')} should receive", GREEN
         ),
@@ -160,23 +163,23 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     # The result is the title; doubts follow it.
     return Page(
         kicker=f"Heliograph run: {visible(network)}",
-        title=_finding(health),
-        lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_span(record.time)}. "
-        + _agreement(health, doubts),
+        title=_headline(health),
+        lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_describe_span(record.time)}. "
+        + _describe_agreement(health, doubts),
         sections=[
             Section(
                 "At a glance",
-                [KeyFigures(keys), *_show_doubts(doubts), *_show_compared(health), *_show_premises(health)],
+                [KeyFigures(keys), *_list_doubts(doubts), *_list_baseline_remarks(health), *_list_premises(health)],
             ),
-            Section("Estimates", [*errors_table(record), *_pictures(health, drawings)]),
+            Section("Estimates", [*errors_table(record), *_list_pictures(health, drawings)]),
             *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
             innovations_section(health, drawings),
-            Section("Links", _health(health, drawings)),
+            Section("Links", _links_section(health, drawings)),
         ],
     )
 
 
-def within(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
+def limit_size(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
     """Return the drawings in their order that together have at most `limit` bytes; pages hold them by 4/3 of that."""
     kept, size = dict[str, bytes](), 0
     for name in sorted(drawings, key=lambda name: name in FIRST, reverse=True):
@@ -186,10 +189,10 @@ def within(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
     return kept
 
 
-def _finding(health: Health) -> str:
+def _headline(health: Health) -> str:
     """Return the last estimate of the filter that the network relies on: its first two states, or its position."""
     record = health.record
-    node = _nodes(record)[0] if _nodes(record) else None
+    node = _nodes_to_draw(record)[0] if _nodes_to_draw(record) else None
     if node is None:
         return f"{len(record.time):,} rows were read"
     trusted = {filter.filter for filter in health.filters if filter.trusted and filter.node == node}
@@ -200,29 +203,29 @@ def _finding(health: Health) -> str:
     shown = coordinates_of(record.states) or tuple(range(min(len(mean), 2)))
     numbers = []
     for i in shown:
-        band = f" ± {rounded(BAND * deviation[i], deviation[i])}" if estimate.claim != "none" else ""
+        band = f" ± {round_to(BAND * deviation[i], deviation[i])}" if estimate.claim != "none" else ""
         state, unit = record.states[i], record.units.get(record.states[i], "")
-        numbers.append(f"{visible(state)} {rounded(mean[i], deviation[i])}{band} {visible(unit)}".strip())
+        numbers.append(f"{visible(state)} {round_to(mean[i], deviation[i])}{band} {visible(unit)}".strip())
     return f"{', '.join(numbers)} at the end, by {visible(name)}"
 
 
-def _pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | Choice | Text]:
+def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | Choice | Text]:
     """Return the map of a position if there is one, the estimates by node, then the smoothed ones if there are any."""
     pictures: list[Picture | Choice | Text] = []
     for kind, record in _collect_estimates(health):
         added = ", given later data too" if kind == "smoothed" else ""
-        if (name := _map_of(kind)) in drawings:
-            text = f"The path that {visible(_nodes(record)[0])} estimates{added}"
+        if (name := _map_name(kind)) in drawings:
+            text = f"The path that {visible(_nodes_to_draw(record)[0])} estimates{added}"
             pictures.append(Picture(drawings[name], text, f"{text}, with ellipses of {BAND:g} claimed deviations."))
-        pictures += chosen({
+        pictures += choose_picture({
             node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
                           f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
                           f"side{added}.")
-            for i, node in enumerate(_nodes(record)) if f"{kind}_{i}" in drawings
+            for i, node in enumerate(_nodes_to_draw(record)) if f"{kind}_{i}" in drawings
         })  # fmt: skip
-        absent = [node for i, node in enumerate(_nodes(record)) if f"{kind}_{i}" not in drawings]
-        pictures += not_drawn(absent, f"Their figures are files beside this page ({kind}_0.svg and on).")
-        pictures += not_drawn(_sort_nodes(record)[MOST:], "Their estimates are in the record.")
+        absent = [node for i, node in enumerate(_nodes_to_draw(record)) if f"{kind}_{i}" not in drawings]
+        pictures += say_not_drawn(absent, f"Their figures are files beside this page ({kind}_0.svg and on).")
+        pictures += say_not_drawn(_sort_nodes(record)[MOST:], "Their estimates are in the record.")
     return pictures
 
 
@@ -230,8 +233,8 @@ def errors_table(record: Record) -> list[Table]:
     """Return the errors of each filter where the recording has the true state."""
     rows = [
         [visible(f"{errors.node}/{errors.filter}"), errors.claim,
-         *(rounded(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
-         "–" if np.isnan(errors.nees) else rounded(errors.nees, errors.nees_error)]
+         *(round_to(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
+         "–" if np.isnan(errors.nees) else round_to(errors.nees, errors.nees_error)]
         for errors in errors_of(record)
     ]  # fmt: skip
     # What the columns are, in words.
@@ -252,7 +255,8 @@ def _make_header(state: str, units: Mapping[str, str]) -> str:
     return f"{state} ({units[state]})" if state in units else state
 
 
-def _agreement(health: Health, doubts: list[str]) -> str:
+def _describe_agreement(health: Health, doubts: list[str]) -> str:
+    """How many doubts there are about the network, or that there are none, in words."""
     if doubts:
         return f"There {'is' if len(doubts) == 1 else 'are'} {_count_in_words(len(doubts), 'doubt')} about the network."
     tested = any(tested_filter.test is not None for tested_filter in health.filters)
@@ -264,13 +268,14 @@ def _count_in_words(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def _span(time: np.ndarray) -> str:
+def _describe_span(time: np.ndarray) -> str:
+    """The time that the recording covers, in words."""
     if time.dtype.kind == "M":
         return f"{str(time[0])[:19]} to {str(time[-1])[:19]} UTC"
     return f"from {time[0]:g} to {time[-1]:g}"
 
 
-def _show_doubts(doubts: list[str]) -> list[Points | Text]:
+def _list_doubts(doubts: list[str]) -> list[Points | Text]:
     """Return the doubts that matter most, and where the others are."""
     if not doubts:
         return [Text(["No doubts."])]
@@ -278,27 +283,28 @@ def _show_doubts(doubts: list[str]) -> list[Points | Text]:
     return [Points([visible(line) for line in doubts[:DOUBTS]]), *([Text([more])] if len(doubts) > DOUBTS else [])]
 
 
-def _show_compared(health: Health) -> list[Text | Points]:
-    """Return what the recording says of filters that are there to be compared with; it is no doubt of the network."""
+def _list_baseline_remarks(health: Health) -> list[Text | Points]:
+    """Return what the recording says of baselines, filters to compare with; it is no doubt of the network."""
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []
 
 
-def _show_premises(health: Health) -> list[Text | Points]:
+def _list_premises(health: Health) -> list[Text | Points]:
     """Return the filters that were made for another world than that of their node."""
     text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []
 
 
-def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
+def _links_section(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
+    """Each link: when it is due, what arrived, its longest gap, and mean and deviation of its values."""
     rows = []
     for link in health.links:
-        mean, deviation = _moments(link.values)
+        mean, deviation = _format_mean_and_deviation(link.values)
         known = "may be lost" if link.may_be_lost else "never lost"
         name = visible(f"{link.node}: {link.component}")
         gap = "–" if link.due is None else str(link.longest_gap)
-        rows.append([name, link.due_in, _share(link, "{:.1%}", "–"), gap, known, mean, deviation])
+        rows.append([name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, known, mean, deviation])
     headers = ["received", "due", "arrived", "longest gap", "the network says", "mean", "std. deviation"]
     unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
     slower = (
@@ -312,7 +318,7 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     caption = f"When each component {' and when it '.join(parts)}." + ("" if lost else " None is missing.")
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
     left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
-    missing = not_drawn(left, "Their numbers are in the table.")
+    missing = say_not_drawn(left, "Their numbers are in the table.")
     return [
         Table(headers, rows, slower if any(link.due_in != "each row" for link in health.links) else ""),
         *picture,
@@ -321,18 +327,18 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     ]
 
 
-def _share(link: Arrivals, form: str, unknown: str) -> str:
+def _format_share(link: Arrivals, form: str, unknown: str) -> str:
     """Return the share that arrived in this form, or what stands for it where nobody knows how many were due."""
     return unknown if link.due is None else form.format(link.share)
 
 
-def _moments(values: np.ndarray) -> tuple[str, str]:
+def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
     """Return mean and deviation of a component, each to two digits of its standard error."""
     if len(values) < 2:
         return (f"{values[0]:.4g}" if len(values) else "–"), "–"
     deviation = float(values.std())
     error = deviation / len(values) ** 0.5
-    return rounded(float(values.mean()), error), rounded(deviation, error / 2**0.5)
+    return round_to(float(values.mean()), error), round_to(deviation, error / 2**0.5)
 
 
 def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:

@@ -41,11 +41,15 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     if not len(several):
         raise fail("recordings", "at least one", "none")
     # every run of every recording, then all filled up to the longest
-    parts = [run for i, single in enumerate(several) for run in _parts(network, single, _inputs_of(inputs, i, several))]
+    parts = [
+        run
+        for i, single in enumerate(several)
+        for run in _split_runs(network, single, _pick_inputs(inputs, i, several))
+    ]
     for z, _ in parts:
         network.check_horizon(len(z))
     longest = max(len(z) for z, _ in parts)
-    true = [] if truth is False else _truths(network, several, truth, [len(z) for z, _ in parts])
+    true = [] if truth is False else _split_truth(network, several, truth, [len(z) for z, _ in parts])
     data = Data(
         np.stack([_pad_rows(z, longest, np.nan) for z, _ in parts]),
         np.stack([_pad_rows(u, longest, None) for _, u in parts]),
@@ -56,7 +60,8 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
     return data
 
 
-def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
+def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> object:
+    """Inputs of one recording of several: those in its place in a list, or the common ones."""
     if not isinstance(inputs, list | tuple):
         return inputs
     if len(inputs) != len(several):
@@ -64,7 +69,7 @@ def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
     return inputs[index]
 
 
-def _truths(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
+def _split_truth(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
     """True states (steps, n) of each run of each recording, NaN where they are not known.
 
     Raises:
@@ -86,7 +91,7 @@ def _truths(network: Network, several: Sequence[object], truth: Any, steps: list
             for run, count in zip(runs, steps, strict=True)]  # fmt: skip
 
 
-def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
     held = getattr(recording, "measurements", recording)
     known = getattr(recording, "inputs", None) if inputs is None else inputs
@@ -105,7 +110,7 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
         tables = {f"measurements of {name!r}": z for name, z in held.items()} | {"inputs": known}
         judge_dates(network.inputs, tables)
     # each run: the nodes' columns side by side, and the inputs
-    runs = _runs([np.asarray(fill_masked(held[name])) for name in network.names])
+    runs = _list_runs([np.asarray(fill_masked(held[name])) for name in network.names])
     results = []
     for run in runs:
         columns: list[np.ndarray] = []
@@ -122,7 +127,7 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
     return results
 
 
-def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
+def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
     """Runs of a simulation one by one; a recording is one."""
     if all(value.ndim == 3 for value in values):
         return [list(run) for run in zip(*values, strict=True)]
@@ -137,6 +142,7 @@ def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarr
 
 
 def _check_enough(data: Data, free: int) -> None:
+    """Refuse recordings with too few numbers for so many free ones, or of which nothing varies."""
     z = data.measurements if data.truth is None else data.truth
     count = int(np.count_nonzero(~np.isnan(z)))
     if count < FEWEST * free:

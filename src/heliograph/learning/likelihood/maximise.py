@@ -117,20 +117,21 @@ def maximise(
     moving = np.ones(start.shape, dtype=bool) if active is None else active
     domains = Domains.unbounded(start.shape[1]) if domains is None else domains
     with np.errstate(all="ignore"):
-        state = _begin(evaluate, start, moving, domains, close)
+        state = _init_lanes(evaluate, start, moving, domains, close)
         for count in range(MOST_STEPS):
             best = Maximum(state.x, state.total, state.gradient, state.converged, state.remaining, count)
             if watch is not None:
                 watch(best)
             if state.done.all():
                 return best
-            state = _step(evaluate, state, moving, domains, close)
+            state = _step_lanes(evaluate, state, moving, domains, close)
     return Maximum(state.x, state.total, state.gradient, state.converged, state.remaining, MOST_STEPS)
 
 
-def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: Domains, close: float) -> _State:
+def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: Domains, close: float) -> _State:
+    """Evaluate all starts; lanes whose likelihood or slope is no number there are done."""
     total, gradient, information = evaluate(start)
-    impossible = ~_is_sound(total, gradient, information, moving)
+    impossible = ~_is_finite(total, gradient, information, moving)
     lanes = len(start)
     state = _State(
         start.copy(),
@@ -146,7 +147,8 @@ def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: D
     return _mark_arrived(state, moving, domains, close)
 
 
-def _is_sound(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
+def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Test by lane whether likelihood, gradient and information are numbers."""
     pairs = moving[:, :, None] & moving[:, None, :]
     derivatives = np.all(np.isfinite(gradient) | ~moving, axis=1)
     return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
@@ -155,7 +157,7 @@ def _is_sound(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, 
 def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
     """Mark lanes that have arrived, and those that are stuck because rounding hides what is left to gain."""
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
-    remaining = np.where(state.done, state.remaining, gain_of(state.gradient, state.information, counting) / 2)
+    remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
     stuck = state.radius < SMALLEST_RADIUS
     arrived = ~state.done & (2 * remaining < np.where(stuck, NEAR, close))
     return state._replace(remaining=remaining, done=state.done | stuck | arrived, converged=state.converged | arrived)
@@ -171,7 +173,8 @@ def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Boo
     return np.asarray((outward != 0) & (rise >= 0) & (rise < AT_LIMIT))
 
 
-def _step(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
+def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
+    """Take one trust-region step in every lane: propose, evaluate, accept or not, then adapt radius and model."""
     going = ~state.done
     counting = moving & ~find_at_limits(state.x, state.gradient, domains)
     step, length, foretold = trust_region_step(state.gradient, state.information, state.model, state.radius, counting,
@@ -180,10 +183,10 @@ def _step(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domain
     total, gradient, information = _evaluate_lanes(evaluate, tried, going, state)
     # taken where the likelihood rises; where rounding hides that, if the gradient falls or the step crosses a plateau
     gain = total - state.total
-    sound = going & _is_sound(total, gradient, information, moving)
+    sound = going & _is_finite(total, gradient, information, moving)
     far = length > 0.9 * state.radius
     hidden = foretold < NOISE * np.abs(state.total)
-    fell = gain_of(gradient, information, counting) < gain_of(state.gradient, state.information, counting)
+    fell = expected_gain(gradient, information, counting) < expected_gain(state.gradient, state.information, counting)
     taken = sound & np.where(hidden, (fell | far) & (gain >= -NOISE * np.abs(total)), gain > 1e-4 * foretold)
     # radius by how well the gain was foretold
     well = taken & ((gain > 0.75 * foretold) | hidden)
@@ -227,7 +230,7 @@ def _model_hessian(
     """Model of the Hessian at the end of a step: the information, or the last model corrected by the step (SR1)."""
     # y = B+ p with the change of the gradient y: B+ = B + r r' / r' p, r = y - B p
     base = np.nan_to_num(state.model)
-    wrong = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - _times(base, step)
+    wrong = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - _multiply_lanes(base, step)
     diagonal = np.diagonal(state.information, axis1=1, axis2=2)
     wrong = np.where(domains.free | (diagonal > INVISIBLE), wrong, 0.0)  # elsewhere y is but rounding
     along = np.sum(wrong * step, axis=1)
@@ -239,8 +242,8 @@ def _model_hessian(
     )
     # of the two the one that would have foretold this gain
     slope = np.sum(state.gradient * step, axis=1)
-    by_model = slope - np.sum(step * _times(base, step), axis=1) / 2
-    by_information = slope - np.sum(step * _times(np.nan_to_num(state.information), step), axis=1) / 2
+    by_model = slope - np.sum(step * _multiply_lanes(base, step), axis=1) / 2
+    by_information = slope - np.sum(step * _multiply_lanes(np.nan_to_num(state.information), step), axis=1) / 2
     now = np.where(taken[:, None, None], information, state.information)
     believe = sound & (np.abs(gain - by_model) <= np.abs(gain - by_information))
     return np.where((believe | ~sound)[:, None, None], np.where(sound[:, None, None], secant, base), now)
@@ -265,9 +268,9 @@ def trust_region_step(
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
     g = np.nan_to_num(gradient) * unit
-    b = _scale(model, unit)
+    b = _scale_both_sides(model, unit)
     sane = np.all(np.abs(b) < LARGEST, axis=(1, 2))  # NaN is not
-    b = np.where(sane[:, None, None], b, _scale(information, unit))
+    b = np.where(sane[:, None, None], b, _scale_both_sides(information, unit))
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
     # s: none at first, or what makes the matrix positive
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
@@ -283,7 +286,7 @@ def trust_region_step(
         shift = np.where(beyond, shift + newton, shift)
     inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
     step, length = step * inside[:, None], length * inside
-    foretold = np.sum(step * (g - _times(b, step) / 2), axis=1)
+    foretold = np.sum(step * (g - _multiply_lanes(b, step) / 2), axis=1)
     return step * unit, length, foretold
 
 
@@ -293,15 +296,15 @@ def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.nd
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
     except np.linalg.LinAlgError:  # a pivot that is exactly 0
-        return _times(np.linalg.pinv(matrix, ROUNDING, hermitian=True), right)
+        return _multiply_lanes(np.linalg.pinv(matrix, ROUNDING, hermitian=True), right)
 
 
-def gain_of(
+def expected_gain(
     gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
 ) -> Float[np.ndarray, " lanes"]:
     """g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
     unit, _ = _units_and_flat(information, counting)
-    scaled = _scale(information, unit)
+    scaled = _scale_both_sides(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
     return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
@@ -312,16 +315,17 @@ def _units_and_flat(information: np.ndarray, moving: np.ndarray) -> tuple[np.nda
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     there = moving & (diagonal > LEAST) & np.isfinite(diagonal)
     unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 0.0)
-    scaled = _scale(information, unit)
+    scaled = _scale_both_sides(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * there[:, :, None]
 
 
-def _scale(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
+def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
     stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
     return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])
 
 
-def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def _multiply_lanes(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """A x of each lane."""
     return np.asarray(np.einsum("lij,lj->li", matrix, vector))

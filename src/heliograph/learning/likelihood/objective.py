@@ -112,14 +112,15 @@ class Objective:
     form: Form
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Objective) and same(self._parts(), other._parts())
+        return isinstance(other, Objective) and same(self._list_distinctions(), other._list_distinctions())
 
     def __hash__(self) -> int:
-        return hash((_source(self.description.build)[0], self.form))
+        return hash((_identity_of(self.description.build)[0], self.form))
 
-    def _parts(self) -> tuple[object, ...]:
+    def _list_distinctions(self) -> tuple[object, ...]:
+        """All by which one objective may differ from another."""
         description = self.description
-        return self.form, _source(description.build), description.parameters, description.named, description.start
+        return self.form, _identity_of(description.build), description.parameters, description.named, description.start
 
     def filter(self, x: Array) -> AbstractFilter:
         """Filter at a point of the line."""
@@ -144,7 +145,7 @@ class Objective:
         return nearest(jnp.asarray(truth), mean, angles) - mean, covariance
 
 
-def _source(build: Build) -> tuple[object, ...]:
+def _identity_of(build: Build) -> tuple[object, ...]:
     """What makes a function the same as another: its code and all that it closes over; of another callable itself."""
     if not isinstance(build, FunctionType):
         return (build,)
@@ -164,12 +165,12 @@ def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
     """
     if by_truth:
         sole_filter(network.start)
-        return [_share(Objective(network, "truth"))]
-    return [_share(Objective(network, form)) for form in forms_of(network.start)]
+        return [_reuse_equal(Objective(network, "truth"))]
+    return [_reuse_equal(Objective(network, form)) for form in forms_of(network.start)]
 
 
 @lru_cache
-def _share(objective: Objective) -> Objective:
+def _reuse_equal(objective: Objective) -> Objective:
     """Return the first one equal to this: to find its program again, it need not be compared."""
     return objective
 

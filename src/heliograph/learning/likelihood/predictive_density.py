@@ -44,7 +44,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
     if isinstance(law, Constant):
         return Discrete([float(law.value)], [1.0])
     # F^-1(Phi(t)) at the nodes
-    points, weights = _normal(count)
+    points, weights = _normal_nodes(count)
     match law:
         case Rayleigh():
             gains = scipy.stats.rayleigh.ppf(points, scale=float(law.scale))
@@ -55,7 +55,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
         case Nakagami():
             gains = np.sqrt(scipy.stats.gamma.ppf(points, float(law.shape)) * float(law.power) / float(law.shape))
         case _:
-            gains = np.quantile(_draw_law(law), points)
+            gains = np.quantile(_draw_values(law), points)
     return Discrete(gains, weights)
 
 
@@ -73,7 +73,7 @@ def discretise_laws(channel: Map, count: int) -> Map:
 
 
 @cache
-def _normal(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Values of Phi(t) at the nodes, and their weights."""
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
@@ -81,7 +81,8 @@ def _normal(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @in_float64
-def _draw_law(law: AbstractLaw) -> np.ndarray:
+def _draw_values(law: AbstractLaw) -> np.ndarray:
+    """Draw values of a law, whose quantiles stand for it."""
     samples: np.ndarray = np.asarray(jax.vmap(law.sample)(jax.random.split(jax.random.key(0), DRAWS)))
     return samples
 
@@ -190,12 +191,16 @@ def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: St
     """Densities and pits of z (steps, m), from the moments (steps, p) and (steps, p, p) of the signals before each."""
     y, spread, z = expected
     blocks = [
-        _block(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts) for i in range(0, max(len(z), 1), ROWS)
+        _score_block(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts)
+        for i in range(0, max(len(z), 1), ROWS)
     ]
     return Predictive(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 
-def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: StackDensities) -> tuple[np.ndarray, np.ndarray]:
+def _score_block(
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: StackDensities
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it."""
     total, pits, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]

@@ -90,7 +90,7 @@ def fates_of_sequence(
         received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
     # a new stretch at each restart, copies dropped
     stretches: list[list[int]] = [[]]
-    for run in _rising(received):
+    for run in _split_rising(received):
         again = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
         if again and not (sent is None and _are_copies(again, run, stretches[-1])):
             stretches.append([])
@@ -99,10 +99,10 @@ def fates_of_sequence(
             if stretches[-1] and number - stretches[-1][-1] >= jump:
                 stretches.append([])
             stretches[-1].append(number)
-    return [_gaps(np.array(numbers)) for numbers in stretches if numbers]
+    return [_mark_gaps(np.array(numbers)) for numbers in stretches if numbers]
 
 
-def _rising(received: np.ndarray) -> list[list[int]]:
+def _split_rising(received: np.ndarray) -> list[list[int]]:
     """Split numbers where they fall back; of equal ones in a row one stays."""
     numbers = received[np.concatenate([[True], np.diff(received) != 0])]
     return [run.tolist() for run in np.split(numbers, np.flatnonzero(np.diff(numbers) < 0) + 1)]
@@ -121,7 +121,8 @@ def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
     return len(again) <= FEW or replayed
 
 
-def _gaps(received: np.ndarray) -> BetweenArrivals:
+def _mark_gaps(received: np.ndarray) -> BetweenArrivals:
+    """Fates of the packets from the first number to the last: those that are missing were lost."""
     lost = np.ones(received[-1] - received[0] + 1)
     lost[received - received[0]] = 0.0
     return BetweenArrivals.of(lost)

@@ -110,10 +110,10 @@ class Runs:
         """Log-likelihood at logits of (loss when good, when bad, fail, recover), and its gradient by complex steps."""
         shifted = np.broadcast_to(x, (5, 4)).astype(complex)
         shifted[np.arange(4), np.arange(4)] += 1j * STEP
-        total = self._log(1 / (1 + np.exp(-shifted)))
+        total = self._log_likelihoods(1 / (1 + np.exp(-shifted)))
         return float(total[4].real), np.asarray(total[:4].imag / STEP)
 
-    def _log(self, shares: np.ndarray) -> np.ndarray:
+    def _log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
         """Log-likelihoods for several sets of shares (sets, 4)."""
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)
@@ -130,9 +130,9 @@ class Runs:
                 parts[:, here] = start[:, None]
                 continue
             step = moved * np.stack(emitted[kind], axis=-1)[:, None, :]  # T' A
-            power, scale = _powers(step, lengths)
+            power, scale = _power_matrices(step, lengths)
             parts[:, here], scales[:, here] = power[:, position], scale[:, position]
-        whole, scale = _product(parts)
+        whole, scale = _multiply_runs(parts)
         ahead = whole.sum(axis=-2)[..., 0]  # all columns of what starts with p 1' agree
         return np.asarray(np.log(ahead) + scale + scales.sum(axis=1))
 
@@ -149,7 +149,7 @@ def _scale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return matrix / size[..., None, None], np.log(size)
 
 
-def _powers(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _power_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scaled matrix^length for each length, and the logarithms of the scales: by the binary digits of the lengths."""
     shape = (len(matrix), len(lengths))
     power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
@@ -166,7 +166,7 @@ def _powers(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.nda
     return power, scale
 
 
-def _product(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _multiply_runs(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Product of (sets, runs, 2, 2), the last run first, scaled, and the logarithm of the scale: pair by pair."""
     scale = np.zeros(len(parts))
     while parts.shape[1] > 1:

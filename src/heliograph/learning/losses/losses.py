@@ -109,6 +109,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 
 
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
+    """Fit the five laws, by name."""
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
         "markov": MarkovLosses.fit(parts, intervals=intervals),
@@ -150,7 +151,7 @@ def loss_memory(fates: object) -> LossMemory:
     off, variance = 0.0, 0.0
     for stretch in check_fates(fates):
         # of a stretch between arrivals the packets between them, which are exchangeable if losses are independent
-        for lost in _unbroken(np.where(is_trial(stretch), stretch, np.nan)):
+        for lost in _split_at_unknown(np.where(is_trial(stretch), stretch, np.nan)):
             n, ones = len(lost), float(lost.sum())
             pairs = 2 * ones * (n - ones)
             off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
@@ -165,7 +166,7 @@ def _likelihood(counts: np.ndarray) -> float:
     return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
 
 
-def _unbroken(fate: np.ndarray) -> list[np.ndarray]:
+def _split_at_unknown(fate: np.ndarray) -> list[np.ndarray]:
     """Parts of a stretch without an unknown fate."""
     edges = np.flatnonzero(np.isnan(fate))
     return [stretch[~np.isnan(stretch)] for stretch in np.split(fate, edges) if np.any(~np.isnan(stretch))]
@@ -201,9 +202,12 @@ class RunningRateLosses(AbstractLossLaw):
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             share = expit(x)
-            ahead = [_ahead(stretch, *share) for stretch in parts]
+            ahead = [_predict_losses(stretch, *share) for stretch in parts]
             value, slope = (
-                sum(column) for column in zip(*(_log(*a) for a in zip(parts, ahead, trials, strict=True)), strict=True)
+                sum(column)
+                for column in zip(
+                    *(_sum_log_probabilities(*a) for a in zip(parts, ahead, trials, strict=True)), strict=True
+                )
             )
             return float(value), np.asarray(slope * share * (1 - share))
 
@@ -217,11 +221,13 @@ class RunningRateLosses(AbstractLossLaw):
     def predicted(self, fate: Packets) -> Packets:
         """Probability of each loss by the running rate; an unknown fate leaves it where it is."""
         known = ~np.isnan(fate)
-        at_known = _ahead(np.append(fate[known], 0.0), *(share.estimate for share in self.shares().values()))[0]
+        at_known = _predict_losses(np.append(fate[known], 0.0), *(share.estimate for share in self.shares().values()))[
+            0
+        ]
         return np.asarray(at_known[np.cumsum(known) - known])
 
 
-def _ahead(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
+def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
     """P(lost) of each packet, and its derivatives (3, packets)."""
     before = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
     keep = [1.0, step - 1.0]
@@ -231,7 +237,10 @@ def _ahead(lost: Packets, base: float, weight: float, step: float) -> tuple[Pack
     return base + weight * rate, np.stack([1 + weight * by_base, rate, weight * by_step])
 
 
-def _log(lost: Packets, ahead: tuple[Packets, Packets], trials: np.ndarray) -> tuple[float, np.ndarray]:
+def _sum_log_probabilities(
+    lost: Packets, ahead: tuple[Packets, Packets], trials: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Log-likelihood of the trials under these predictions, and its gradient."""
     p, slope = ahead
     p = np.clip(p, 1e-300, 1 - 1e-16)
     logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))

@@ -41,20 +41,22 @@ def shares_at(function: Slope, top: np.ndarray, value: float, intervals: bool) -
     """
     if not intervals:
         return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
-    return [_profile(function, top, value, i) for i in range(len(top))]
+    return [_profile_interval(function, top, value, i) for i in range(len(top))]
 
 
-def _profile(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
+def _profile_interval(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
+    """The share at logit i of the maximum, with the interval where the profile of its likelihood falls by FALL."""
     ends = {side: top[i] * side > END - 4 for side in (-1, 1)}
     fall = FALL_AT_END if any(ends.values()) else FALL
     low, high = (
-        (0.0 if side < 0 else 1.0) if ends[side] else _end(function, top, value - fall, i, side) for side in (-1, 1)
+        (0.0 if side < 0 else 1.0) if ends[side] else _find_crossing(function, top, value - fall, i, side)
+        for side in (-1, 1)
     )
     estimate = next((0.0 if side < 0 else 1.0 for side in (-1, 1) if ends[side]), float(expit(top[i])))
     return Share(estimate, low, high)
 
 
-def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> float:
+def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> float:
     """Crossing of the level by the profile of logit i on one side; 0 or 1 where it does not cross."""
     others, near = np.delete(np.arange(len(top)), i), top.copy()
 
