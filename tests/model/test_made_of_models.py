@@ -263,6 +263,16 @@ def meshed():
     yield hg.simulation.freeze(network, "m", arrived, 5, np.ones((5, 1))), network, 0
 
 
+def one_node():
+    plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0, states={"level": "m"})
+    sensor, link = hg.LinearSensor([[1.0]], 0.1, {"read": "m"}), hg.hop(hg.Rayleigh(0.8), 0.1)
+    filters = {"f": hg.linear_filter(plant, sensor, link)}
+    nodes = {"a": hg.Node(sensor, link, filters, (-9.0, 9.0), -99.0), "b": hg.Node(sensor, link, filters)}
+    fusion = hg.Fusion("f", hg.CovarianceIntersection(), neighbours={"a": ["b"], "b": ["a"]})
+    network = hg.Network(plant, nodes, {"m": fusion})
+    yield hg.simulation.node_network(network, "a"), network, 0
+
+
 def centre():
     f = hg.linear_filter(LINE, ON_LINE, NOISY)
     network = hg.Network(LINE, {n: hg.Node(ON_LINE, NOISY, {"f": f}) for n in "ab"},
@@ -329,6 +339,7 @@ HELPERS = {
     "hg.event_filter": on_line(lambda *parts: hg.event_filter(*parts, hg.SendOnDelta([1.0, 1.0]))),
     # Networks of networks.
     "hg.planning.designed_network": designed, "hg.simulation.freeze": meshed,
+    "hg.simulation.node_network": one_node,
 }  # fmt: skip
 HOLDERS = {  # what holds models as they are given, and what only reads them
     "hg.Network", "hg.Node", "hg.model.RelayNetwork", "hg.h_infinity.HInfinityFilter", "hg.filters.PolynomialFilter",
