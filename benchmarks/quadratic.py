@@ -19,7 +19,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.factors.roots import roots_of, square
-from heliograph.linear.recursion import Corrected, covariance_step, noises_of
+from heliograph.linear.recursion import RecursionStep, covariance_step, take_noise_roots
 from heliograph.linear.system import Steps
 from heliograph.random_affine.moments.monomials import position
 
@@ -70,9 +70,9 @@ def seconds(call: Callable[[], object], dimension: int) -> float:
     return float(best)
 
 
-def prepared(step: Steps, covariance: np.ndarray) -> Callable[[], Corrected]:
+def prepared(step: Steps, covariance: np.ndarray) -> Callable[[], RecursionStep]:
     """The covariance step of this model, whose roots are taken before the clock starts."""
-    return partial(covariance_step, roots_of(covariance), step, noises_of(step, np.diag(covariance)))
+    return partial(covariance_step, roots_of(covariance), step, take_noise_roots(step, np.diag(covariance)))
 
 
 class Row(NamedTuple):

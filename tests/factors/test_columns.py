@@ -13,12 +13,12 @@ from heliograph.factors.columns import (
     join_columns,
     root_of,
     rounding_of,
-    triangular,
+    triangularise,
     unit_lower,
 )
 
 # One program for each size, not one for each of its hundred operations.
-triangular, eliminate = jax.jit(triangular), jax.jit(eliminate)
+triangularise, eliminate = jax.jit(triangularise), jax.jit(eliminate)
 
 EXACT = {"rtol": 1e-12, "atol": 1e-12}  # sums of some twenty products of numbers of order 1
 
@@ -42,7 +42,7 @@ def product(c):
 def test_both_ways_to_factors_give_the_sum(n):
     """Written out up to 16 rows, a loop above."""
     given = columns(n, n + 3)
-    for factors in (triangular(given), eliminate(given.covariance)):
+    for factors in (triangularise(given), eliminate(given.covariance)):
         np.testing.assert_allclose(product(factors), product(given), **EXACT)
         assert np.all(np.triu(factors.matrix, 1) == 0) and np.all(np.diagonal(factors.matrix) == 1)
         assert np.all(np.asarray(factors.weights) > 0)
@@ -53,7 +53,7 @@ def test_a_row_made_of_others_leaves_nothing(n):
     """Exactly nothing of a row of zeros; of twice another the square of rounding, or, eliminated, rounding."""
     given = columns(n, n + 3)
     given.matrix[1], given.matrix[2] = 2 * given.matrix[0], 0.0
-    orthogonal, formed = triangular(given), eliminate(given.covariance)
+    orthogonal, formed = triangularise(given), eliminate(given.covariance)
     assert orthogonal.weights[2] == 0 and np.all(np.asarray(orthogonal.matrix)[3:, 2] == 0)
     assert 0 <= orthogonal.weights[1] < 1e-28 and 0 <= formed.weights[1] < 1e-13
     np.testing.assert_allclose(product(orthogonal), product(given), **EXACT)
@@ -70,13 +70,13 @@ def test_a_pivot_is_at_least_its_share():
 def test_derivatives_exist_where_variances_are_zero():
     """Of d_2 of W diag(w) W' by the weight of a column that alone carries the second row: its square."""
     matrix = np.array([[1.0, 0.0], [0.5, 3.0]])
-    of_weight = jax.grad(lambda w: triangular(Columns(matrix, jnp.stack([0.0 * w, w]))).weights[1])
+    of_weight = jax.grad(lambda w: triangularise(Columns(matrix, jnp.stack([0.0 * w, w]))).weights[1])
     of_pivot = jax.grad(lambda v: eliminate(jnp.diag(jnp.stack([v, 2 * v]))).weights[1])
     assert of_weight(0.0) == pytest.approx(9.0) and of_pivot(0.0) == pytest.approx(2.0)
 
 
 def test_decorrelated_rows_have_independent_noises():
-    lower, rows = triangular(columns(4, 7)).matrix, np.random.default_rng(1).normal(size=(4, 3))
+    lower, rows = triangularise(columns(4, 7)).matrix, np.random.default_rng(1).normal(size=(4, 3))
     np.testing.assert_allclose(lower @ decorrelate(lower, rows), rows, **EXACT)
 
 

@@ -8,29 +8,32 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from heliograph.factors.columns import Columns, columns_of, nothing, rounding_of, triangular
+from heliograph.factors.columns import Columns, columns_of, rounding_of, triangularise, zero_covariance
 from heliograph.factors.gaussian import (
     Gaussian,
+    add_noise_to_image,
     append_rows,
-    backwards,
+    condition_on_next_state,
+    condition_on_observation,
+    from_columns,
+    from_covariance,
+    from_summed_covariance,
     gain_of,
-    given,
     image_by_slopes,
-    leading,
-    merge,
-    move,
-    observe,
-    of_columns,
-    of_sum,
-    revise,
-    smooth,
-    transform,
+    impose_moments_of_combination,
+    merge_mixture,
+    predict_affine,
+    rts_step,
+    take_leading,
 )
 from tests.factors.exact import after, congruence, exactly, total
 
 # One program for each size, not one for each of its hundred operations.
-backwards, move, observe, revise = (jax.jit(f) for f in (backwards, move, observe, revise))
-smooth, transform, append_rows = (jax.jit(f) for f in (smooth, transform, append_rows))
+condition_on_next_state, predict_affine, condition_on_observation, impose_moments_of_combination = (
+    jax.jit(f)
+    for f in (condition_on_next_state, predict_affine, condition_on_observation, impose_moments_of_combination)
+)
+rts_step, add_noise_to_image, append_rows = (jax.jit(f) for f in (rts_step, add_noise_to_image, append_rows))
 
 EXACT = {"rtol": 1e-11, "atol": 1e-12}  # some twenty products of numbers of order 1, and a solution
 SIZES = [(1, 1), (3, 2), (5, 3), (18, 4)]
@@ -57,10 +60,10 @@ def test_moving_adds_the_noise(n, m):
     mean, p, _, _, _ = problem(n, m)
     rng = np.random.default_rng(0)
     f, b, q = rng.normal(size=(n, n)), rng.normal(size=n), covariance(rng, n)
-    x = given(mean, p)
+    x = from_covariance(mean, p)
     np.testing.assert_allclose(x.covariance, p, **EXACT)
-    by_rows = move(x, f, b, columns_of(q))
-    by_image = transform(image_by_slopes(f @ x.mean + b, f @ x.root, x), columns_of(q))
+    by_rows = predict_affine(x, f, b, columns_of(q))
+    by_image = add_noise_to_image(image_by_slopes(f @ x.mean + b, f @ x.root, x), columns_of(q))
     for moved in (by_rows, by_image):
         np.testing.assert_allclose(moved.mean, f @ mean + b, **EXACT)
         np.testing.assert_allclose(moved.covariance, f @ p @ f.T + q, rtol=1e-10, atol=1e-10)
@@ -73,8 +76,8 @@ def test_observing_is_kalman_s_update(n, m, missing):
     mean, p, h, r, z = problem(n, m)
     used = np.arange(m) >= (1 if missing else 0)
     innovation = np.where(used, z, np.nan)
-    x = given(mean, p)
-    known, seen = observe(x, h @ x.root, jnp.asarray(innovation), columns_of(r))
+    x = from_covariance(mean, p)
+    known, seen = condition_on_observation(x, h @ x.root, jnp.asarray(innovation), columns_of(r))
     h, r, z = h[used], r[np.ix_(used, used)], z[used]
     s = h @ p @ h.T + r
     gain = np.linalg.solve(s, h @ p).T
@@ -86,8 +89,8 @@ def test_observing_is_kalman_s_update(n, m, missing):
 
 def test_nothing_that_arrives_changes_nothing():
     mean, p, h, r, _ = problem(3, 2)
-    x = given(mean, p)
-    known, seen = observe(x, h @ x.root, jnp.full(2, jnp.nan), columns_of(r))
+    x = from_covariance(mean, p)
+    known, seen = condition_on_observation(x, h @ x.root, jnp.full(2, jnp.nan), columns_of(r))
     for a, b in zip(known, x, strict=True):
         np.testing.assert_array_equal(a, b)
     assert seen.log_density(np.zeros(2, bool), jnp.zeros(2)) == 0
@@ -95,17 +98,21 @@ def test_nothing_that_arrives_changes_nothing():
 
 def test_nothing_known_and_nothing_said_changes_nothing():
     x = Gaussian(jnp.ones(2), jnp.zeros(1), jnp.zeros(2))
-    known, _ = observe(x, jnp.eye(2), jnp.ones(2), nothing(2))
+    known, _ = condition_on_observation(x, jnp.eye(2), jnp.ones(2), zero_covariance(2))
     assert np.all(known.mean == 1) and np.all(known.variances == 0)
 
 
 def test_an_output_that_others_determine_is_judged_by_them():
     """The same noise-free output twice: the density is that of one where they agree, and 0 where they do not."""
-    x, rows = given(np.zeros(1), np.eye(1)), jnp.ones((2, 1))
+    x, rows = from_covariance(np.zeros(1), np.eye(1)), jnp.ones((2, 1))
     both = np.ones(2, bool)
     alone = -0.5 * (0.3**2 + np.log(2 * np.pi))
-    agrees = observe(x, rows, jnp.asarray([0.3, 0.3]), nothing(2))[1].log_density(both, jnp.ones(2))
-    differs = observe(x, rows, jnp.asarray([0.3, 0.4]), nothing(2))[1].log_density(both, jnp.ones(2))
+    agrees = condition_on_observation(x, rows, jnp.asarray([0.3, 0.3]), zero_covariance(2))[1].log_density(
+        both, jnp.ones(2)
+    )
+    differs = condition_on_observation(x, rows, jnp.asarray([0.3, 0.4]), zero_covariance(2))[1].log_density(
+        both, jnp.ones(2)
+    )
     assert agrees == pytest.approx(alone) and differs == -np.inf
 
 
@@ -114,11 +121,11 @@ def test_an_output_that_others_determine_is_judged_by_them():
 def test_a_wide_prior_and_a_precise_sensor_keep_their_digits(wide, precise):
     """Four steps of position and velocity in fractions: every variance within 2 % of the exact one."""
     a, q, h = np.array([[1.0, 1.0], [0.0, 1.0]]), 1e-9 * np.eye(2), np.array([[1.0, 0.0]])
-    x, p = given(np.zeros(2), wide * np.eye(2)), exactly(wide * np.eye(2))
+    x, p = from_covariance(np.zeros(2), wide * np.eye(2)), exactly(wide * np.eye(2))
     process = columns_of(q)
     for _ in range(4):
-        x = move(x, a, np.zeros(2), process)
-        x, _ = observe(x, h @ x.root, jnp.zeros(1), columns_of(np.array([[precise]])))
+        x = predict_affine(x, a, np.zeros(2), process)
+        x, _ = condition_on_observation(x, h @ x.root, jnp.zeros(1), columns_of(np.array([[precise]])))
         p = total(congruence(exactly(a), p), exactly(q))
         p, _ = after(p, exactly(h), [[Fraction(precise)]])
         np.testing.assert_allclose(np.diagonal(x.covariance), [float(p[0][0]), float(p[1][1])], rtol=0.02)
@@ -127,10 +134,10 @@ def test_a_wide_prior_and_a_precise_sensor_keep_their_digits(wide, precise):
 @pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])
 def test_units_do_not_matter(unit):
     mean, p, h, r, z = problem(3, 2)
-    x = given(unit * mean, unit**2 * p)
-    known, _ = observe(x, h @ x.root, jnp.asarray(unit * z), columns_of(unit**2 * r))
-    alone = given(mean, p)
-    expected, _ = observe(alone, h @ alone.root, jnp.asarray(z), columns_of(r))
+    x = from_covariance(unit * mean, unit**2 * p)
+    known, _ = condition_on_observation(x, h @ x.root, jnp.asarray(unit * z), columns_of(unit**2 * r))
+    alone = from_covariance(mean, p)
+    expected, _ = condition_on_observation(alone, h @ alone.root, jnp.asarray(z), columns_of(r))
     np.testing.assert_allclose(known.mean / unit, expected.mean, rtol=1e-11)
     np.testing.assert_allclose(known.covariance / unit**2, expected.covariance, rtol=1e-11)
 
@@ -139,8 +146,11 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same():
     """The condition of S is 1e9; one after another the outputs keep their digits. In fractions."""
     h, noise = np.array([[1.0, 1.0], [1.0, 1.0001]]), 1e-12 * np.array([[1.0, 0.9], [0.9, 1.0]])
     _, gain = after(exactly(np.eye(2)), exactly(h), exactly(noise))
-    x = given(np.zeros(2), np.eye(2))
-    found = [observe(x, jnp.asarray(h) @ x.root, jnp.asarray(z), columns_of(noise))[0].mean for z in np.eye(2)]
+    x = from_covariance(np.zeros(2), np.eye(2))
+    found = [
+        condition_on_observation(x, jnp.asarray(h) @ x.root, jnp.asarray(z), columns_of(noise))[0].mean
+        for z in np.eye(2)
+    ]
     np.testing.assert_allclose(np.transpose(found), np.array(gain, dtype=float), rtol=1e-10)
 
 
@@ -150,11 +160,11 @@ def test_smoothing_is_rauch_s(n, state_noise):
     mean, p, _, _, _ = problem(n, 1)
     rng = np.random.default_rng(3)
     f, q = rng.normal(size=(n, n)), state_noise * covariance(rng, n)
-    x = given(mean, p)
-    ahead = move(x, f, np.zeros(n), columns_of(q))
-    back = backwards(x, f @ x.root, ahead.mean, triangular(columns_of(q)))
-    later = given(np.asarray(ahead.mean) + 0.3, 0.4 * np.asarray(ahead.covariance))
-    known = smooth(back, later)
+    x = from_covariance(mean, p)
+    ahead = predict_affine(x, f, np.zeros(n), columns_of(q))
+    back = condition_on_next_state(x, f @ x.root, ahead.mean, triangularise(columns_of(q)))
+    later = from_covariance(np.asarray(ahead.mean) + 0.3, 0.4 * np.asarray(ahead.covariance))
+    known = rts_step(back, later)
     prior = f @ p @ f.T + q
     gain = np.linalg.solve(prior, f @ p).T
     np.testing.assert_allclose(known.mean, mean + gain @ np.full(n, 0.3), rtol=1e-9)
@@ -166,12 +176,12 @@ def test_a_part_that_others_determine_says_nothing_of_the_state_before(n):
     """The last part of x+ is the sum of the first two, to rounding: its innovation is that, and its gain is zero."""
     mean, p, _, _, _ = problem(n, 1)
     rng = np.random.default_rng(5)
-    f, x = rng.normal(size=(n, n)), given(mean, p)
+    f, x = rng.normal(size=(n, n)), from_covariance(mean, p)
     f[-1] = f[0] + f[1]
-    rounding = triangular(rounding_of(np.diagonal(f @ p @ f.T)))
-    back = backwards(x, f @ x.root, f @ mean, rounding)
+    rounding = triangularise(rounding_of(np.diagonal(f @ p @ f.T)))
+    back = condition_on_next_state(x, f @ x.root, f @ mean, rounding)
     assert np.all(np.asarray(back.gain)[:, -1] == 0) and np.all(np.any(np.asarray(back.gain)[:, :-1], axis=0))
-    known = smooth(back, Gaussian(jnp.asarray(f @ mean), back.lower, jnp.zeros(n)))
+    known = rts_step(back, Gaussian(jnp.asarray(f @ mean), back.lower, jnp.zeros(n)))
     part = f[:-1]  # x given its first parts exactly
     gain = np.linalg.solve(part @ p @ part.T, part @ p).T
     np.testing.assert_allclose(known.covariance, p - gain @ part @ p, rtol=0, atol=1e-10)
@@ -181,7 +191,7 @@ def test_a_mixture_has_its_moments():
     rng = np.random.default_rng(0)
     means, spreads = rng.normal(size=(3, 2)), np.stack([covariance(rng, 2) for _ in range(3)])
     weights = np.array([0.2, 0.5, 0.3])
-    whole = merge(jax.vmap(given)(means, spreads), weights)
+    whole = merge_mixture(jax.vmap(from_covariance)(means, spreads), weights)
     middle = weights @ means
     apart = means - middle
     np.testing.assert_allclose(whole.mean, middle, **EXACT)
@@ -191,10 +201,10 @@ def test_a_mixture_has_its_moments():
 
 def test_rounding_keeps_a_noise_free_filter_from_knowing_more_than_it_can():
     """A state that moves and is seen without noise: its variance stays above the square of its rounding."""
-    x, rounding = given(np.zeros(1), 1.034 * np.eye(1)), rounding_of(np.array([1.034]))
+    x, rounding = from_covariance(np.zeros(1), 1.034 * np.eye(1)), rounding_of(np.array([1.034]))
     for _ in range(20):
-        x = move(x, np.array([[0.9]]), np.zeros(1), rounding)
-        x, _ = observe(x, 0.349 * x.root, jnp.zeros(1), rounding_of(np.array([0.349**2 * 1.034])))
+        x = predict_affine(x, np.array([[0.9]]), np.zeros(1), rounding)
+        x, _ = condition_on_observation(x, 0.349 * x.root, jnp.zeros(1), rounding_of(np.array([0.349**2 * 1.034])))
     assert 1e-33 < float(x.variances[0]) < 1e-30
 
 
@@ -204,8 +214,8 @@ def test_derivatives_pass_a_known_state_and_a_noise_free_output():
 
     def variance(start, noise):
         x = Gaussian(jnp.zeros(1), jnp.zeros(0), jnp.asarray(start)[None])
-        x = move(x, jnp.eye(1), jnp.zeros(1), Columns(jnp.eye(1), jnp.full(1, q)))
-        return observe(x, x.root, jnp.zeros(1), Columns(jnp.eye(1), noise[None]))[0].variances[0]
+        x = predict_affine(x, jnp.eye(1), jnp.zeros(1), Columns(jnp.eye(1), jnp.full(1, q)))
+        return condition_on_observation(x, x.root, jnp.zeros(1), Columns(jnp.eye(1), noise[None]))[0].variances[0]
 
     slopes = jax.jit(jax.grad(variance, (0, 1)))
     of_noise, of_start = slopes(0.0, 0.0)[1], slopes(0.0, 0.3)[0]
@@ -214,11 +224,11 @@ def test_derivatives_pass_a_known_state_and_a_noise_free_output():
 
 def test_of_correlated_noises_at_zero_the_scale_has_a_derivative():
     """R = r C at r = 0: given as factors of C and r times their weights, the derivative is that at a small r."""
-    x = given(np.zeros(2), np.array([[2.0, 0.3], [0.3, 1.0]]))
+    x = from_covariance(np.zeros(2), np.array([[2.0, 0.3], [0.3, 1.0]]))
     correlated = columns_of(np.array([[1.0, 0.5], [0.5, 1.0]]))
 
     def variance(r):
-        return jnp.trace(observe(x, x.root, jnp.zeros(2), correlated.times(r))[0].covariance)
+        return jnp.trace(condition_on_observation(x, x.root, jnp.zeros(2), correlated.times(r))[0].covariance)
 
     slope, near = float(jax.jit(jax.grad(variance))(0.0)), float(variance(1e-7) - variance(0.0)) / 1e-7
     assert slope == pytest.approx(near, rel=1e-5)
@@ -228,10 +238,10 @@ def test_several_at_once_are_each_alone():
     """Under vmap and with leading axes, bit for bit as alone."""
     rng = np.random.default_rng(1)
     spreads = np.stack([covariance(rng, 3) for _ in range(4)])
-    many = jax.vmap(given)(np.zeros((4, 3)), spreads)
+    many = jax.vmap(from_covariance)(np.zeros((4, 3)), spreads)
     for i in range(4):
         np.testing.assert_allclose(many.covariance[i], spreads[i], **EXACT)
-    assert of_sum(jnp.zeros(3), columns_of(spreads[0])).root.shape == (3, 3)
+    assert from_summed_covariance(jnp.zeros(3), columns_of(spreads[0])).root.shape == (3, 3)
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1e-9, 0.3, 1.0, 7.0])
@@ -239,10 +249,10 @@ def test_several_at_once_are_each_alone():
 def test_revising_a_scalar_changes_its_law_and_not_that_of_x_given_it(n, ratio):
     """P - (1 - ratio) K V K' and mean + K shift; no variance is negative, whether t is known better then or worse."""
     mean, p, rows, _, _ = problem(n, 1)
-    x, h = given(mean, p), rows[0]
+    x, h = from_covariance(mean, p), rows[0]
     v = h @ p @ h
     gain = p @ h / v
-    after = revise(x, h @ x.root, 0.7, ratio)
+    after = impose_moments_of_combination(x, h @ x.root, 0.7, ratio)
     np.testing.assert_allclose(after.mean, mean + 0.7 * gain, **EXACT)
     np.testing.assert_allclose(after.covariance, p - (1 - ratio) * v * np.outer(gain, gain), rtol=1e-11, atol=1e-11)
     # To the last digits: after a ratio of 1e-9 too, where the difference has half of its digits.
@@ -252,25 +262,25 @@ def test_revising_a_scalar_changes_its_law_and_not_that_of_x_given_it(n, ratio):
 
 def test_revising_a_scalar_keeps_the_digits_of_a_small_ratio():
     """Against fractions: relative errors of a few eps of a variance that becomes 1e-20 of what it was."""
-    x, h, ratio = given(np.zeros(2), np.diag([1e8, 1.0])), np.array([1.0, 0.0]), 1e-20
-    after = revise(x, h @ x.root, 0.0, ratio)
+    x, h, ratio = from_covariance(np.zeros(2), np.diag([1e8, 1.0])), np.array([1.0, 0.0]), 1e-20
+    after = impose_moments_of_combination(x, h @ x.root, 0.0, ratio)
     np.testing.assert_allclose(np.diagonal(after.covariance), [1e-12, 1.0], rtol=1e-14)
 
 
 def test_revising_what_has_no_variance_leaves_all_as_it_is():
-    x = given(np.ones(2), np.diag([0.0, 2.0]))
-    after = revise(x, np.array([1.0, 0.0]), 3.0, 0.5)
+    x = from_covariance(np.ones(2), np.diag([0.0, 2.0]))
+    after = impose_moments_of_combination(x, np.array([1.0, 0.0]), 3.0, 0.5)
     for before, now in zip(x, after, strict=True):
         np.testing.assert_array_equal(now, before)
 
 
 def test_rows_below_a_gaussian_are_the_joint_law_and_its_first_components_the_same_again():
     mean, p, h, r, _ = problem(3, 2)
-    x = given(mean, p)
-    both = append_rows(x, h @ x.mean, h @ x.root, triangular(columns_of(r)))
+    x = from_covariance(mean, p)
+    both = append_rows(x, h @ x.mean, h @ x.root, triangularise(columns_of(r)))
     np.testing.assert_allclose(both.covariance[3:, 3:], h @ p @ h.T + r, **EXACT)
     np.testing.assert_allclose(both.covariance[3:, :3], h @ p, **EXACT)
-    for before, now in zip(x, leading(both, 3), strict=True):
+    for before, now in zip(x, take_leading(both, 3), strict=True):
         np.testing.assert_array_equal(now, before)
 
 
@@ -278,10 +288,10 @@ def test_rows_below_a_gaussian_are_the_joint_law_and_its_first_components_the_sa
 def test_squares_below_the_normal_numbers_count_as_zero(size):
     """1 / 1e-310 is no number: the column stays as it is, and nothing is learned of what it hides in."""
     x = Gaussian(np.zeros(2), np.array([0.5]), np.array([1.0, 2.0]))
-    both = of_columns(np.zeros(2), Columns(np.array([[size, 0.0], [size, 1.0]]), np.ones(2)))
+    both = from_columns(np.zeros(2), Columns(np.array([[size, 0.0], [size, 1.0]]), np.ones(2)))
     np.testing.assert_allclose(both.covariance, [[0.0, 0.0], [0.0, 1.0]], atol=1e-300)
-    after, _ = observe(x, np.array([[size, 0.0]]), np.zeros(1), nothing(1))
-    revised = revise(x, np.array([size, 0.0]), 0.0, 0.5)
+    after, _ = condition_on_observation(x, np.array([[size, 0.0]]), np.zeros(1), zero_covariance(1))
+    revised = impose_moments_of_combination(x, np.array([size, 0.0]), 0.0, 0.5)
     for part in (*both, *after, *revised):
         assert np.isfinite(part).all()
     if size < 1e-154:
@@ -290,11 +300,11 @@ def test_squares_below_the_normal_numbers_count_as_zero(size):
 
 
 def test_gain_is_that_of_the_covariance_form_and_of_observe():
-    """P C' (C P C' + R)^-1 with a correlated noise, and what `observe` moves the mean by: to 1e-12."""
+    """P C' (C P C' + R)^-1 with a correlated noise, and what `condition_on_observation` moves the mean by: to 1e-12."""
     draw = np.random.default_rng(5)
     p, r = (root @ root.T for root in (draw.normal(size=(4, 4)), draw.normal(size=(3, 3))))
     c, e = draw.normal(size=(3, 4)), draw.normal(size=3)
-    x, noise = given(jnp.zeros(4), jnp.asarray(p)), triangular(columns_of(r))
+    x, noise = from_covariance(jnp.zeros(4), jnp.asarray(p)), triangularise(columns_of(r))
     gain = gain_of(x, c @ x.root, noise)
     np.testing.assert_allclose(gain, p @ c.T @ np.linalg.inv(c @ p @ c.T + r), rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(gain @ e, observe(x, c @ x.root, e, noise)[0].mean, rtol=1e-12)
+    np.testing.assert_allclose(gain @ e, condition_on_observation(x, c @ x.root, e, noise)[0].mean, rtol=1e-12)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from heliograph.factors.columns import columns_of
-from heliograph.factors.gaussian import given, observe
+from heliograph.factors.gaussian import condition_on_observation, from_covariance
 from heliograph.factors.roots import observe_root, roots_of, square
 from heliograph.numerics.lapack import add_information
 from tests.factors.exact import after, congruence, exactly
@@ -63,12 +63,12 @@ def test_an_output_that_repeats_another_says_nothing_and_takes_nothing_away(nois
 
 
 def test_it_is_the_update_of_the_filters():
-    """The same numbers as those of `observe`, which takes components one after another."""
+    """The same numbers as those of `condition_on_observation`, which takes components one after another."""
     p, h, r = problem(4, 3)
     result = observe_root(roots_of(p), h, roots_of(r))
     with jax.enable_x64(True):
-        x = given(np.zeros(4), p)
-        others = [observe(x, h @ x.root, innovation, columns_of(r))[0] for innovation in np.eye(3)]
+        x = from_covariance(np.zeros(4), p)
+        others = [condition_on_observation(x, h @ x.root, innovation, columns_of(r))[0] for innovation in np.eye(3)]
     for j, other in enumerate(others):
         np.testing.assert_allclose(other.mean, result.gain[:, j], rtol=1e-10, atol=1e-12)
     with jax.enable_x64(True):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.factors.gaussian import given
+from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.gaussian.signal import Signal
 from heliograph.filters.gaussian.transform import PolynomialMoments, Transformed, image_of_moments
 from tests import machine
@@ -67,7 +67,7 @@ def test_too_many_points_are_refused():
 @eqx.filter_jit
 def correct(update, prior, moments, described):
     """Gain and bound for a prior covariance and the moments of y: its mean, covariance, Cov(x, y) and E[y y']."""
-    x, (mean, spread, cross, second) = given(jnp.zeros(len(prior)), prior), moments
+    x, (mean, spread, cross, second) = from_covariance(jnp.zeros(len(prior)), prior), moments
     image = image_of_moments(Transformed(mean, spread, cross), x)
     signal = Signal(x, image.mean, image.slopes, image.curvature, second, jnp.diagonal(second))
     return update.correct(prior, signal, described, jnp.ones(2, bool))

@@ -3,7 +3,7 @@
 import numpy as np
 
 import heliograph as hg
-from heliograph.linear.polynomial import memory_system
+from heliograph.linear.polynomial import quadratic_system_with_linear_estimate
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, scalar_system, two_sensors
 
@@ -12,7 +12,7 @@ def designs(system, horizon):
     s = model(system, horizon)
     linear = hg.linear.lmmse(hg.linear.lifted_system(*s, 1, horizon))
     quadratic = hg.linear.lmmse(hg.linear.lifted_system(*s, 2, horizon)).gains.covariance
-    memory = memory_system(*s, linear)
+    memory = quadratic_system_with_linear_estimate(*s, linear)
     return linear.gains.covariance, quadratic, memory
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.linear.recursion import covariance_step, noises_of
+from heliograph.linear.recursion import covariance_step, take_noise_roots
 from heliograph.numerics.lapack import pseudo_solve
 from heliograph_studies.quadratic_bias import compute
 from tests.oracles import quadratic_bias as oracle
@@ -38,7 +38,7 @@ def test_slow_covariance_is_not_taken_for_its_limit():
     steps = hg.linear.Steps(a * item, 0 * item[:, 0], q * item, item, 0 * item[:, 0], r * item)
     system = hg.linear.LinearSystem(steps, [0.0], [[limit * (1 + 4e-10)]], [[1.0]])
     root, expected = np.sqrt(system.covariance), []
-    noises = noises_of(system.step(0), system.covariance[0])
+    noises = take_noise_roots(system.step(0), system.covariance[0])
     for k in range(horizon):
         root = covariance_step(root, system.step(k), noises).root
         expected.append(root[0, 0] ** 2)

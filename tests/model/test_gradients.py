@@ -11,7 +11,7 @@ from scipy import special
 import heliograph as hg
 from heliograph.engine.choice import compute_once
 from heliograph.factors.columns import Columns
-from heliograph.random_affine.moments.push import push
+from heliograph.random_affine.moments.push import push_moments
 
 STEPS = 6
 LOST = 2  # the step of which nothing arrives
@@ -175,7 +175,7 @@ def test_noises_and_moments_of_every_map_can_be_traced():
 
     def evaluate(p):
         item = make(p)
-        return item.moments(1).matrix, item.moments(4).matrix, push(item, 4, np.ones(15))
+        return item.moments(1).matrix, item.moments(4).matrix, push_moments(item, 4, np.ones(15))
 
     p = np.array([0.5, 0.3, 0.1, 0.8, 0.4, 0.7])
     single, two, pushed = compute_once(evaluate, jax.jit(evaluate), (p,))

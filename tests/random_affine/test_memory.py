@@ -10,7 +10,7 @@ import heliograph as hg
 from heliograph.h_infinity.system import disturb_gain
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.intervals import moment_interval
-from heliograph.random_affine.moments.push import push
+from heliograph.random_affine.moments.push import push_moments
 from heliograph.testing import check_random_affine
 
 GAINS = np.array([0.2, 1.0])
@@ -168,7 +168,7 @@ SENSOR = hg.LinearSensor([[1.0]], 0.1)
     "use",
     [
         lambda c: c.moments(2),
-        lambda c: push(c, 2, np.ones(3)),
+        lambda c: push_moments(c, 2, np.ones(3)),
         lambda c: moment_interval(c, 2),
         hg.random_affine.second_order,
         disturb_gain,

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.random_affine.outliers import branches, is_bounded
+from heliograph.random_affine.outliers import branches_of_noise, has_bounded_noise
 
 R = np.array([[1.0, 0.3], [0.3, 2.0]])
 
@@ -54,7 +54,7 @@ def test_share_and_delay_of_a_one_sided_law_can_be_free():
 @pytest.mark.parametrize("nu", [2.0, 3.0, 5.0])
 def test_branches_of_students_law_have_its_density(nu):
     """To 0.08 in the logarithm within 100 scales: what 25 precisions over 5.7 decades give for 2 to 5 degrees."""
-    part = branches(hg.StudentT(1.0, nu))
+    part = branches_of_noise(hg.StudentT(1.0, nu))
     e = np.linspace(-100, 100, 2001)
     density = np.sum(np.exp(part.log_share[0]) * stats.norm.pdf(e[:, None], 0, np.sqrt(part.variance[0])), axis=1)
     assert np.max(np.abs(np.log(density) - stats.t.logpdf(e, nu))) < 0.08
@@ -68,7 +68,7 @@ def test_students_law_tends_to_the_gaussian_one():
 
 def test_components_apart_keep_the_branches_of_each():
     law = hg.random_affine.Independent([hg.Contaminated(1.0, 0.1, 9.0), hg.Gaussian([[2.0]])])
-    part = branches(law)
+    part = branches_of_noise(law)
     np.testing.assert_allclose(np.exp(part.log_share), [[0.9, 0.1], [1.0, 0.0]])
     np.testing.assert_allclose(part.variance[:, 0], [1.0, 2.0])
 
@@ -78,7 +78,7 @@ def test_bounds_of_share_and_size_dominate_every_law_within_them():
     for share in (0.0, 0.05, 0.1):
         gap = bound.covariance - hg.Contaminated(R, share, 9 * R).covariance
         assert np.linalg.eigvalsh(gap).min() > -1e-12
-    assert is_bounded(hg.LinearSensor(np.eye(2), bound)) and not is_bounded(hg.LinearSensor(np.eye(2), R))
+    assert has_bounded_noise(hg.LinearSensor(np.eye(2), bound)) and not has_bounded_noise(hg.LinearSensor(np.eye(2), R))
 
 
 @pytest.mark.parametrize(

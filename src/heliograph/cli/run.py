@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
-    from heliograph.smoothing.modes import AbstractSmoothing
+    from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
     Write = Callable[[Record, Path], None]
     Horizons = int | list[float | np.timedelta64 | np.datetime64]

@@ -1,8 +1,9 @@
 """Covariances as sums of squares W diag(w) W', and the two ways to their factors L diag(d) L'.
 
 L is unit lower triangular and d is never negative, so that a variance is a sum of positive terms in any precision. Rows
-are made orthogonal (`triangular`) where digits matter: a row is known to eps, so its square to eps^2. The sum is formed
-and eliminated (`eliminate`) where products matter: two thirds of them, and a pivot is known to eps of its variance.
+are made orthogonal (`triangularise`) where digits matter: a row is known to eps, so its square to eps^2. The sum is
+formed and eliminated (`eliminate`) where products matter: two thirds of them, and a pivot is known to eps of its
+variance.
 
 A known zero of a matrix stays a known zero through a matrix product, not through a product of numbers, which might be
 NaN: so products of rows and columns are written as matrix products here.
@@ -67,8 +68,8 @@ def side_by_side(parts: Columns, weights: Array) -> Columns:
     return Columns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
 
 
-def nothing(n: int) -> Columns:
-    """A covariance of zero of n components: no columns."""
+def zero_covariance(n: int) -> Columns:
+    """Covariance of zero of n components: no columns."""
     return Columns(np.zeros((n, 0)), np.zeros(0))
 
 
@@ -81,16 +82,16 @@ def unit_lower(entries: Array) -> Any:
     np.fill_diagonal(place, count + 1)
     ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
     whole = xp.concatenate([entries, ends], axis=-1)
-    return whole[..., place] if xp is np else _take(whole, place)
+    return whole[..., place] if xp is np else _take_entries(whole, place)
 
 
 def below_diagonal(lower: jax.Array) -> jax.Array:
     """Read off the entries of L below its diagonal, row by row: the inverse of `unit_lower`."""
     n = lower.shape[-1]
-    return _take(lax.reshape(lower, (n * n,)), np.flatnonzero(np.tri(n, k=-1)))
+    return _take_entries(lax.reshape(lower, (n * n,)), np.flatnonzero(np.tri(n, k=-1)))
 
 
-def _take(entries: jax.Array, places: np.ndarray) -> jax.Array:
+def _take_entries(entries: jax.Array, places: np.ndarray) -> jax.Array:
     """Take entries of the last axis at places that are known."""
     axis = entries.ndim - 1
     numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
@@ -103,12 +104,12 @@ def is_positive(x: jax.Array) -> jax.Array:
     return x > float(np.finfo(np.dtype(x.dtype)).tiny)
 
 
-def inverse(x: jax.Array) -> jax.Array:
+def reciprocal_or_one(x: jax.Array) -> jax.Array:
     """1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
     return 1 / jnp.where(is_positive(x), x, 1.0)
 
 
-def reciprocal(x: jax.Array) -> jax.Array:
+def reciprocal_or_zero(x: jax.Array) -> jax.Array:
     """1 / x of a positive number, and 0 of 0."""
     positive = is_positive(x)
     return jnp.where(positive, 1 / jnp.where(positive, x, 1.0), 0.0)
@@ -120,8 +121,8 @@ def square_root(x: jax.Array) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
-def triangular(columns: Columns) -> Columns:
-    """Return L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
+def triangularise(columns: Columns) -> Columns:
+    """Find L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
 
     d_j = |row j|^2 in the weights, L_ij = (row i, row j) / d_j, and row i loses L_ij row j. c n (n + 1) products for c
     columns, n reciprocals. A row that depends on those above it has d = 0 and adds nothing to those below.
@@ -130,34 +131,36 @@ def triangular(columns: Columns) -> Columns:
     """
     rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
     if len(rows) > WRITTEN:
-        return _long_triangular(rows, weights)
+        return _triangularise_in_loop(rows, weights)
     n, lower, variances = len(rows), [], []
     for j in range(n):
         row = lax.index_in_dim(rows, j, keepdims=False)
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
-        share = _below(j, outer(lax.dot(rows, weighted), lax.reshape(inverse(variances[j]), (1,))))
+        share = _column_below_diagonal(
+            j, outer(lax.dot(rows, weighted), lax.reshape(reciprocal_or_one(variances[j]), (1,)))
+        )
         rows = rows - outer(share, row)
         lower.append(share)
-    return _factors(lower, variances, rows.dtype)
+    return _assemble_factors(lower, variances, rows.dtype)
 
 
 def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
-    """Return L and d with L diag(d) L' = P, by elimination: n^3 / 6 products, n reciprocals.
+    """Factor P = L diag(d) L' by elimination: n^3 / 6 products, n reciprocals.
 
     A pivot is known to eps of its own variance, of which rounding may leave less than nothing: it is at least `least`
     times it.
     """
     if len(covariance) > WRITTEN:
-        return _long_eliminated(covariance, least)
+        return _eliminate_in_loop(covariance, least)
     n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
         variances.append(_bound_below(column[j], least * covariance[j, j]))
-        share = _below(j, outer(column, lax.reshape(reciprocal(variances[j]), (1,))))
+        share = _column_below_diagonal(j, outer(column, lax.reshape(reciprocal_or_zero(variances[j]), (1,))))
         rest = symmetric(rest - outer(share, column))
         lower.append(share)
-    return _factors(lower, variances, covariance.dtype)
+    return _assemble_factors(lower, variances, covariance.dtype)
 
 
 def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
@@ -255,13 +258,13 @@ def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
     return jnp.where(pivot >= floor, pivot, floor)
 
 
-def _below(j: int, column: jax.Array) -> jax.Array:
+def _column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
     """Return column j of L without its diagonal: the entries below it, zeros above."""
     n = len(column)
     return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
 
 
-def _factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> Columns:
+def _assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> Columns:
     """Put L and d together from the columns below the diagonal and the entries of d."""
     n = len(variances)
     if not n:
@@ -270,40 +273,40 @@ def _factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype
     return Columns(below + np.eye(n, dtype=dtype), lax.concatenate([lax.reshape(d, (1,)) for d in variances], 0))
 
 
-def _long_triangular(rows: jax.Array, weights: jax.Array) -> Columns:
-    """Compute `triangular` as a loop over the rows."""
+def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
+    """Compute `triangularise` as a loop over the rows."""
     n = len(rows)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rows, lower, variances = carry
         weighted = weights * rows[j]
         d = rows[j] @ weighted
-        share = jnp.where(np.arange(n) > j, rows @ weighted * inverse(d), 0.0)
-        return rows - jnp.outer(share, rows[j]), *_with_column(j, lower, share, variances, d)
+        share = jnp.where(np.arange(n) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
+        return rows - jnp.outer(share, rows[j]), *_insert_column(j, lower, share, variances, d)
 
     start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
     return Columns(lower, variances)
 
 
-def _long_eliminated(covariance: jax.Array, least: float) -> Columns:
+def _eliminate_in_loop(covariance: jax.Array, least: float) -> Columns:
     """Compute `eliminate` as a loop over the columns."""
     n, whole = len(covariance), jnp.diagonal(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rest, lower, variances = carry
         d = _bound_below(rest[j, j], least * whole[j])
-        share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal(d), 0.0)
-        return rest - jnp.outer(share, rest[j]), *_with_column(j, lower, share, variances, d)
+        share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal_or_zero(d), 0.0)
+        return rest - jnp.outer(share, rest[j]), *_insert_column(j, lower, share, variances, d)
 
     start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
     return Columns(lower, variances)
 
 
-def _with_column(
+def _insert_column(
     j: jax.Array, lower: jax.Array, share: jax.Array, variances: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Put a column into L, below its diagonal, and an entry into d, both zero before, at a place that a loop counts."""
+    """Insert column j of L below its diagonal and entry j of d, at a place that a loop counts."""
     here = np.arange(len(variances)) == j
     return jnp.where(here, lower + share[:, None], lower), jnp.where(here, d, variances)

@@ -20,14 +20,14 @@ from heliograph.factors.columns import (
     decorrelate,
     eliminate,
     factor_constant,
-    inverse,
     is_positive,
     join_columns,
-    nothing,
-    reciprocal,
-    triangular,
+    reciprocal_or_one,
+    reciprocal_or_zero,
+    triangularise,
     unit_lower,
     unit_of,
+    zero_covariance,
 )
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, WRITTEN, rounding, symmetric
 from heliograph.numerics.traced import is_traced, library
@@ -67,28 +67,28 @@ class Gaussian(NamedTuple):
         return xp.where(upper, product, xp.swapaxes(product, -1, -2))
 
 
-def of_columns(mean: jax.Array, columns: Columns) -> Gaussian:
-    """Make a Gaussian whose covariance is a sum of squares: by orthogonal rows, to eps^2 of each variance."""
-    factors = triangular(columns)
+def from_columns(mean: jax.Array, columns: Columns) -> Gaussian:
+    """Gaussian of a covariance that is a sum of squares W diag(w) W', by orthogonal rows: exact to eps^2."""
+    factors = triangularise(columns)
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
-def of_sum(mean: jax.Array, *parts: Columns) -> Gaussian:
-    """Make the same Gaussian by the sum's matrix: 2/3 of the products, each variance to n eps of itself."""
+def from_summed_covariance(mean: jax.Array, *parts: Columns) -> Gaussian:
+    """Gaussian of Cov = sum of the parts, by elimination of the summed matrix: faster, less exact."""
     total = parts[0].covariance
     for part in parts[1:]:
         total = total + part.covariance
-    return of_matrix(mean, total)
+    return from_covariance_by_elimination(mean, total)
 
 
-def of_matrix(mean: jax.Array, covariance: jax.Array) -> Gaussian:
-    """Make a Gaussian of a covariance matrix that is a sum of squares, by elimination."""
+def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Gaussian:
+    """Gaussian of a covariance matrix that was summed of squares, by elimination."""
     factors = eliminate(covariance, len(covariance) * unit_of(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
-def given(mean: Array, covariance: Array) -> Gaussian:
-    """Make a Gaussian of a covariance matrix, the border to all that has one; each variance to n eps of itself."""
+def from_covariance(mean: Array, covariance: Array) -> Gaussian:
+    """Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself."""
     if isinstance(covariance, np.ndarray):
         factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_constant(covariance))
         return Gaussian(*factors)
@@ -96,9 +96,11 @@ def given(mean: Array, covariance: Array) -> Gaussian:
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
 
 
-def move(x: Gaussian, matrix: Any, shift: Array, noise: Columns) -> Gaussian:
-    """Move x to F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w. F is a matrix, or has its `@`."""
-    return of_columns(jnp.asarray(matrix @ x.mean + shift), join_columns(Columns(matrix @ x.root, x.variances), noise))
+def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: Columns) -> Gaussian:
+    """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
+    return from_columns(
+        jnp.asarray(matrix @ x.mean + shift), join_columns(Columns(matrix @ x.root, x.variances), noise)
+    )
 
 
 class Image(NamedTuple):
@@ -118,7 +120,7 @@ class Image(NamedTuple):
     @property
     def slopes(self) -> jax.Array:
         """Slopes in xi, 0 in what is known, (p, n)."""
-        return jnp.asarray(self.explained.matrix * reciprocal(jnp.asarray(self.unit)))
+        return jnp.asarray(self.explained.matrix * reciprocal_or_zero(jnp.asarray(self.unit)))
 
     @property
     def columns(self) -> Columns:
@@ -128,7 +130,7 @@ class Image(NamedTuple):
 
 def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: Columns | None = None) -> Image:
     """Image of an f of which the slopes in xi are computed, affine where it has no curvature."""
-    rest = nothing(len(mean)) if curvature is None else curvature
+    rest = zero_covariance(len(mean)) if curvature is None else curvature
     return Image(mean, Columns(slopes, x.variances), np.ones(len(x.mean)), rest)
 
 
@@ -142,22 +144,22 @@ def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns)
     return Gaussian(jnp.concatenate([x.mean, mean]), below_diagonal(root), variances)
 
 
-def leading(x: Gaussian, n: int) -> Gaussian:
-    """Return the law of the first n components alone: the first rows of L."""
+def take_leading(x: Gaussian, n: int) -> Gaussian:
+    """Marginal Gaussian of the first n components: the first rows of L."""
     return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
 
 
 def sum_unexplained(image: Image, noise: Columns) -> Columns:
-    """Return n columns of what f(x) + w has beside its slopes: curvature + Cov w, `noise` as `triangular` makes it."""
-    return of_sum(image.mean, image.curvature, noise).columns if len(image.curvature.weights) else noise
+    """Return n columns of Cov (f(x) + w) beside its slopes: curvature + Cov w, `noise` as of `triangularise`."""
+    return from_summed_covariance(image.mean, image.curvature, noise).columns if len(image.curvature.weights) else noise
 
 
-def transform(image: Image, noise: Columns) -> Gaussian:
-    """Return the law of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
+def add_noise_to_image(image: Image, noise: Columns) -> Gaussian:
+    """Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
 
-    Slopes by orthogonal rows, as `move` does: a prior may tie what a precise measurement has to tell apart.
+    Slopes by orthogonal rows, as `predict_affine` does: a prior may tie what a precise measurement has to tell apart.
     """
-    return of_columns(image.mean, join_columns(image.explained, sum_unexplained(image, noise)))
+    return from_columns(image.mean, join_columns(image.explained, sum_unexplained(image, noise)))
 
 
 class Innovations(NamedTuple):
@@ -189,7 +191,7 @@ class Innovations(NamedTuple):
         return jnp.sum(jnp.where(present, jnp.where(determined, agrees, density), 0.0))
 
 
-def observe(
+def condition_on_observation(
     x: Gaussian, slopes: jax.Array, innovation: jax.Array, noise: Columns, present: jax.Array | None = None
 ) -> tuple[Gaussian, Innovations]:
     """Condition x = m + L xi on z = E z + slopes xi + v, given z - E z.
@@ -201,7 +203,7 @@ def observe(
     n, m = len(x.mean), len(innovation)
     present = ~jnp.isnan(innovation) if present is None else present
     # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
-    fresh = triangular(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    fresh = triangularise(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = jnp.where(present[:, None], rows, 0.0)
     whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
@@ -259,7 +261,7 @@ def _measure_product(
     product, power = products
     s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], 0)), (0,))
     after, kept, w = _revise_columns(root, d, product, f, s)
-    return after, kept, w * inverse(s[0]), s[0]
+    return after, kept, w * reciprocal_or_one(s[0]), s[0]
 
 
 def _revise_columns(
@@ -268,7 +270,7 @@ def _revise_columns(
     """Return V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
     n, lower = len(d), np.tril(np.ones(root.shape, bool))
     w = lax.cumsum(lax.select(lower, root * product, jnp.zeros_like(root)), axis=1, reverse=True)
-    over = inverse(s)  # where s is 0, so is what it divides
+    over = reciprocal_or_one(s)  # where s is 0, so is what it divides
     # s_j and s_{j+1}, and one over each.
     s_here, s_next = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
     over_here, over_next = lax.slice_in_dim(over, 0, n), lax.slice_in_dim(over, 1, n + 1)
@@ -280,8 +282,8 @@ def _revise_columns(
     return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False)
 
 
-def revise(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
-    """Change the law of one scalar t = E t + row xi, and leave that of x given t: what is learned is of t alone.
+def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
+    """Give t = E t + row xi a new mean and variance (shift, ratio) and leave x given t: a rank-one update of L, d.
 
     The mean of t moves by `shift`, its variance V = row diag(d) row' becomes `ratio` times V, as by a likelihood of t
     of any shape: mean + K shift and P - (1 - ratio) K V K', K = Cov(x, t) / V. With f = row and
@@ -299,7 +301,7 @@ def revise(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> G
     before = jnp.append(0.0, lax.cumsum(power))
     s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
     root, variances, w = _revise_columns(x.root, x.variances, product, (1 - ratio) * row, s)
-    return Gaussian(x.mean + w * (inverse(s[0]) * shift), below_diagonal(root), variances)
+    return Gaussian(x.mean + w * (reciprocal_or_one(s[0]) * shift), below_diagonal(root), variances)
 
 
 def moments_of_mixture(
@@ -315,13 +317,13 @@ def moments_of_mixture(
     return means[0] + shift, symmetric(within + Columns((about - shift).T, weights).covariance)
 
 
-def merge(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
+def merge_mixture(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
     """Merge a mixture into one Gaussian of its moments; `parts` have a leading axis."""
-    return of_matrix(*moments_of_mixture(parts.mean, parts.covariance, weights))
+    return from_covariance_by_elimination(*moments_of_mixture(parts.mean, parts.covariance, weights))
 
 
-class Backwards(NamedTuple):
-    """Law of x given the next state x+ = m+ + L e: m + K e + a noise that is uncorrelated with e.
+class BackwardGain(NamedTuple):
+    """Regression of x on the next state x+ = m+ + L e: x = m + K e + a noise uncorrelated with e.
 
     J = K L^-1 of Rauch's form is never formed: a part of e that is nearly nothing has a large column of K, which would
     be spread over all of J, to cancel again.
@@ -337,21 +339,21 @@ class Backwards(NamedTuple):
 
     def mean_given(self, later: jax.Array) -> jax.Array:
         """E x, from that of x+."""
-        return self.left.mean + self.gain @ self.apart((later - self.ahead)[:, None])[:, 0]
+        return self.left.mean + self.gain @ self.apply_inverse_factor((later - self.ahead)[:, None])[:, 0]
 
-    def apart(self, rows: jax.Array) -> jax.Array:
+    def apply_inverse_factor(self, rows: jax.Array) -> jax.Array:
         """L^-1 times rows (n, ...)."""
         return decorrelate(unit_lower(self.lower), rows)
 
 
-def backwards(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) -> Backwards:
-    """Law of x = m + L_x xi given x+ = ahead + slopes xi + N omega: the next state measures this one, part by part.
+def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) -> BackwardGain:
+    """Regress x = m + L_x xi on x+ = ahead + slopes xi + N omega, taking x+ as a measurement, part by part.
 
     (x, x+) has the factors [[L_x, 0], [slopes, N]] and (d, r). Each part of x+, without a noise but omega, is measured:
     its innovation, given those before it, is a part of e, its gain a column of K and, of the parts to come, of L. Where
     those before it determine a part, its slopes are the rounding of n^3 products, UNITS eps each, and count as zero.
 
-    Shapes: slopes (n, n); noise N (n, n), unit lower, as `triangular` makes it, and r (n,).
+    Shapes: slopes (n, n); noise N (n, n), unit lower, as `triangularise` makes it, and r (n,).
     """
     n, root = len(x.mean), jnp.concatenate([x.root, slopes])
     whole = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
@@ -371,7 +373,7 @@ def backwards(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: Columns) 
 
     root, d, gains = _measure_parts(measure_part, n, root, x.variances)
     left = Gaussian(x.mean, below_diagonal(root[:n]), d)
-    return Backwards(left, gains[:n], ahead, below_diagonal(gains[n:]))
+    return BackwardGain(left, gains[:n], ahead, below_diagonal(gains[n:]))
 
 
 def _measure_parts(
@@ -394,13 +396,13 @@ def _measure_parts(
     return root, d, lax.concatenate(gains, 1)
 
 
-def smooth(back: Backwards, later: Gaussian) -> Gaussian:
-    """Law of x given all data, from that of the next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+), J = K L^-1.
+def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
+    """Smooth x by the smoothed next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+), J = K L^-1.
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
-    carried = Columns(back.gain @ back.apart(later.root), later.variances)
-    return of_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))
+    carried = Columns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
+    return from_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))
 
 
 def _stack_numbers(entries: list[jax.Array]) -> jax.Array:

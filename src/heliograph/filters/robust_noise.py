@@ -21,9 +21,9 @@ from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.outliers import (
     Branches,
     StudentT,
-    branches,
+    branches_of_noise,
     has_outliers,
-    nominal,
+    noise_without_outliers,
 )
 from heliograph.random_affine.superposed import Superposed
 
@@ -162,7 +162,7 @@ def describe_outlier_noise(
     rows, xp = np.arange(m), library(plain.power.center, sensed, late)
     squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
     # Moments of the noise without its outliers, as it arrives.
-    base, last = nominal(sensed), nominal(late) if late is not None else None
+    base, last = noise_without_outliers(sensed), noise_without_outliers(late) if late is not None else None
     source = _find_noisy_outputs(squares, base.covariance, plain)
     covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
     center = plain.mean_gain @ base.mean
@@ -170,12 +170,12 @@ def describe_outlier_noise(
         covariance, center = covariance + last.covariance, center + last.mean
     _check_weighable(covariance, apart)
     # Branches of the sensor's noise, and their pairs with those of the last hop's.
-    log_share, mean, variance = (values[source] for values in branches(sensed))
+    log_share, mean, variance = (values[source] for values in branches_of_noise(sensed))
     late_mean: Array = np.zeros(mean.shape)
     late_variance: Array = late_mean
     if late is not None:
         log_share, mean, variance, late_mean, late_variance = _combine_branches(
-            Branches(log_share, mean, variance), branches(late)
+            Branches(log_share, mean, variance), branches_of_noise(late)
         )
     return ReceivedNoise(
         log_share=log_share, mean=mean, variance=variance, late_mean=late_mean, late_variance=late_variance,

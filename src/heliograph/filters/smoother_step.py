@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, join_columns, triangular, unit_lower
-from heliograph.factors.gaussian import Backwards, Gaussian, backwards, of_columns, smooth
+from heliograph.factors.columns import Columns, decorrelate, join_columns, triangularise, unit_lower
+from heliograph.factors.gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.angle import Angles, wrap_angles
@@ -64,7 +64,7 @@ class SmootherStep(Module):
     """
 
     after: Gaussian
-    before: Backwards
+    before: BackwardGain
     projection: Float[jax.Array, "*time n N"] | None = eqx.field(default=None, kw_only=True)
     shift: Float[jax.Array, "*time n"] | None = eqx.field(default=None, kw_only=True)
     nis: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
@@ -85,7 +85,7 @@ class SmootherStep(Module):
 
     def back(self, later: Gaussian) -> Gaussian:
         """Smooth the state before the step from the state after it, both given the same later data (one RTS step)."""
-        return smooth(self.before, later)
+        return rts_step(self.before, later)
 
     def start(self) -> EarlierState:
         """Return the state after this step as an earlier state that is yet to be carried ahead."""
@@ -102,14 +102,14 @@ class SmootherStep(Module):
         before = self.before
         noise = Columns(point.through(before.left.root), before.left.variances)
         after = EarlierState(
-            point.mean, point.through(before.gain), before.lower, triangular(join_columns(point.noise, noise))
+            point.mean, point.through(before.gain), before.lower, triangularise(join_columns(point.noise, noise))
         )
         return after._replace(mean=point.mean + after.through((self.after.mean - before.ahead)[:, None])[:, 0])
 
     def reached(self, point: EarlierState) -> Gaussian:
         """Mean and covariance of an earlier state given all data up to this step."""
         now = Columns(point.through(self.after.root), self.after.variances)
-        return of_columns(point.mean, join_columns(now, point.noise))
+        return from_columns(point.mean, join_columns(now, point.noise))
 
     def with_data(self, mean_before: jax.Array, mean_prior: jax.Array, mean_after: jax.Array) -> Self:
         """Return the same step with other data of the same arrivals: other means."""
@@ -164,7 +164,7 @@ def smoother_step_of(
     slopes, noise = moved
     return SmootherStep(
         _gaussian_of(after),
-        backwards(_gaussian_of(before), jnp.asarray(slopes), jnp.asarray(prior.mean), noise),
+        condition_on_next_state(_gaussian_of(before), jnp.asarray(slopes), jnp.asarray(prior.mean), noise),
         claim=claim,
         angles=angles,
         projection=None if projection is None else jnp.asarray(projection),

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import numpy as np
 
-from heliograph.factors.gaussian import given
+from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.forecasting.horizons import Ahead, Horizons, Inputs, ahead_of, check_ahead
@@ -148,7 +148,7 @@ def _moved_alone(network: Network, estimate: Estimate) -> tuple[AbstractFilter, 
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     lowered = replace(filter, claim=claim)
     object.__setattr__(lowered, "kept", filter.kept)
-    return lowered, given(mean, covariance if claim != "none" else np.zeros_like(covariance))
+    return lowered, from_covariance(mean, covariance if claim != "none" else np.zeros_like(covariance))
 
 
 def _sensor_of(network: Network, node: str) -> AnySensor | None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call, compute_once
-from heliograph.factors.gaussian import Gaussian, given, leading
+from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import signal_of
@@ -56,7 +56,7 @@ class Outlook(Module):
         """Moments of the states, one part of a filter that has no more; the means alone where nothing is claimed."""
         if isinstance(state, HasComponents):
             weights, parts = state.components
-            parts = leading(parts, len(self.filter.states))
+            parts = take_leading(parts, len(self.filter.states))
             return Moments(weights, parts.mean, jnp.asarray(jax.vmap(lambda x: x.covariance)(parts)))
         estimate = self.filter.estimate(state)
         covariance = jnp.asarray(estimate.covariance)
@@ -74,7 +74,7 @@ class Outlook(Module):
         plant, sensor, start = at(self.plant, k), at(self.sensor, k), second_moments_at_start(self.plant)
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-            signal = signal_of(plant, sensor, self.transform, given(mean, covariance), start)
+            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start)
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)

@@ -11,7 +11,7 @@ from .informed import (
     MatrixWeights as MatrixWeights,
     ScalarWeights as ScalarWeights,
 )
-from .weights import (
+from .h_infinity_levels import (
     fused_error_norm as fused_error_norm,
     fused_level as fused_level,
     level_weights as level_weights,
@@ -19,7 +19,7 @@ from .weights import (
 from .mesh.graph import (
     neighbours_within as neighbours_within,
 )
-from .mesh.rules import (
+from .mesh.neighbour_rules import (
     DiffusionWeights as DiffusionWeights,
     FrozenWeights as FrozenWeights,
     TraceIntersection as TraceIntersection,

@@ -7,19 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of, eliminate, join_columns, rounding_of, square_root, unit_of
-from heliograph.factors.gaussian import Gaussian, gain_of, leading, move, of_columns
+from heliograph.factors.gaussian import Gaussian, from_columns, gain_of, predict_affine, take_leading
 from heliograph.filters.gaussian.signal import augmented_second_moment
-from heliograph.fusion.cross_covariance import ErrorMap, Errors
-from heliograph.fusion.informed import AbstractInformedFusion, Happened
+from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
+from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fused, Means
-from heliograph.linear.jump_system import propagate
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.types import Array, Bool, Float
 
 
-class Past(NamedTuple):
+class PastReports(NamedTuple):
     """Reports sent 0, 1, ... steps ago: mean gain, offset, mean noise Cov(z | sent), and the quantizers' error.
 
     Shapes: gain (age, node, m, n), offset (age, node, m), noise (age, node, m, m), error (age, node, n).
@@ -39,7 +39,7 @@ class ReportsBelief(NamedTuple):
     """
 
     gaussian: Gaussian
-    past: Past
+    past: PastReports
     spill: Float[jax.Array, "N N"] | None
 
 
@@ -64,25 +64,27 @@ class AllReports(AbstractInformedFusion):
         """True: it uses reports that fade, are late, or never arrive."""
         return True
 
-    def start(self, errors: Errors) -> ReportsBelief:
+    def start(self, errors: ErrorMoments) -> ReportsBelief:
         """Return the state before the first report, over lossless links."""
-        return begin(errors, 0, errors.bias.shape[1], quantized=False)
+        return initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
 
-    def use(self, state: ReportsBelief, happened: Happened, means: Means) -> tuple[ReportsBelief, Fused]:
-        """Move the plant and all errors, then use the reports; one that is NaN did not arrive."""
+    def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
+        """Predict plant and all errors, then correct with the reports; one that is NaN did not arrive."""
         nodes, n = means.shape
-        after, _ = receive_reports(propagate_errors(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
+        after, _ = correct_with_reports(
+            propagate_errors(state, happened, lossless_links(nodes, n)), jnp.asarray(means)[None]
+        )
         return after, estimate_state(after, n)
 
 
-def faithful(nodes: int, n: int) -> ReportModel:
-    """Lossless links, which deliver what is sent."""
+def lossless_links(nodes: int, n: int) -> ReportModel:
+    """Model of links that deliver what is sent, unchanged and at once."""
     zero = np.zeros((nodes, n))
     return ReportModel(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
 
 
-def begin(errors: Errors, delays: int, received: int, quantized: bool) -> ReportsBelief:
-    """Return the state before the first report, for so many `delays` and `received` numbers per report.
+def initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
+    """State before the first report, for so many `delays` and `received` numbers per report.
 
     Every error is that of x_0 then, up to a constant; nothing has been sent.
     """
@@ -92,9 +94,9 @@ def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Report
     root = jnp.pad(jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1)), (unsent, (0, 0)))
     mean = jnp.pad(errors.mean.reshape(-1), unsent)
     shapes = (received, n), (received,), (received, received), (n,)
-    past = Past(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
+    past = PastReports(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
     spill = jnp.zeros((len(mean), len(mean))) if quantized else None
-    return ReportsBelief(of_columns(mean, Columns(root, start.weights)), past, spill)
+    return ReportsBelief(from_columns(mean, Columns(root, start.weights)), past, spill)
 
 
 class ReportLine(NamedTuple):
@@ -113,7 +115,7 @@ class ReportLine(NamedTuple):
         return jnp.concatenate([moved, sent, past[: -nodes * n]])
 
 
-def propagate_errors(state: ReportsBelief, happened: Happened, links: ReportModel) -> ReportsBelief:
+def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportModel) -> ReportsBelief:
     """Predict zeta+ = F zeta + f + B w - K nu; then each node sends x - e_i."""
     step, errors = happened
     nodes, n, _ = step.gain.shape
@@ -127,23 +129,27 @@ def propagate_errors(state: ReportsBelief, happened: Happened, links: ReportMode
     # Past reports move on by one place, without a noise.
     line = ReportLine(step.transition)
     shift, noise = jnp.pad(step.shift, (0, length - moved)), noise.through(np.eye(length, moved))
-    spill = None if state.spill is None else symmetric(propagate(line, state.spill, 0.0))
-    return ReportsBelief(move(state.gaussian, line, shift, noise), _prepend_present(state.past, errors, links), spill)
+    spill = None if state.spill is None else symmetric(propagate_by_mode(line, state.spill, 0.0))
+    return ReportsBelief(
+        predict_affine(state.gaussian, line, shift, noise), _prepend_present(state.past, errors, links), spill
+    )
 
 
-def _square_mean(errors: Errors) -> Float[jax.Array, " n"]:
+def _square_mean(errors: ErrorMoments) -> Float[jax.Array, " n"]:
     """E[x_i^2] before any data."""
     return jnp.asarray(errors.state_mean**2 + jnp.diagonal(errors.state_covariance))
 
 
-class Expected(NamedTuple):
+class PredictedReports(NamedTuple):
     """Predicted mean of the reports, (age, node, m) flattened, and their innovation covariance."""
 
     mean: Float[jax.Array, " M"]
     covariance: Float[jax.Array, "M M"]
 
 
-def receive_reports(state: ReportsBelief, reports: Float[jax.Array, "age node m"]) -> tuple[ReportsBelief, Expected]:
+def correct_with_reports(
+    state: ReportsBelief, reports: Float[jax.Array, "age node m"]
+) -> tuple[ReportsBelief, PredictedReports]:
     """Correct with the reports that arrived, by their age in steps; NaN for those that did not arrive now.
 
     With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
@@ -152,7 +158,7 @@ def receive_reports(state: ReportsBelief, reports: Float[jax.Array, "age node m"
     that K times these slopes is an eps too.
     """
     x, past, values = state.gaussian, state.past, jnp.ravel(reports)
-    output, offset = _output(past, len(x.mean)), jnp.ravel(past.offset)
+    output, offset = _output_matrix(past, len(x.mean)), jnp.ravel(past.offset)
     expected, present, noise = output @ x.mean + offset, ~jnp.isnan(values), _factor_each(past.noise)
     gain, unexpected = _gain_of_reports(x, output, past, present), jnp.where(present, values - expected, 0.0)
     # Joseph's form, sums of squares; the errors mu themselves enter the bound (Young, Cauchy).
@@ -160,14 +166,14 @@ def receive_reports(state: ReportsBelief, reports: Float[jax.Array, "age node m"
     kept = join_columns(Columns(keep @ x.root, x.variances), noise.through(gain))
     spill = None
     if state.spill is not None:
-        push = _within(gain @ _along_diagonal(past.gain), jnp.ravel(past.error))
-        spill = symmetric(_sum(propagate(keep, state.spill, 0.0), push))
-    law = Expected(expected, join_columns(Columns(output @ x.root, x.variances), noise).covariance)
-    return ReportsBelief(of_columns(x.mean + gain @ unexpected, kept), past, spill), law
+        push = _cauchy_bound(gain @ _block_diagonal(past.gain), jnp.ravel(past.error))
+        spill = symmetric(_young_sum(propagate_by_mode(keep, state.spill, 0.0), push))
+    law = PredictedReports(expected, join_columns(Columns(output @ x.root, x.variances), noise).covariance)
+    return ReportsBelief(from_columns(x.mean + gain @ unexpected, kept), past, spill), law
 
 
 def _gain_of_reports(
-    x: Gaussian, output: Float[jax.Array, "M N"], past: Past, present: Bool[jax.Array, " M"]
+    x: Gaussian, output: Float[jax.Array, "M N"], past: PastReports, present: Bool[jax.Array, " M"]
 ) -> Float[jax.Array, "N M"]:
     """Gain of what arrived, with quantizers' errors and rounding as noise of each report."""
     one, shape = np.eye(past.noise.shape[-1]), past.offset.shape
@@ -183,11 +189,11 @@ def _gain_of_reports(
 
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
     """Estimate of x, with the covariance of its error or a bound on it."""
-    x = leading(state.gaussian, n)
-    return x.mean, x.covariance if state.spill is None else _sum(x.covariance, state.spill[:n, :n])
+    x = take_leading(state.gaussian, n)
+    return x.mean, x.covariance if state.spill is None else _young_sum(x.covariance, state.spill[:n, :n])
 
 
-def _prepend_present(past: Past, errors: Errors, links: ReportModel) -> Past:
+def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
     """Put the present reports before those of earlier steps."""
     mean = errors.state_mean - errors.bias
     blocks = jnp.einsum("iaib->iab", errors.joint)
@@ -199,11 +205,11 @@ def _prepend_present(past: Past, errors: Errors, links: ReportModel) -> Past:
     known = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
     known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))
     noise = jnp.einsum("iabcd,icd->iab", links.spread, known)
-    new = Past(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
-    return Past(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
+    new = PastReports(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
+    return PastReports(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
 
 
-def _output(past: Past, length: int) -> Float[jax.Array, "M N"]:
+def _output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
     """Output matrix of the reports: mean gains on x - e_i now, and on the reports of earlier steps."""
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
@@ -218,17 +224,17 @@ def _measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Colu
     nodes, _, m = gain.shape
     each = noise.ndim == 3
     received = _factor_each(jnp.asarray(noise)[None]) if each else columns_of(noise.reshape(nodes * m, nodes * m))
-    return received.through(_along_diagonal(gain[None]))
+    return received.through(_block_diagonal(gain[None]))
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> Columns:
     """Factors of the covariance of noises that are independent of each other, of all reports together."""
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
-    return Columns(_along_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
+    return Columns(_block_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
 
 
-def _along_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
+def _block_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
     """Block-diagonal matrix of these blocks."""
     ages, nodes, rows, columns = blocks.shape
     items = jnp.arange(ages * nodes)
@@ -237,13 +243,13 @@ def _along_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array
     return full.reshape(len(items) * rows, len(items) * columns)
 
 
-def _within(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
+def _cauchy_bound(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
     """B with (B mu)(B mu)' <= B s diag(D) B' for |mu| <= D, s = sum D over what B uses (Cauchy)."""
     used = jnp.where(jnp.any(into != 0, axis=0), error, 0.0)
     return jnp.sum(used) * (into * used) @ into.T
 
 
-def _sum(a: jax.Array, b: jax.Array) -> jax.Array:
+def _young_sum(a: jax.Array, b: jax.Array) -> jax.Array:
     """(1 + s / r) A + (1 + r / s) B, a bound on E[(u + v)(u + v)'] of least trace: r^2 = tr A, s^2 = tr B (Young)."""
     r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
     both = (r > 0) & (s > 0)

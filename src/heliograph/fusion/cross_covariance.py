@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import LinearStep
-from heliograph.linear.jump_system import propagate
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
@@ -82,13 +82,13 @@ class ErrorStep(NamedTuple):
         if self.received.ndim == 4:
             measured = jnp.einsum("iam,imjl,jbl->iajb", self.gain, self.received, self.gain)
         else:
-            items, blocks = jnp.arange(nodes), symmetrize(propagate(self.gain, self.received, 0.0))
+            items, blocks = jnp.arange(nodes), symmetrize(propagate_by_mode(self.gain, self.received, 0.0))
             measured = jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(blocks)
         added = jnp.pad(measured.reshape(nodes * n, nodes * n), ((n, 0), (n, 0)))
-        return jnp.asarray(propagate(self.of_noise, self.process, added))
+        return jnp.asarray(propagate_by_mode(self.of_noise, self.process, added))
 
 
-class Errors(NamedTuple):
+class ErrorMoments(NamedTuple):
     """Moments of zeta = (x, e_1, ..., e_nodes), of the plant's state and the errors e_i = x - m_i, before any data.
 
     Shapes: mean (1 + node, n), covariance (N, N).
@@ -126,10 +126,12 @@ class Errors(NamedTuple):
         return self.covariance[n:, n:].reshape(nodes, n, nodes, n)
 
 
-def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]) -> Errors:
+def initial_errors(
+    mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]
+) -> ErrorMoments:
     """Moments before the first step: every filter starts at a known mean, so all errors are x_0 up to a constant."""
     mean, starts = jnp.asarray(mean), jnp.asarray(starts)
-    return Errors(jnp.concatenate([mean[None], mean - starts]), jnp.tile(covariance, (1 + len(starts),) * 2))
+    return ErrorMoments(jnp.concatenate([mean[None], mean - starts]), jnp.tile(covariance, (1 + len(starts),) * 2))
 
 
 def error_step(filters: LinearStep, motion: Motion, observation: Observation) -> ErrorStep:
@@ -155,14 +157,14 @@ def propagate_state(
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """E x and Cov x after the step."""
     matrix = jnp.asarray(motion.matrix)
-    return matrix @ mean + motion.shift, symmetric(propagate(matrix, covariance, motion.noise))
+    return matrix @ mean + motion.shift, symmetric(propagate_by_mode(matrix, covariance, motion.noise))
 
 
-def advance(errors: Errors, step: ErrorStep) -> Errors:
-    """Propagate the moments of zeta, of all pairs of nodes: F P F' + B Q B' + K E[nu nu'] K'."""
+def propagate_errors_jointly(errors: ErrorMoments, step: ErrorStep) -> ErrorMoments:
+    """Propagate all pairs: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', and the terms of a wrong model."""
     mean = step.transition @ errors.mean.reshape(-1) + step.shift
-    covariance = symmetric(propagate(step.transition, errors.covariance, step.noise()))
-    return Errors(mean.reshape(errors.mean.shape), covariance)
+    covariance = symmetric(propagate_by_mode(step.transition, errors.covariance, step.noise()))
+    return ErrorMoments(mean.reshape(errors.mean.shape), covariance)
 
 
 class ErrorSources(NamedTuple):
@@ -192,7 +194,7 @@ class ErrorSources(NamedTuple):
         return xp.tensordot(weights, self.shared, axes=2), independent
 
 
-class Factors(NamedTuple):
+class SourceFactors(NamedTuple):
     """Moments of zeta by their sources: zeta = E zeta + roots s + (0, a_1, ..., a_nodes), Cov s = I.
 
     s are x_0 and the process noise of each step, and the channels' noise where nodes share it; a_i is independent, of
@@ -217,15 +219,15 @@ class Factors(NamedTuple):
         return ErrorSources(self.roots[n:].reshape(-1, n, self.roots.shape[1]), self.independent)
 
 
-def initial_factors(errors: Errors, sources: int) -> Factors:
+def initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
     """Factors before the first step, with room for `sources` more: all is the deviation of x_0."""
     nodes, n = errors.bias.shape
     state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))
-    return Factors(errors.mean, jnp.tile(state, (1 + nodes, 1)), jnp.zeros((nodes, n, n)))
+    return SourceFactors(errors.mean, jnp.tile(state, (1 + nodes, 1)), jnp.zeros((nodes, n, n)))
 
 
-def advance_factors(factors: Factors, step: ErrorStep, k: jax.Array) -> Factors:
-    """Propagate over step k: s gets the process noise, and the measurement noise where nodes share it."""
+def propagate_factors(factors: SourceFactors, step: ErrorStep, k: jax.Array) -> SourceFactors:
+    """Propagate factors over step k: s gets the process noise, and the measurement noise where nodes share it."""
     nodes, n, m = step.gain.shape
     new, added = step.of_noise @ cholesky(jnp.asarray(step.process)), jnp.zeros(())
     # Shared measurement noise is a source, independent noise stays the node's.
@@ -234,12 +236,12 @@ def advance_factors(factors: Factors, step: ErrorStep, k: jax.Array) -> Factors:
         sources = (-step.gain @ root).reshape(nodes * n, -1)
         new = jnp.concatenate([new, jnp.pad(sources, ((n, 0), (0, 0)))], axis=1)
     else:
-        added = propagate(step.gain, step.received, 0.0)
+        added = propagate_by_mode(step.gain, step.received, 0.0)
     # The new sources of step k go to columns of their own.
     mean = step.transition @ factors.mean.reshape(-1) + step.shift
     roots = jax.lax.dynamic_update_slice(step.transition @ factors.roots, new, (0, n + new.shape[1] * k))
-    independent = symmetrize(propagate(step.transition.errors, factors.independent, added))
-    return Factors(mean.reshape(factors.mean.shape), roots, independent)
+    independent = symmetrize(propagate_by_mode(step.transition.errors, factors.independent, added))
+    return SourceFactors(mean.reshape(factors.mean.shape), roots, independent)
 
 
 def _subtract(a: Array, b: Array) -> jax.Array:

@@ -6,20 +6,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.fusion.cross_covariance import Errors, ErrorStep
-from heliograph.fusion.mesh.gains import Believed, Weights
-from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
-from heliograph.fusion.weights import (
+from heliograph.fusion.cross_covariance import ErrorMoments, ErrorStep
+from heliograph.fusion.joint_covariance_weights import (
     component_weights,
     diagonal_weights,
     matrix_weights,
     scalar_weights,
-    solve_arrived_scalar_weights,
-    solve_arrived_weights,
-    solve_arrived_weights_by_component,
+    solve_regularised_scalar_weights,
+    solve_regularised_weights,
+    solve_regularised_weights_by_component,
     weigh_covariance,
     weigh_covariance_by_component,
 )
+from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights
+from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import WRITTEN
@@ -29,17 +29,17 @@ from heliograph.numerics.types import Array, Bool, Float, PyTree
 Joint = Float[jax.Array, "node n node n"]
 
 
-class Happened(NamedTuple):
-    """One step as the fusion centre knows it: of plant and errors, and their moments after it."""
+class CentreStep(NamedTuple):
+    """What the centre knows of one step: motion, error recursion, E[nu nu'], and joint moments after it."""
 
     step: ErrorStep
-    errors: Errors
+    errors: ErrorMoments
 
 
 class AbstractInformedFusion(AbstractFusion):
     """A rule that needs the joint covariance of the local errors; a `Network` propagates it for the rule.
 
-    `start` is the rule's state before the first step, `use` updates it with the reports of one step.
+    `start` is the rule's state before the first step, `fuse_step` updates it with the reports of one step.
     """
 
     @property
@@ -49,21 +49,22 @@ class AbstractInformedFusion(AbstractFusion):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """Refused: the local claims do not determine the joint covariance."""
-        raise self._lacking()
+        raise self._refuse_without_joint()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Refused: the local covariances alone are not enough."""
-        raise self._lacking()
+        raise self._refuse_without_joint()
 
-    def start(self, errors: Errors) -> PyTree:
+    def start(self, errors: ErrorMoments) -> PyTree:
         """Return the rule's state before the first step."""
         return ()
 
-    def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
-        """Return next state, fused mean and covariance, from the nodes' means after a step."""
-        raise unwritten(self, "use")
+    def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
+        """Fuse the nodes' means after a step: return the next state, and fused mean and covariance."""
+        raise unwritten(self, "fuse_step")
 
-    def _lacking(self) -> ValueError:
+    def _refuse_without_joint(self) -> ValueError:
+        """Make the ValueError of a rule that is called without the joint covariance of the errors."""
         what = "the errors' joint covariance, which a Network of linear filters has"
         return fail(f"fusion by {type(self).__name__}", what, "estimates with a covariance each")
 
@@ -95,15 +96,17 @@ class AbstractWeights(AbstractInformedFusion):
         """Compute W from P for those estimates that are present, zero for the others."""
         raise unwritten(self, "arrived")
 
-    def neighbour_weights(self, believed: Believed) -> Weights:
+    def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
         chosen = self.arrived(believed.joint, believed.present)
-        return Weights(jnp.eye(len(chosen)), jnp.swapaxes(chosen, 0, 1), weigh_covariance(chosen, believed.joint))
+        return NeighbourWeights(
+            jnp.eye(len(chosen)), jnp.swapaxes(chosen, 0, 1), weigh_covariance(chosen, believed.joint)
+        )
 
-    def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
-        """Weight the present estimates."""
+    def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
+        """Fuse the present estimates with the best weights for their joint covariance."""
         errors = happened.errors
         unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
@@ -138,7 +141,7 @@ class MatrixWeights(AbstractWeights):
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Weights of those that are present."""
-        return solve_arrived_weights(joint, present)
+        return solve_regularised_weights(joint, present)
 
 
 class DiagonalWeights(AbstractWeights):
@@ -160,15 +163,15 @@ class DiagonalWeights(AbstractWeights):
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Weights of those that are present."""
-        return solve_arrived_weights_by_component(joint, present)
+        return solve_regularised_weights_by_component(joint, present)
 
-    def neighbour_weights(self, believed: Believed) -> Weights:
+    def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
         if believed.joint is None or self.with_mean or len(believed.present) > WRITTEN:
             return super().neighbour_weights(believed)
         chosen = component_weights(believed.joint, believed.present)
         identity = jnp.eye(chosen.shape[1])
-        return Weights(identity, chosen, weigh_covariance_by_component(chosen, believed.joint))
+        return NeighbourWeights(identity, chosen, weigh_covariance_by_component(chosen, believed.joint))
 
 
 class ScalarWeights(AbstractWeights):
@@ -192,4 +195,4 @@ class ScalarWeights(AbstractWeights):
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Weights of those that are present."""
-        return solve_arrived_scalar_weights(joint, present)
+        return solve_regularised_scalar_weights(joint, present)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.fusion.mesh.gains import Believed, Weights
+from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights
 from heliograph.numerics.linalg import factor, psd_solve, rounding, solver, symmetric
 from heliograph.numerics.types import Float
 
@@ -28,7 +28,7 @@ def intersect(
     Differences of the means are used, since the matrices that multiply them have lost the digits that nearly dependent
     components cost: the means themselves may be millions of deviations from zero.
     """
-    covariance = inverse(_sum_weighted(weights, information))
+    covariance = invert(_sum_weighted(weights, information))
     off = jnp.einsum("k,kab,kb->a", weights, information, means - means[0])
     return means[0] + covariance @ off, covariance
 
@@ -76,7 +76,7 @@ def _trace_derivatives(
     information: Float[jax.Array, "count n n"], w: Float[jax.Array, " count"]
 ) -> tuple[Float[jax.Array, ""], Float[jax.Array, " count"], Float[jax.Array, "count count"]]:
     """Return tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
-    p = inverse(_sum_weighted(w, information))
+    p = invert(_sum_weighted(w, information))
     half = information @ p  # J_k P
     full = p @ half
     hessian = 2 * symmetric(jnp.einsum("kab,jba->kj", half, full))
@@ -133,11 +133,11 @@ def intersect_inversely(
     itself is too flat to tell weights apart that differ by 1e-8. Estimates of one covariance have equal weights.
     """
     both = jnp.stack([p, q])
-    p_information, q_information = inverses(both)
+    p_information, q_information = invert_covariances(both)
 
     def fused(w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        common = inverses((w * p + (1 - w) * q)[None])[0]
-        return inverse(p_information + q_information - common), common
+        common = invert_covariances((w * p + (1 - w) * q)[None])[0]
+        return invert(p_information + q_information - common), common
 
     # Bisection of the slope.
     def halve(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -154,16 +154,16 @@ def intersect_inversely(
     covariance, common = fused(w)
     # The two factors sum to the fused information: of differences, as above.
     mean = a + covariance @ ((q_information - (1 - w) * common) @ (b - a))
-    return replace_known(mean, symmetric(covariance), jnp.stack([a, b]), both)
+    return restore_exact_components(mean, symmetric(covariance), jnp.stack([a, b]), both)
 
 
-def inverse(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
-    """Return A^-1 of a positive definite A."""
+def invert(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
+    """Invert a positive definite matrix."""
     return symmetric(psd_solve(a, jnp.eye(len(a))))
 
 
-def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
-    """Invert several covariances P_k of one state; components that an estimate knows exactly count as known to KNOWN.
+def invert_covariances(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
+    """Invert covariances P_k of one state; a component of variance 0 counts as known to KNOWN.
 
     A component with less than KNOWN of its variance left, given those before it, gets KNOWN of it added; a component of
     variance zero gets KNOWN of the largest variance that any of the estimates has for it (1 where all are zero): the
@@ -176,20 +176,22 @@ def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count
 
 
 def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
+    """Invert a covariance whose variances are at least `least`."""
     _, scales = factor(a)  # 1 / root of what those before it leave of a component: rounding where that is next to none
     none = jnp.where((scales == 0) | (scales**2 * least > 1), 1.0, 0.0)
-    return inverse(a + jnp.diag(none * least))
+    return invert(a + jnp.diag(none * least))
 
 
-def replace_known(
+def restore_exact_components(
     mean: Float[jax.Array, " n"],
     covariance: Float[jax.Array, "n n"],
     means: Float[jax.Array, "count n"],
     inputs: Float[jax.Array, "count n n"],
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Replace each component of a fused estimate that an input knows exactly by that input's, of variance zero.
+    """Where an input has variance 0, give the fused estimate that input's mean, and variance 0.
 
-    In `inverses` a small number stands for no variance, of which the mean would keep 1e-8 of what the others say.
+    In `invert_covariances` a small number stands for no variance, of which the mean would keep 1e-8 of what the
+    others say.
     """
     exact = jnp.diagonal(inputs, axis1=1, axis2=2) == 0
     for own, is_exact in zip(reversed(list(means)), reversed(list(exact)), strict=True):
@@ -201,13 +203,13 @@ def replace_known(
 Shared = tuple[Float[jax.Array, " degree"], Float[jax.Array, "n n"]]  # shares pi, and (sum_j pi_j P_j^-1)^-1
 
 
-def equal_shares(believed: Believed) -> Shared:
+def equal_shares(believed: NeighbourEstimates) -> Shared:
     """Return one share for each estimate that arrived."""
     present = believed.present.astype(believed.traces.dtype)
     return intersect_shares(believed, present / present.sum())
 
 
-def trace_shares(believed: Believed, power: float, improvements: int) -> Shared:
+def trace_shares(believed: NeighbourEstimates, power: float, improvements: int) -> Shared:
     """Return shares proportional to (tr P_j)^-power, or equal where these give the smaller trace; then improved.
 
     The first alone ignore a neighbour of large variance who alone knows a mode. An improvement multiplies each share by
@@ -231,15 +233,15 @@ def trace_shares(believed: Believed, power: float, improvements: int) -> Shared:
     return best
 
 
-def intersect_shares(believed: Believed, shares: Float[jax.Array, " degree"]) -> Shared:
+def intersect_shares(believed: NeighbourEstimates, shares: Float[jax.Array, " degree"]) -> Shared:
     """Return the shares with the covariance (sum_j pi_j P_j^-1)^-1 of their intersection."""
-    return shares, inverse(jnp.einsum("j,jab->ab", shares, believed.information))
+    return shares, invert(jnp.einsum("j,jab->ab", shares, believed.information))
 
 
-def intersection_weights(believed: Believed, shared: Shared) -> Weights:
+def intersection_weights(believed: NeighbourEstimates, shared: Shared) -> NeighbourWeights:
     """Return the weights C_j = Pc pi_j P_j^-1 and Pc."""
     shares, covariance = shared
-    return Weights(covariance, shares[:, None, None] * believed.information, covariance)
+    return NeighbourWeights(covariance, shares[:, None, None] * believed.information, covariance)
 
 
 def _smaller_trace(a: Shared, b: Shared) -> Shared:

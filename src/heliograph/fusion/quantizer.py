@@ -125,16 +125,16 @@ def levels_of(value: int) -> Float[np.ndarray, ""]:
     return np.asarray(value, dtype=np.float64)
 
 
-def parameter(name: str, value: ArrayLike) -> Parameter:
+def check_parameter(name: str, value: ArrayLike) -> Parameter:
     """Return a parameter as a number, or as one number per component."""
     several = isinstance(value, Sequence) or rank(name, value) > 0
     numbers: Parameter = array(name, value, (None,) if several else ())
     return numbers
 
 
-def positive(name: str, value: ArrayLike) -> Parameter:
-    """Return a parameter that is positive."""
-    numbers = parameter(name, value)
+def check_positive(name: str, value: ArrayLike) -> Parameter:
+    """Return a parameter that must be positive."""
+    numbers = check_parameter(name, value)
     if not isinstance(numbers, jax.Array) and np.any(numbers <= 0):
         raise fail(name, "positive numbers", value)
     return numbers
@@ -177,7 +177,7 @@ class UniformQuantizer(AbstractQuantizer):
 
     def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
         self.levels = levels_of(levels)
-        self.amplitude, self.scale = positive("amplitude", amplitude), positive("scale", scale)
+        self.amplitude, self.scale = check_positive("amplitude", amplitude), check_positive("scale", scale)
         check_range("amplitude times scale", self.amplitude, self.scale, self.levels)
 
     def init(self, n: int) -> tuple[()]:
@@ -187,7 +187,7 @@ class UniformQuantizer(AbstractQuantizer):
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the fixed amplitude."""
-        return state, _quantize_as_published(
+        return state, _uniform_quantize(
             jnp.asarray(fill_masked(value), dtype=float), self.amplitude, self.levels, self.scale
         )
 
@@ -198,10 +198,10 @@ class UniformQuantizer(AbstractQuantizer):
         return bound
 
 
-def _quantize_as_published(
+def _uniform_quantize(
     x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
 ) -> Quantized:
-    """Equations (10), (11) and (13), with d for values from d on and -d for values below -d."""
+    """Midpoint of the segment that holds x; d for values from d on and -d below -d, without a bound there."""
     scaled = x / scale
     inside = midpoint(segment_of(scaled, amplitude, levels), amplitude, levels)
     value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, inside))
@@ -243,7 +243,7 @@ class UplinkState(NamedTuple):
 
 
 class EscapeQuantizer(AbstractQuantizer):
-    """A decodable quantizer that does not saturate, driven by nothing but what was sent.
+    """Dynamic (zooming) quantizer: zooms out by escape symbols, in by `decay`, driven by what was sent alone.
 
     Where x is outside [-d, d], an escape symbol doubles the amplitude, as often as needed: m = ceil(log2(|x| / d)).
     Then the segment is sent, so |error| <= d 2^m / levels always, and both ends go on with
@@ -287,10 +287,13 @@ class EscapeQuantizer(AbstractQuantizer):
         self.levels = levels_of(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)
-        self.amplitude, self.smallest = positive("amplitude", amplitude), positive("smallest amplitude", smallest)
+        self.amplitude, self.smallest = (
+            check_positive("amplitude", amplitude),
+            check_positive("smallest amplitude", smallest),
+        )
         for name, value in (("amplitude", self.amplitude), ("smallest amplitude", self.smallest)):
             check_range(name, value, np.ones(()), self.levels)
-        self.decay, self.growth = _decay(decay), _growth(growth)
+        self.decay, self.growth = _check_decay(decay), _check_growth(growth)
         self.interval = None if interval is None else check_count("interval", interval)
 
     @in_float64
@@ -308,8 +311,8 @@ class EscapeQuantizer(AbstractQuantizer):
     def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
         """Encode a value (n,), from the amplitude that both ends know, or from the first one."""
         x = jnp.asarray(fill_masked(value), dtype=float)
-        anew = jnp.broadcast_to(self._restarts(state.number) | restart, x.shape)
-        amplitude = self._amplitude(state, anew)
+        anew = jnp.broadcast_to(self._is_restart(state.number) | restart, x.shape)
+        amplitude = self._present_amplitude(state, anew)
         # m = ceil(log2(|x| / d)) by exponents, without rounding.
         (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
         doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
@@ -329,7 +332,7 @@ class EscapeQuantizer(AbstractQuantizer):
         # A missed number means a wrong amplitude, until a restart.
         synchronised = restart | (state.number == number)
         # Midpoint of the segment at the doubled amplitude d 2^m.
-        used = jnp.ldexp(self._amplitude(state, restart), escapes)
+        used = jnp.ldexp(self._present_amplitude(state, restart), escapes)
         inside = midpoint(segment, used, self.levels)
         sent = jnp.where(beyond, jnp.where(segment == ABOVE, used, -used), inside)
         largest = np.finfo(used.dtype).max
@@ -344,10 +347,12 @@ class EscapeQuantizer(AbstractQuantizer):
         )
         return after, Quantized(value, error, known & beyond, escapes + 1)
 
-    def _restarts(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+    def _is_restart(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+        """True where the value of this number is sent from the first amplitude again."""
         return number == 0 if self.interval is None else number % self.interval == 0
 
-    def _amplitude(self, state: UplinkState, restart: Bool[Array, "*n"]) -> Float[Array, "*n"]:
+    def _present_amplitude(self, state: UplinkState, restart: Bool[Array, "*n"]) -> Float[Array, "*n"]:
+        """Amplitude for the present value: the first one at a restart, else that of the state."""
         return jnp.where(restart, self.amplitude, state.amplitude)
 
     def claim(self, claim: Claim) -> Claim:
@@ -355,15 +360,17 @@ class EscapeQuantizer(AbstractQuantizer):
         return weakest([claim, "nominal"])
 
 
-def _decay(value: ArrayLike) -> Parameter:
-    decay = parameter("decay", value)
+def _check_decay(value: ArrayLike) -> Parameter:
+    """Return the decay of the amplitude, which must lie between 0 and 1."""
+    decay = check_parameter("decay", value)
     if not isinstance(decay, jax.Array) and np.any((decay <= 0) | (decay >= 1)):
         raise fail("decay", "numbers between 0 and 1", value)
     return decay
 
 
-def _growth(value: ArrayLike) -> Parameter:
-    growth = parameter("growth", value)
+def _check_growth(value: ArrayLike) -> Parameter:
+    """Return the growth of the amplitude, which must be above 1."""
+    growth = check_parameter("growth", value)
     if not isinstance(growth, jax.Array) and np.any(growth < 0):
         raise fail("growth", "no negative number", value)
     return growth

@@ -13,12 +13,12 @@ from heliograph.fusion.intersection import (
     intersect,
     intersect_inversely,
     intersection_weights,
-    inverses,
-    replace_known,
+    invert_covariances,
+    restore_exact_components,
     trace_optimal_weights,
     trace_shares,
 )
-from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
+from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, gains_of
 from heliograph.fusion.mesh.graph import Graph, Neighbours, neighbours_of
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
 from heliograph.fusion.report_link import ReportLink, ReportLinks, check_reports
@@ -89,12 +89,12 @@ class AbstractFusion(Module):
         """Return the rule with what differs between the rows of a graph along the last axis of every array."""
         return self
 
-    def neighbour_weights(self, believed: Believed) -> Weights:
+    def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Weights of the neighbours' estimates that arrived, and the covariance of what is fused."""
         raise fail("fusion between neighbours", "a rule such as CovarianceIntersection() or MatrixWeights()",
                    type(self).__name__)  # fmt: skip
 
-    def neighbour_gains(self, believed: Believed, step: Step) -> Gains:
+    def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
         """Gains of one node's step: fuse what was believed, predict once, correct with what was measured."""
         return gains_of(self.neighbour_weights(believed), step)
 
@@ -151,9 +151,9 @@ class AbstractIntersection(AbstractFusion):
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Find the weights and intersect."""
-        information = inverses(covariances)
+        information = invert_covariances(covariances)
         mean, covariance = intersect(means, information, self.weights_of(covariances, information))
-        return replace_known(mean, covariance, means, covariances)
+        return restore_exact_components(mean, covariance, means, covariances)
 
 
 class CovarianceIntersection(AbstractIntersection):
@@ -170,7 +170,7 @@ class CovarianceIntersection(AbstractIntersection):
         """Weights of least trace."""
         return trace_optimal_weights(information)
 
-    def neighbour_weights(self, believed: Believed) -> Weights:
+    def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Intersect with shares that are nearly those of least trace: a few improvements of `TraceIntersection`."""
         return intersection_weights(believed, trace_shares(believed, POWER, IMPROVEMENTS))
 
@@ -185,7 +185,7 @@ class EqualIntersection(AbstractIntersection):
         """Equal weights."""
         return jnp.full(len(information), 1 / len(information))
 
-    def neighbour_weights(self, believed: Believed) -> Weights:
+    def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Intersect with equal shares of what arrived."""
         return intersection_weights(believed, equal_shares(believed))
 

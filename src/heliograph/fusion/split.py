@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.fusion.joint_covariance_weights import matrix_weights, weigh_covariance
 from heliograph.fusion.rules import AbstractIntersection, Covariances, Fused, Means
-from heliograph.fusion.weights import matrix_weights, weigh_covariance
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.types import Array, ArrayLike, Float

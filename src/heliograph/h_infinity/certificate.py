@@ -83,16 +83,19 @@ def certify_level(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     level = float(scalar("level", level, TINY, LARGEST))
-    findings = {"f": _findings("growth", growth), "h": _findings("output growth", output_growth)}
+    findings = {"f": _list_findings("growth", growth), "h": _list_findings("output growth", output_growth)}
     n, m, T = system.states, system.received, system.steps
     K = array("gains", gains, (T, n, m))
     if np.max(np.abs(K), initial=0.0) > LARGEST:
         raise fail("gains", f"entries of at most {LARGEST:g}", f"{np.max(np.abs(K)):g}")
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
-    lam = _multipliers(array("multipliers", multipliers, (T, None)))
+    lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))
     # Phi_k of every step, and its largest eigenvalue
     matrices = [theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
-    tops, negative = np.array([_largest(phi) for phi in matrices]), np.array([is_negative(phi) for phi in matrices])
+    tops, negative = (
+        np.array([_largest_eigenvalue(phi) for phi in matrices]),
+        np.array([is_negative(phi) for phi in matrices]),
+    )
     # initial condition: level^2 W - P_0 > 0
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
@@ -108,35 +111,36 @@ def certify_level(
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
     assumed: list[str] = []
     for letter, of in (("f", system.growth), ("h", system.output_growth)):
-        reasons += _against(of, findings[letter])
+        reasons += _reasons_against(of, findings[letter])
         assumed += _list_assumed(letter, of, findings[letter])
     count = T if negative.all() else int(np.argmin(negative))
     about = tuple(findings["f"] + findings["h"]), tuple(reasons), tuple(assumed)
     return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *about)
 
 
-def _findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFinding]:
+def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFinding]:
+    """Check the growth findings that were given, and return them as a list."""
     return [instance(name, finding, GrowthFinding, FINDINGS) for finding in items(name, given, FINDINGS)]
 
 
-def _against(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
+def _reasons_against(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """Reasons against a certificate: refuted constants, and findings about constants that the system does not have."""
-    reasons, constants = [], _positive(growth.state) + _positive(growth.error)
+    reasons, constants = [], _list_positive(growth.state) + _list_positive(growth.error)
     for finding in findings:
         if finding.refuted:
             reasons.append(finding.text)
-        elif not any(_supports(finding, value) for value in constants):
+        elif not any(_finding_covers(finding, value) for value in constants):
             known = ", ".join(sorted({f"{value:g}" for value in constants})) or "none"
             reasons.append(f"{finding.name}: a finding about the constant {finding.constant:g}, the system has {known}")
     return reasons
 
 
-def _supports(finding: GrowthFinding, constant: float) -> bool:
+def _finding_covers(finding: GrowthFinding, constant: float) -> bool:
     """Decide whether a finding about its own constant covers this one: it is no larger, but for rounding."""
     return finding.constant <= constant * (1 + TOLERANCE)
 
 
-def _positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
+def _list_positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
     """List the constants that are not zero, without repetition, in their order."""
     return list(dict.fromkeys(float(value) for value in constants if value > 0))
 
@@ -153,8 +157,8 @@ def _list_assumed(letter: str, growth: Growth, findings: Sequence[GrowthFinding]
         (growth.state, itself, around_zero),
         (growth.error, differences, findings),
     ):
-        for value in _positive(constants):
-            about = [finding for finding in relevant if _supports(finding, value)]
+        for value in _list_positive(constants):
+            about = [finding for finding in relevant if _finding_covers(finding, value)]
             if not about or not all(finding.proved for finding in about):
                 assumed.append(f"{what} with a = {value:g}")
     return assumed
@@ -238,15 +242,15 @@ def _drop_absent(
     return np.asarray(phi[np.ix_(stored, stored)])
 
 
-def _multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
+def _complete_multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
     """Multipliers of f, f~, h, h~ from 2 or 4 for each step."""
     if given.shape[1] not in (2, 4):
         raise fail("multipliers", "2 or 4 for each step", given.shape[1])
     return given if given.shape[1] == 4 else np.repeat(given, 2, axis=1)
 
 
-def _largest(phi: Float[np.ndarray, "q q"]) -> float:
-    """Largest eigenvalue."""
+def _largest_eigenvalue(phi: Float[np.ndarray, "q q"]) -> float:
+    """Largest eigenvalue of a symmetric matrix."""
     return float(np.linalg.eigvalsh((phi + phi.T) / 2)[-1])
 
 
@@ -264,4 +268,4 @@ def _find_scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
     if not np.all(diagonal < 0):
         return np.inf
     scale = 1 / np.sqrt(-diagonal)
-    return _largest(phi * np.outer(scale, scale))
+    return _largest_eigenvalue(phi * np.outer(scale, scale))

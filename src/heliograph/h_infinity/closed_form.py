@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliograph.h_infinity.design import HInfinityDesign
-from heliograph.h_infinity.step import StepMatrices, step_matrices
+from heliograph.h_infinity.step_inequality import StepMatrices, step_matrices
 from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import TINY, array, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
@@ -40,10 +40,11 @@ def known_channel_design(
     for growth, column, name in ((system.growth, 0, "f~"), (system.output_growth, 1, "h~")):
         if not growth.absent and np.any(given[:, column] <= 0):
             raise fail(f"multipliers of {name}", "positive ones, since it is not zero", given[:, column].min())
-    return _riccati(system, level, given)
+    return _run_riccati(system, level, given)
 
 
-def _riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
+def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
+    """Run the Riccati recursion over the horizon at one level; stop at the first step without a gain."""
     n, m, steps = system.states, system.received, system.steps
     # a little below the level, so that the certificate has a margin
     inner = level * (1 - SLACK)

@@ -19,7 +19,7 @@ from heliograph.h_infinity.solver import (
     check_choice,
     run_solver,
 )
-from heliograph.h_infinity.step import (
+from heliograph.h_infinity.step_inequality import (
     Layout,
     StepMatrices,
     Unknowns,
@@ -103,7 +103,7 @@ def recursive_design(
     target = None if level is None else float(scalar("level", level, TINY, LARGEST))
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
-    start = None if initial is None else _weight(initial, system.states)
+    start = None if initial is None else _checked_weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, flag("separate", separate))
     search = flag("search", search)
     # at the given level, or by bisection
@@ -117,7 +117,7 @@ def recursive_design(
         tried[trial] = recursion.run(trial, start)
         return tried[trial].feasible
 
-    smallest = _smallest(works, guess)
+    smallest = _bisect_level(works, guess)
     if design is not None:
         return design._replace(smallest_level=smallest)
     if smallest is None:
@@ -156,27 +156,27 @@ def horizon_design(
     steps, coordinates = scale(system, step_matrices(system, flag("separate", separate)), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
     layouts = [Layout(n, m, len(s.growth), given_correction) for s in steps]
-    start = None if initial is None else coordinates.initial_weight(_weight(initial, n))
+    start = None if initial is None else coordinates.initial_weight(_checked_weight(initial, n))
     allowed = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
     # one convex problem in all weights, gains, multipliers and the level squared
     problem = HorizonProblem(steps, layouts, allowed, start)
     status = run_solver(problem.problem, solver)
     values = problem.unknowns.value
     if not status.startswith("optimal") or values is None:
-        return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
+        return _unsolved_design(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
     # the solver's answer must satisfy every step's inequality itself
     parts = [np.asarray(values[entries]) for entries in problem.places]
     solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
-    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, solved)]
+    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_next_weight, solved)]
     failed = _first_failing(steps, solved, weights, square)
     if failed is not None:
         text = f"the solver's answer fails at step {failed} ({status})"
-        return _empty(system, separate, float("nan"), text)._replace(failed_step=failed)
+        return _unsolved_design(system, separate, float("nan"), text)._replace(failed_step=failed)
     # back to the user's units
     chosen = given_gains
     if chosen is None:
-        chosen = np.array([coordinates.gain(steps[k].nominal + _gain(u), k) for k, u in enumerate(solved)])
+        chosen = np.array([coordinates.gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)])
     multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(solved)])
     unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
     proven = all_multipliers(system, multipliers, separate)
@@ -190,7 +190,7 @@ def _first_failing(
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
         fixed = step.target - square * step.energy
         fixed[: len(weights[k]), : len(weights[k])] -= weights[k]
-        if not _holds(step, unknowns, fixed, SCREEN * square):
+        if not _inequality_holds(step, unknowns, fixed, SCREEN * square):
             return k
     return None
 
@@ -209,7 +209,7 @@ class _Recursion:
         system, n, c = self.system, self.system.states, self.coordinates
         # P_0 in scaled coordinates, and the initial condition
         relative = (level / c.unit) ** 2
-        design = _empty(system, self.separate, level, "")
+        design = _unsolved_design(system, self.separate, level, "")
         too_low = design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
         if relative < LARGEST**-2:  # P_0 in units of it would be no number
             return too_low
@@ -223,18 +223,19 @@ class _Recursion:
             fixed = step.target / relative - step.energy
             fixed[: 2 * n, : 2 * n] -= present
             status, unknowns = self._problem(k, present if k == 0 else None).solve(fixed)
-            if unknowns is None or not _holds(step, unknowns, fixed, SCREEN):
+            if unknowns is None or not _inequality_holds(step, unknowns, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
-            present = _block(unknowns)
-            design.gains[k] = c.gain(step.nominal + _gain(unknowns), k)
+            present = _next_weight(unknowns)
+            design.gains[k] = c.gain(step.nominal + _gain_correction(unknowns), k)
             design.weights[k + 1] = relative * c.weight(present, k + 1)
             design.multipliers[k] = all_multipliers(system, relative * c.multipliers(unknowns, k), self.separate)
         return design._replace(feasible=True, status="optimal")
 
     def _problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
+        """Return the step's problem, the one compiled before where its matrices and sizes are the same."""
         step, sizes = self.steps[k], self.coordinates.ratio(k + 1)
-        coupling = _coupling(start, self.system.states)
+        coupling = _coupled_initial_weight(start, self.system.states)
         for matrices, single, coupled, problem in self.compiled:
             if all(map(np.array_equal, matrices, step)) and single == sizes and coupled is coupling is None:
                 return problem
@@ -243,42 +244,46 @@ class _Recursion:
         return problem
 
 
-def _coupling(start: Float[np.ndarray, "w w"] | None, n: int) -> Float[np.ndarray, "w w"] | None:
+def _coupled_initial_weight(start: Float[np.ndarray, "w w"] | None, n: int) -> Float[np.ndarray, "w w"] | None:
     """Initial weight if it couples x and e, as those of later steps do not; else None."""
     return None if start is None or not np.any(start[:n, n:]) else start
 
 
-def _weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
+def _checked_weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
+    """Initial weight diag(P1, P2) of these sizes; raise ValueError for another shape."""
     return symmetric_weight("initial weight P_0", array("initial weight P_0", initial, (2 * n, 2 * n)))
 
 
-def _holds(step: StepMatrices, unknowns: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float) -> bool:
-    """Check that a solver's answer satisfies the inequality with Z = K'P2 K itself, strictly."""
-    gain = _gain(unknowns)
+def _inequality_holds(
+    step: StepMatrices, unknowns: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float
+) -> bool:
+    """Feasibility of one step: P1, P2 > 0, and the inequality with Z = K'P2 K itself strictly negative."""
+    gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, spread=gain.T @ unknowns.error @ gain)
     positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0
     return bool(positive and np.linalg.eigvalsh(next_energy(step, exact) + fixed)[-1] < -strictness)
 
 
-def _gain(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:
+def _gain_correction(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:
     """K - K0 = P2^-1 Y."""
     return np.asarray(np.linalg.solve(unknowns.error, unknowns.product))
 
 
-def _block(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
+def _next_weight(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
     """diag(P1, P2)."""
     zero = np.zeros_like(unknowns.state)
     return np.block([[unknowns.state, zero], [zero, unknowns.error]])
 
 
-def _empty(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
+def _unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
+    """Design without gains, with the solver's status."""
     n, steps = system.states, system.steps
     shapes = (steps, n, system.received), (steps + 1, 2 * n, 2 * n), (steps, 4 if separate else 2)
     gains, weights, multipliers = (np.full(shape, np.nan) for shape in shapes)
     return HInfinityDesign(level, gains, weights, multipliers, False, status)
 
 
-def _smallest(works: Callable[[float], bool], guess: float) -> float | None:
+def _bisect_level(works: Callable[[float], bool], guess: float) -> float | None:
     """Smallest level that works, to SEARCH_ACCURACY, by doubling and bisection of its logarithm."""
     high = guess
     while not works(high):

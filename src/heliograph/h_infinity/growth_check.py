@@ -149,24 +149,24 @@ def check_growth(
     _check_function(check_callable("function", function, "the state"), bottom)
     if not differences and (np.any(bottom > 0) or np.any(top < 0)):
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
-    tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
+    tools, random = _SlopesAndRatios(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
     starts = bottom + (top - bottom) * scipy.stats.qmc.Sobol(len(bottom), seed=seed).random(POINTS)
 
     def with_zero(points: np.ndarray) -> np.ndarray:
         return np.concatenate([points, np.zeros_like(points)], axis=1)
 
     if not differences:
-        points = _climb(lambda x: tools.ratio(with_zero(x)), starts, bottom, top, random)
-        return _finding(name, constant, bottom, top, tools, points, with_zero(points), False)
+        points = _climb_at_random(lambda x: tools.ratio(with_zero(x)), starts, bottom, top, random)
+        return _make_finding(name, constant, bottom, top, tools, points, with_zero(points), False)
     # largest slope: Sobol points, then random moves from the steepest
-    points = _climb(tools.slope, starts, bottom, top, random)
+    points = _climb_at_random(tools.slope, starts, bottom, top, random)
     # largest ratio: close pairs along the steepest directions, and pairs far apart
     move = tools.steepest(points) * NEARBY * tools.width / 2
     close = np.concatenate([np.clip(points - move, bottom, top), np.clip(points + move, bottom, top)], axis=1)
     far = bottom + (top - bottom) * random.random((POINTS, 2, len(bottom)))
     starts = np.concatenate([close, far.reshape(POINTS, -1)])
-    pairs = _climb(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
-    return _finding(name, constant, bottom, top, tools, points, pairs, True)
+    pairs = _climb_at_random(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
+    return _make_finding(name, constant, bottom, top, tools, points, pairs, True)
 
 
 def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
@@ -182,6 +182,7 @@ def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
 
 
 def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return the ends of a box as arrays; raise ValueError unless low < high."""
     bottom = np.asarray(array("low corner of the region", low, (None,)))
     top = np.asarray(array("high corner of the region", high, bottom.shape))
     if np.any(top < bottom) or not np.any(top > bottom):
@@ -189,7 +190,7 @@ def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"],
     return bottom, top
 
 
-class _Tools:
+class _SlopesAndRatios:
     """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once."""
 
     def __init__(self, function: Function, width: float):
@@ -235,12 +236,12 @@ def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarr
     return call
 
 
-def _finding(
+def _make_finding(
     name: str,
     constant: float,
     low: np.ndarray,
     high: np.ndarray,
-    tools: _Tools,
+    tools: _SlopesAndRatios,
     points: np.ndarray,
     pairs: np.ndarray,
     differences: bool,
@@ -259,7 +260,7 @@ def _finding(
     return finding._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
 
 
-def _climb(
+def _climb_at_random(
     objective: Callable[[np.ndarray], np.ndarray],
     starts: Float[np.ndarray, "starts n"],
     low: Float[np.ndarray, "n"],
@@ -307,29 +308,33 @@ def slope_bound(
             whole = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
             evaluate(jax.make_jaxpr(plain)(example), [whole], continuous=True)
             slopes = jax.make_jaxpr(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(example)
-            return SlopeBound(_sharpen(slopes, low, high, goal), "")
+            return SlopeBound(_sharpen_bound(slopes, low, high, goal), "")
     except UnknownError as reason:
         return SlopeBound(np.inf, f"cannot follow {reason}")
 
 
-def _sharpen(
+def _sharpen_bound(
     slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> float:
+    """Bisect the boxes whose bound is above the goal, at most LIMIT boxes, and return the largest bound."""
     bottoms, tops, done, seen = low[None], high[None], 0.0, 0
     while len(bottoms):
         bounds = np.concatenate(
-            [_bounds(slopes, bottoms[i : i + BOXES], tops[i : i + BOXES]) for i in range(0, len(bottoms), BOXES)]
+            [_bound_slopes(slopes, bottoms[i : i + BOXES], tops[i : i + BOXES]) for i in range(0, len(bottoms), BOXES)]
         )
         seen += len(bottoms)
         undecided = bounds > goal
         done = max(done, float(np.max(bounds[~undecided], initial=0.0)))
         if seen + 2 * np.count_nonzero(undecided) > LIMIT:
             return max(done, float(np.max(bounds)))
-        bottoms, tops = _halve(bottoms[undecided], tops[undecided], high - low)
+        bottoms, tops = _halve_boxes(bottoms[undecided], tops[undecided], high - low)
     return done
 
 
-def _bounds(slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray) -> Float[np.ndarray, " boxes"]:
+def _bound_slopes(
+    slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray
+) -> Float[np.ndarray, " boxes"]:
+    """Bound the Jacobian's norm over each of the boxes, infinite where the interval arithmetic says nothing."""
     short = BOXES - len(low)
     ends = [np.concatenate([end, np.repeat(end[-1:], short, axis=0)]) for end in (low, high)]
     (bounded,) = evaluate(slopes, [Interval(*ends)], continuous=False)
@@ -341,7 +346,7 @@ def _bounds(slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarr
     return np.where(finite.all(axis=(1, 2)), norms, np.inf)[: len(low)]
 
 
-def _halve(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Every box in two, across its widest side, in shares of the whole box's."""
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))

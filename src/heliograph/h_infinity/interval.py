@@ -41,11 +41,11 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
     values: dict[core.Var, Interval] = {}
 
     def read(atom: core.Var | core.Literal) -> Interval:
-        return exact(atom.val) if isinstance(atom, core.Literal) else values[atom]
+        return point_interval(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
     # intervals of the arguments and constants, then of each operation's results in order
     values.update(zip(jaxpr.jaxpr.invars, arguments, strict=True))
-    values.update(zip(jaxpr.jaxpr.constvars, map(exact, jaxpr.consts), strict=True))
+    values.update(zip(jaxpr.jaxpr.constvars, map(point_interval, jaxpr.consts), strict=True))
     for equation in jaxpr.jaxpr.eqns:
         inputs = [read(atom) for atom in equation.invars]
         name = equation.primitive.name
@@ -59,18 +59,18 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
         elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):  # whole numbers are not rounded
             results = _apply_to_ends(equation, inputs)
         else:
-            results = [_operation(equation, inputs, continuous)]
+            results = [_apply_operation(equation, inputs, continuous)]
         values.update(zip(equation.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.jaxpr.outvars]
 
 
-def exact(value: object) -> Interval:
+def point_interval(value: object) -> Interval:
     """Interval that holds a single value."""
     array = np.asarray(value)
     return Interval(array, array)
 
 
-def outward(low: object, high: object, ulps: int = 1) -> Interval:
+def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
     """Interval with its ends moved outward by `ulps` units in the last place; an end that is no number is infinite."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
@@ -79,7 +79,7 @@ def outward(low: object, high: object, ulps: int = 1) -> Interval:
     return Interval(low, high)
 
 
-def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
+def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
     """Interval of an operation's result."""
     name, params = equation.primitive.name, equation.params
     # arithmetic, and functions of a single number
@@ -100,7 +100,7 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
         case "dot_general":
             return _dot(x[0], x[1], params["dimension_numbers"])
         case "iota":
-            return exact(equation.primitive.bind(**params))
+            return point_interval(equation.primitive.bind(**params))
         # what may be true in a part of the interval alone is not decided
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
             return _decide(_compare(name, *x), continuous)
@@ -113,7 +113,7 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
         case "not":
             return Interval(~x[0].high, ~x[0].low)
         case "select_n":
-            return _select(x)
+            return _select_case(x)
     raise UnknownError(name)
 
 
@@ -138,6 +138,7 @@ def _bound(equation: Any, ends: list[Numbers]) -> list[Numbers]:
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
+    """Interval of truth values of a comparison of a and b."""
     if name in ("gt", "ge"):
         return _compare({"gt": "lt", "ge": "le"}[name], b, a)
     if name == "ne":
@@ -151,7 +152,7 @@ def _compare(name: str, a: Interval, b: Interval) -> Interval:
     return Interval(a.high <= b.low, a.low <= b.high)
 
 
-def _select(x: list[Interval]) -> Interval:
+def _select_case(x: list[Interval]) -> Interval:
     """Interval of cases[which]: where that is open, from the lowest of the possible cases to the highest."""
     which, cases = x[0], x[1:]
     lows, highs = [np.broadcast_arrays(*ends) for ends in ([c.low for c in cases], [c.high for c in cases])]
@@ -175,22 +176,22 @@ def _quotient(a: Interval, b: Interval) -> Interval:
     safe = Interval(np.where(through, 1.0, b.low), np.where(through, 1.0, b.high))
     ends = [x / y for x in a for y in safe]
     low, high = np.minimum.reduce(ends), np.maximum.reduce(ends)
-    return outward(np.where(through, -np.inf, low), np.where(through, np.inf, high))
+    return round_outward(np.where(through, -np.inf, low), np.where(through, np.inf, high))
 
 
 def _square(a: Interval) -> Interval:
     low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
-    square = outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
+    square = round_outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
     return Interval(np.maximum(square.low, 0.0), square.high)
 
 
 def _power(a: Interval, exponent: int) -> Interval:
     if exponent < 0:
-        return _quotient(exact(np.ones_like(a.low)), _power(a, -exponent))
+        return _quotient(point_interval(np.ones_like(a.low)), _power(a, -exponent))
     if exponent % 2 == 0:
         inner = _absolute(a)
-        return outward(inner.low**exponent, inner.high**exponent, ULPS)
-    return outward(a.low**exponent, a.high**exponent, ULPS)
+        return round_outward(inner.low**exponent, inner.high**exponent, ULPS)
+    return round_outward(a.low**exponent, a.high**exponent, ULPS)
 
 
 def _absolute(a: Interval) -> Interval:
@@ -204,7 +205,7 @@ def _rising(
     """Interval version of a function that never falls, whose values stay between `low` and `high`."""
 
     def call(a: Interval) -> Interval:
-        values = outward(function(a.low), function(a.high), ULPS)
+        values = round_outward(function(a.low), function(a.high), ULPS)
         return Interval(np.maximum(values.low, low), np.minimum(values.high, high))
 
     return call
@@ -213,7 +214,7 @@ def _rising(
 def _cosine(a: Interval) -> Interval:
     """Interval of cos: 1 if an even multiple of pi is inside or a hair outside, -1 if an odd one is."""
     ends = np.cos(a.low), np.cos(a.high)
-    cosine = outward(np.minimum(*ends), np.maximum(*ends), ULPS)
+    cosine = round_outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
     top = np.floor(last / 2) >= np.ceil(first / 2)
     bottom = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
@@ -226,7 +227,7 @@ def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
     count = int(np.prod([a.low.shape[i] for i in axes]))
     size = np.sum(np.maximum(np.abs(a.low), np.abs(a.high)), axis=axes)
     room = 2 * (count + 2) * np.finfo(float).eps * size
-    return outward(np.sum(a.low, axis=axes) - room, np.sum(a.high, axis=axes) + room)
+    return round_outward(np.sum(a.low, axis=axes) - room, np.sum(a.high, axis=axes) + room)
 
 
 def _dot(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
@@ -243,32 +244,32 @@ def _dot(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
     free_a, free_b = (x.low.ndim - len(c) - len(left_batch) for x, c in ((a, left), (b, right)))
     wide = [Interval(*(laid(end, left, left_batch, 0, free_b) for end in a))]
     wide.append(Interval(*(laid(end, right, right_batch, free_a, 0) for end in b)))
-    product = outward(*_product(*wide))
+    product = round_outward(*_product(*wide))
     axes = tuple(range(product.low.ndim - len(left), product.low.ndim))
     return _sum(product, axes)
 
 
 ARITHMETIC: dict[str, Callable[..., Interval]] = {
-    "add": lambda a, b: outward(a.low + b.low, a.high + b.high),
-    "add_any": lambda a, b: outward(a.low + b.low, a.high + b.high),
-    "sub": lambda a, b: outward(a.low - b.high, a.high - b.low),
-    "mul": lambda a, b: outward(*_product(a, b)),
+    "add": lambda a, b: round_outward(a.low + b.low, a.high + b.high),
+    "add_any": lambda a, b: round_outward(a.low + b.low, a.high + b.high),
+    "sub": lambda a, b: round_outward(a.low - b.high, a.high - b.low),
+    "mul": lambda a, b: round_outward(*_product(a, b)),
     "div": _quotient,
     "neg": lambda a: Interval(-a.high, -a.low),
     "max": lambda a, b: Interval(np.maximum(a.low, b.low), np.maximum(a.high, b.high)),
     "min": lambda a, b: Interval(np.minimum(a.low, b.low), np.minimum(a.high, b.high)),
     "abs": _absolute,
     "square": _square,
-    "one_minus_square": lambda a: ARITHMETIC["sub"](exact(np.ones_like(a.low)), _square(a)),  # a slope of tanh
+    "one_minus_square": lambda a: ARITHMETIC["sub"](point_interval(np.ones_like(a.low)), _square(a)),  # a slope of tanh
     "exp": _rising(np.exp, 0.0),
     "log": _rising(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
     "log1p": _rising(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),
     "expm1": _rising(np.expm1, -1.0),
     "sqrt": _rising(lambda x: np.where(x >= 0, np.sqrt(np.maximum(x, 0.0)), np.nan)),
-    "rsqrt": lambda a: _quotient(exact(np.ones_like(a.low)), ARITHMETIC["sqrt"](a)),
+    "rsqrt": lambda a: _quotient(point_interval(np.ones_like(a.low)), ARITHMETIC["sqrt"](a)),
     "tanh": _rising(np.tanh, -1.0, 1.0),
     "logistic": _rising(lambda x: 1 / (1 + np.exp(-x)), 0.0, 1.0),
     "atan": _rising(np.arctan),
-    "sin": lambda a: _cosine(outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS)),
+    "sin": lambda a: _cosine(round_outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS)),
     "cos": _cosine,
 }

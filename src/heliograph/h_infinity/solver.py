@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from typing_extensions import TypeAliasType
 
-from heliograph.h_infinity.step import (
+from heliograph.h_infinity.step_inequality import (
     Layout,
     LinearForms,
     StepMatrices,

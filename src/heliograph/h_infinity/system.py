@@ -67,13 +67,14 @@ def disturb_gain(channel: AbstractRandomAffine) -> DisturbedGain:
         GainAndNoise: lambda hop, _: _disturb_hop(hop),
         Series: lambda _, parts: reduce(_compose, parts),
         Mixture: lambda mixture, parts: _disturb_mixture(mixture, parts),
-        Stack: lambda stack, parts: _stack(parts, stack.inputs),
+        Stack: lambda stack, parts: _stack_gains(parts, stack.inputs),
         Superposed: lambda channel, _: disturb_gain(channel.as_stack),
     }, "channel", "hops, series, mixtures, stacks and sums of them")  # fmt: skip
     return gain
 
 
 def _disturb_hop(channel: GainAndNoise) -> DisturbedGain:
+    """Joint moments of [g A, N] of one hop, N a root of its noise's covariance."""
     covariance = np.asarray(channel.noise.covariance)
     unit = standard_deviations(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # of correlations: free of units
@@ -96,14 +97,14 @@ def _disturb_hop(channel: GainAndNoise) -> DisturbedGain:
 
 def _compose(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
     """[G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2], with independent factors."""
-    passed = _stack([first, _disturb_known(np.eye(then.disturbances))], shared=0)
+    passed = _stack_gains([first, _disturb_known(np.eye(then.disturbances))], shared=0)
     mean = then.mean @ passed.mean
     second = np.einsum("aicj,ibjd->abcd", then.second, passed.second)
     return DisturbedGain(mean, second, first.inputs)
 
 
 def _disturb_mixture(channel: Mixture, parts: list[DisturbedGain]) -> DisturbedGain:
-    widened = [_place(gain, channel.inputs, parts, i) for i, gain in enumerate(parts)]
+    widened = [_place_columns(gain, channel.inputs, parts, i) for i, gain in enumerate(parts)]
     weights = np.asarray(channel.choice.probabilities)
     mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
     second = np.tensordot(weights, [gain.second for gain in widened], axes=1)
@@ -114,7 +115,7 @@ def _disturb_known(matrix: np.ndarray) -> DisturbedGain:
     return DisturbedGain(matrix, np.multiply.outer(matrix, matrix), 0)
 
 
-def _place(gain: DisturbedGain, shared: int, parts: list[DisturbedGain], index: int) -> DisturbedGain:
+def _place_columns(gain: DisturbedGain, shared: int, parts: list[DisturbedGain], index: int) -> DisturbedGain:
     """The same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
     private_widths = [p.mean.shape[1] - shared for p in parts]
     start = shared + sum(private_widths[:index])
@@ -126,9 +127,9 @@ def _place(gain: DisturbedGain, shared: int, parts: list[DisturbedGain], index: 
     return DisturbedGain(mean, second, shared)
 
 
-def _stack(parts: list[DisturbedGain], shared: int) -> DisturbedGain:
+def _stack_gains(parts: list[DisturbedGain], shared: int) -> DisturbedGain:
     """Independent maps one above the other that share their first `shared` inputs; E[H_ab H_ij] factors across maps."""
-    placed = [_place(gain, shared, parts, i) for i, gain in enumerate(parts)]
+    placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]
     mean = np.concatenate([gain.mean for gain in placed])
     second = np.multiply.outer(mean, mean)
     row = 0
@@ -243,7 +244,7 @@ def growth_system(
     n, v = B.shape[1:]
     D = _repeat_over(steps, "feedthrough matrix", feedthrough, (None, v))
     y = D.shape[1]
-    links = _links(steps, channel)
+    links = _moments_of_links(steps, channel)
     if links[0].inputs != y:
         raise fail("channel", f"one that takes the sensor's {y} outputs", f"{links[0].inputs} inputs")
     # every matrix once for each step
@@ -253,10 +254,10 @@ def growth_system(
         _repeat_over(steps, "output matrix", np.zeros((y, n)) if output is None else output, (y, n)),
         D,
         _repeat_over(steps, "wanted matrix", target, (None, n)),
-        _growth(steps, "growth", growth),
-        _growth(steps, "output growth", output_growth),
+        _check_growth(steps, "growth", growth),
+        _check_growth(steps, "output growth", output_growth),
         links,
-        _weight(initial_weight, n),
+        _check_initial_weight(initial_weight, n),
     )
 
 
@@ -273,7 +274,8 @@ def _repeat_over(
     return matrices[:steps]
 
 
-def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
+def _moments_of_links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
+    """Joint moments of the channel's gain and noise sources at every step; refuse channels that remember."""
     check_maps("channel", [first(channel)])
     if first(channel).remembers:
         expected = (
@@ -290,7 +292,8 @@ def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
     return links
 
 
-def _growth(steps: int, name: str, value: Constants) -> Growth:
+def _check_growth(steps: int, name: str, value: Constants) -> Growth:
+    """Growth constants at every step from a number, or from a pair (of the function, of its differences)."""
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
         raise fail(name, "a number, or a pair (of the function, of its differences)", value)
@@ -301,7 +304,8 @@ def _growth(steps: int, name: str, value: Constants) -> Growth:
     return Growth(*constants)
 
 
-def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
+def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
+    """Initial weight (2n, 2n) from a number or a positive definite matrix."""
     name, size = "initial weight", 2 * n
     single = rank(name, value) == 0
     matrix: np.ndarray = scalar(name, value) * np.eye(size) if single else array(name, value, (size, size))

@@ -30,8 +30,8 @@ def mix_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n
     return sums.reshape(*axes, -1, n, n)
 
 
-def propagate(maps: Any, moments: Float[Array, "..."], added: Array | float) -> Any:
-    """Propagate second moments over a linear step, X+ = F X F' + S, of each mode, of a symmetric X.
+def propagate_by_mode(maps: Any, moments: Float[Array, "..."], added: Array | float) -> Any:
+    """Propagate second moments of each mode over a linear step, X+ = F X F' + S, of a symmetric X.
 
     F X F' = F (F X)', so that F is only ever multiplied from the left: it may be sparse, or structured with an `@`.
     """
@@ -59,7 +59,7 @@ class JumpSystem(NamedTuple):
 
     def step(self, moments: Float[Array, "*axes _ n n"]) -> Any:
         """Propagate X over one step, without an axis of time; or over each step from an X before it of its own."""
-        return propagate(self.maps, mix_modes(self.chain, moments), self.added)
+        return propagate_by_mode(self.maps, mix_modes(self.chain, moments), self.added)
 
     def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
         """Propagate X from before the first step: X after each step."""
@@ -77,7 +77,7 @@ class JumpSystem(NamedTuple):
 
     def operator(self) -> Float[np.ndarray, "e e"]:
         """Return the matrix of X -> X over all steps, without noise, on the entries of upper triangles."""
-        return np.asarray(make_entry_matrix(self._replace(added=0.0 * self.added)._around, self.shape))
+        return np.asarray(make_entry_matrix(self._replace(added=0.0 * self.added)._propagate_one_period, self.shape))
 
     def radius(self) -> float:
         """Return the spectral radius of the operator: below 1, X stays bounded over steps that repeat for ever."""
@@ -85,7 +85,10 @@ class JumpSystem(NamedTuple):
 
     def steady(self) -> Any:
         """Solve for X (time, M, n, n) after each of steps that repeat for ever, of a radius below 1."""
-        start = solve_fixed_point(self._replace(added=0.0 * self.added)._around, self._around(np.zeros(self.shape)))
+        start = solve_fixed_point(
+            self._replace(added=0.0 * self.added)._propagate_one_period,
+            self._propagate_one_period(np.zeros(self.shape)),
+        )
         after = library(start).stack(self.after(start))
         return (after + after.swapaxes(-1, -2)) / 2
 
@@ -100,7 +103,7 @@ class JumpSystem(NamedTuple):
             ahead = []
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
                 ahead.append(weight + behind)
-                behind = mix_modes(chain.T, propagate(maps.swapaxes(-1, -2), ahead[-1], 0.0))
+                behind = mix_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), ahead[-1], 0.0))
             return behind[..., : shape[0], :, :], ahead[::-1]
 
         behind = np.zeros(shape)
@@ -109,34 +112,34 @@ class JumpSystem(NamedTuple):
         ahead = np.array([np.broadcast_to(value, self.maps.shape[1:]) for value in back(behind, weights)[1]])
         return np.asarray(ahead + ahead.swapaxes(-1, -2)) / 2
 
-    def _around(self, moments: Array) -> Any:
-        """Propagate X from before the first step to after the last, summed over modes that are forgotten there."""
+    def _propagate_one_period(self, moments: Array) -> Any:
+        """Propagate X from before the first step to after the last, summed over modes that are redrawn there."""
         last = self.after(moments)[-1]
         return last if moments.shape[-3] == last.shape[-3] else last.sum(axis=-3, keepdims=True)
 
 
 def make_entry_matrix(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
     """Return the matrix of a linear map of symmetric matrices (..., n, n) on the entries of their upper triangles."""
-    _, where, basis = _triangles(shape)
+    _, where, basis = _triangle_places(shape)
     matrix: Array = linear(basis)[:, *where].T
     return matrix
 
 
 def solve_fixed_point(linear: Maps, constant: Array) -> Any:
     """Solve X = L(X) + C for a linear map of symmetric matrices (..., n, n), and a constant of their shape."""
-    matrix, where = make_entry_matrix(linear, constant.shape), _triangles(constant.shape)[1]
+    matrix, where = make_entry_matrix(linear, constant.shape), _triangle_places(constant.shape)[1]
     solution = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[where])
     return unpack_entries(solution, constant.shape)
 
 
 def unpack_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
     """Return symmetric matrices with these entries in their upper triangles."""
-    return entries[_triangles(shape)[0]]
+    return entries[_triangle_places(shape)[0]]
 
 
 @lru_cache(8)
-def _triangles(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
-    """Place of each entry among those of the upper triangles, these, and matrices of one entry each."""
+def _triangle_places(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
+    """Place of each matrix entry among those of the upper triangles, these entries, and matrices of one entry each."""
     where = np.nonzero(np.triu(np.ones(shape)))
     places = np.empty(shape, dtype=int)
     places[where] = places[*where[:-2], where[-1], where[-2]] = np.arange(len(where[0]))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.jump_system import JumpSystem, mix_modes, propagate, unpack_entries
+from heliograph.linear.jump_system import JumpSystem, mix_modes, propagate_by_mode, unpack_entries
 from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import pseudo_solve, spectral_radius
 from heliograph.numerics.types import Float, Int
@@ -75,7 +75,7 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
         return radius
     unit = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
     (witness,) = jumps._replace(added=unit).steady()
-    left: Parts = witness - propagate(jumps.maps[0], mix_modes(system.chain, witness), 0.0)
+    left: Parts = witness - propagate_by_mode(jumps.maps[0], mix_modes(system.chain, witness), 0.0)
     return radius if min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness).min()) > 0 else float("inf")
 
 
@@ -99,7 +99,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
         if grown > NEGLIGIBLE:
             parts, noise = parts / grown, noise / grown
         before, gains = gains, _improve_gains(system, parts, noise)
-        if _change(before, gains) < CONVERGED:
+        if _relative_change(before, gains) < CONVERGED:
             break
         if step.bit_count() == 1 and system.closed(gains).radius() < BELOW_ONE:
             break
@@ -118,19 +118,19 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
     radius = float(np.max(np.abs(values)))
     for _ in range(POLISHING):
         below = radius < BELOW_ONE
-        parts = jumps.steady()[0] if below else _fastest(jumps.shape, values, vectors)
+        parts = jumps.steady()[0] if below else _fastest_growing_covariances(jumps.shape, values, vectors)
         better = _improve_gains(system, parts, 1.0 if below else 1 / NEGLIGIBLE)
         jumps = system.closed(better)
         values, vectors = np.linalg.eig(jumps.operator())
         reached = float(np.max(np.abs(values)))
-        if reached >= max(radius, BELOW_ONE) or _change(gains, better) < CONVERGED:
+        if reached >= max(radius, BELOW_ONE) or _relative_change(gains, better) < CONVERGED:
             break
         gains, radius = better, reached
     return gains
 
 
-def _fastest(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
-    """The covariances that grow by the spectral radius: a positive map has such an eigenvector."""
+def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
+    """Covariances that grow by the spectral radius: a positive map has such an eigenvector."""
     parts = unpack_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
     return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
@@ -148,7 +148,8 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
     return tuple(results)
 
 
-def _change(before: KindGains, after: KindGains) -> float:
+def _relative_change(before: KindGains, after: KindGains) -> float:
+    """Change of the bounds, relative to the larger one."""
     size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
     gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
     return float(gap / size) if size > 0 else 0.0
@@ -159,8 +160,8 @@ SAME = 1e-7  # relative: eigenvalues closer than this are one
 SETS_LIMIT = 256  # sets of modes that are tried for one eigenvalue
 
 
-class Unseen(NamedTuple):
-    """Growth of an eigenvalue while the links stay in modes that do not show it: |a|^2 rho(chain among these).
+class UnobservedGrowth(NamedTuple):
+    """Growth of an eigenvector while the links stay in modes that do not observe it: |a|^2 rho(chain among these).
 
     From 1 on, the mean error of every filter grows without end, if noise reaches the eigenvector.
     """
@@ -183,39 +184,42 @@ def eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndar
     return results
 
 
-def fastest_unseen(
+def fastest_unobserved_mode(
     matrix: Float[np.ndarray, "n n"], chain: Float[np.ndarray, "modes modes"], outputs: Sequence[np.ndarray]
-) -> Unseen:
-    """Return the largest growth over eigenvalues and sets of modes; `outputs` are the rows C_i (m, n) of each mode.
+) -> UnobservedGrowth:
+    """Find the largest growth over eigenvalues and sets of modes that do not observe them.
 
     E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
     """
     results = [
-        Unseen(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
+        UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
         for value, space in eigenspaces(matrix)
-        for modes, vectors in _blind(space, outputs)
+        for modes, vectors in _mode_sets_without_observation(space, outputs)
     ]
-    nothing = Unseen(0.0, 0j, (), np.zeros((len(matrix), 0)))
+    nothing = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))
     return max(results, key=lambda items: items.growth, default=nothing)
 
 
-def _blind(space: np.ndarray, outputs: Sequence[np.ndarray]) -> list[tuple[tuple[int, ...], np.ndarray]]:
-    """Sets of modes that all miss some common eigenvector, largest for each subspace, with a basis of these."""
-    subspaces = {frozenset(_missing(space, outputs)): space}
+def _mode_sets_without_observation(
+    space: np.ndarray, outputs: Sequence[np.ndarray]
+) -> list[tuple[tuple[int, ...], np.ndarray]]:
+    """List sets of modes that all miss a common eigenvector, largest for each subspace, with a basis of these."""
+    subspaces = {frozenset(_modes_not_observing(space, outputs)): space}
     for output in outputs:
         for known in list(subspaces.values()):
-            smaller = _kernel(output, known)
+            smaller = _unobservable_part(output, known)
             if smaller.shape[1] and len(subspaces) < SETS_LIMIT:
-                subspaces.setdefault(frozenset(_missing(smaller, outputs)), smaller)
+                subspaces.setdefault(frozenset(_modes_not_observing(smaller, outputs)), smaller)
     return [(tuple(sorted(modes)), basis) for modes, basis in subspaces.items() if modes]
 
 
-def _missing(space: np.ndarray, outputs: Sequence[np.ndarray]) -> Iterable[int]:
-    return (i for i, c in enumerate(outputs) if _kernel(c, space).shape[1] == space.shape[1])
+def _modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) -> Iterable[int]:
+    """Modes whose output matrix C_i maps the whole subspace to zero."""
+    return (i for i, c in enumerate(outputs) if _unobservable_part(c, space).shape[1] == space.shape[1])
 
 
-def _kernel(output: np.ndarray, space: np.ndarray) -> np.ndarray:
-    """The part of a subspace that the rows of an output do not show, each row taken at its own size."""
+def _unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
+    """Part of a subspace that the rows of an output do not observe, each row taken at its own size."""
     sizes = np.linalg.norm(output, axis=1)
     rows = output[sizes > 0] / sizes[sizes > 0][:, None]
     if not len(rows):
@@ -225,8 +229,8 @@ def _kernel(output: np.ndarray, space: np.ndarray) -> np.ndarray:
     return np.asarray(space @ right.conj().T[:, rank:])
 
 
-def is_reached(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
-    """Return whether a noise reaches every one of these directions within n steps (the controllable subspace)."""
+def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
+    """True if the noise excites every one of these directions within n steps (controllable subspace)."""
     basis, columns = np.zeros((len(matrix), 0)), noise
     for _ in range(len(matrix)):
         size = np.linalg.norm(columns, 2) if columns.size else 0.0

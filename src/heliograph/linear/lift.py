@@ -19,8 +19,14 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Series
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents, position
-from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.moments.monomials import (
+    MEMORY_LIMIT_ENTRIES,
+    count_monomials,
+    degrees,
+    exponents,
+    position,
+)
+from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
 from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
 from heliograph.random_affine.superposed import sensed_by_link
@@ -52,8 +58,8 @@ class SteadyMoments:
         self._squares = [places[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
         self._last: Moments | None = None
 
-    def stays(self, moments: Moments) -> bool:
-        """Return whether the moments are those of the call before, to rounding."""
+    def is_steady(self, moments: Moments) -> bool:
+        """True if the moments are those of the call before, to rounding."""
         before, self._last = self._last, moments
         if before is None or self._tolerance < 0:
             return False
@@ -80,7 +86,7 @@ def lift_modes(
     """
     n, modes = plants[0].inputs, len(measurements[0].initial)
     law, rows = np.asarray(measurements[0].initial), np.eye(modes)
-    before = second_moments(moments, n + 1, degree)
+    before = products_of_monomials(moments, n + 1, degree)
     mean = np.kron(law, before[:, -1])
     start = np.kron(np.diag(law), before) - np.outer(mean, mean)
     # Matrices of each distinct measurement and plant once.
@@ -91,17 +97,17 @@ def lift_modes(
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
     steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
-        if steady.stays(moments) and np.array_equal(law, earlier) and k > 1:
+        if steady.is_steady(moments) and np.array_equal(law, earlier) and k > 1:
             break
         earlier = law
         moved, means = of_plant[id(plant)], of_modes[id(measurement)]
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
-            moments = np.asarray(push(plant, 2 * degree, moments))
+            moments = np.asarray(push_moments(plant, 2 * degree, moments))
         check_moments(moments, k, 2 * degree)
         # Process noise: what the mode's draw adds, and the plant's.
-        after, carried = second_moments(moments, n + 1, degree), moved @ before @ moved.T
+        after, carried = products_of_monomials(moments, n + 1, degree), moved @ before @ moved.T
         chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
-        law = _stays(law, law @ rows)
+        law = _keep_if_unchanged(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
         noise = _mean_noise(law, means, measurement.maps, degree, moments)
         output = np.concatenate(list(means), axis=1)[:-1]
@@ -121,15 +127,17 @@ def _mean_noise(
     moments: Moments,
 ) -> Float[np.ndarray, "N N"]:
     """Measurement noise in the mean over the modes, sum_j p_j (E[Z Z' | j] - K_j E[Y Y'] K_j')."""
-    signal, noise = second_moments(moments, routes[0].inputs + 1, degree), np.zeros((1, 1))
+    signal, noise = products_of_monomials(moments, routes[0].inputs + 1, degree), np.zeros((1, 1))
     for p, matrix, route in zip(law, means, routes, strict=True):
-        arrives = second_moments(push(route, 2 * degree, moments), route.outputs + 1, degree)
+        arrives = products_of_monomials(push_moments(route, 2 * degree, moments), route.outputs + 1, degree)
         noise = noise + p * (np.asarray(arrives) - matrix @ signal @ matrix.T)
     return noise
 
 
-def _stays(law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:
-    """The law after a step; itself where it only flips last bits."""
+def _keep_if_unchanged(
+    law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
+) -> Float[np.ndarray, " modes"]:
+    """Law of the modes after a step; the law before where it differs by rounding only."""
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
@@ -182,7 +190,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         of_modes = lift_modes([r.plant for r in routes], chains, degree, moments, projection)
         return believing(of_modes, Premise(plant, sensor, channel, order=2 * degree))
     # Start of the lifted state: E Y_0 and Cov Y_0.
-    before = second_moments(moments, n + 1, degree)
+    before = products_of_monomials(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
     start_lost = EPS * np.diag(before)[:-1]
     varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
@@ -203,12 +211,12 @@ def _lift_steps(
     steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
     last: Route | None = None
     for k, route in enumerate(routes):
-        if steady.stays(moments):
+        if steady.is_steady(moments):
             break
-        if last is None or not _same(route.plant, last.plant):
-            move = Lifted(route.plant, degree, varies[0])
-        if last is None or not _same(route.measurement, last.measurement):
-            listen = Lifted(route.measurement, degree, varies[1])
+        if last is None or not _are_identical(route.plant, last.plant):
+            move = LiftedMap(route.plant, degree, varies[0])
+        if last is None or not _are_identical(route.measurement, last.measurement):
+            listen = LiftedMap(route.measurement, degree, varies[1])
         last = route
         # Cov(w) from the moments before the step; then the moments after it, and Cov(v) from those.
         process, process_lost = move.conditional_spread(moments)
@@ -222,11 +230,12 @@ def _lift_steps(
     return steps, process_rounding, received_rounding
 
 
-def _same(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:
+def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:
+    """True if two models, or two of their steps, are one object or have equal numbers."""
     return left is right or bool(eqx.tree_equal(left, right))
 
 
-class Lifted:
+class LiftedMap:
     """A map z = G y + n on monomials: E[Z | y] = K Y, and how moments of y of twice the degree become those of z.
 
     The matrix that does the latter is formed for a map that stays, if it is small; one that varies is used but once.
@@ -235,7 +244,7 @@ class Lifted:
     def __init__(self, route: AbstractRandomAffine, degree: int, varies: bool):
         self.route, self.degree = route, degree
         self.matrix = np.asarray(route.moments(degree).matrix)
-        rows, columns = (count(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
+        rows, columns = (count_monomials(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
         small = not varies and rows * columns <= STORED_ENTRIES
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
@@ -249,7 +258,7 @@ class Lifted:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             if self.whole is not None:
                 return np.asarray(self.whole @ np.asarray(moments))
-            return np.asarray(push(self.route, 2 * self.degree, moments))
+            return np.asarray(push_moments(self.route, 2 * self.degree, moments))
 
     def conditional_spread(self, moments: Float[Array, "M"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
         """E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
@@ -265,8 +274,8 @@ class Lifted:
             if not here.any():
                 continue
             low = np.where(self.given <= highest - 2, np.asarray(moments), 0.0)
-            after = np.asarray(second_moments(self.push(low), m, self.degree))
-            left = after - self.matrix @ np.asarray(second_moments(low, n, self.degree)) @ self.matrix.T
+            after = np.asarray(products_of_monomials(self.push(low), m, self.degree))
+            left = after - self.matrix @ np.asarray(products_of_monomials(low, n, self.degree)) @ self.matrix.T
             spread = np.where(here, left, spread)
             lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
         return spread[:-1, :-1], lost[:-1]
@@ -320,19 +329,19 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
 
 def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
     """The maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
-    plants = _maps(each_step(plant, horizon), order)
+    plants = _maps_of_models(each_step(plant, horizon), order)
     sensors, channels = each_step(sensor, horizon), each_step(channel, horizon)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
-        measurements = [_measurements(sensors[:1], channels[:1], order)[0]] * horizon
+        measurements = [_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
     else:
-        measurements = _measurements(sensors, channels, order)
+        measurements = _measurement_maps(sensors, channels, order)
     return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
 
 
-def _measurements(
+def _measurement_maps(
     sensors: Sequence[AnySensor], channels: Sequence[AbstractRandomAffine], order: int
 ) -> list[AbstractRandomAffine]:
-    """Maps from the state to what arrives; a sum of links whose sensors' noises are independent is one of x itself."""
+    """Maps from the state to z; a sum of links whose sensors' noises are independent is one of x itself."""
     apart = list[AbstractRandomAffine]()
     for sensor, channel in zip(sensors, channels, strict=True):
         assert isinstance(sensor, LinearSensor)  # checked before
@@ -340,11 +349,11 @@ def _measurements(
         apart += [] if by_link is None else [by_link]
     if len(apart) == len(sensors):
         return apart
-    return [Series(pair) for pair in zip(_maps(sensors, order), channels, strict=True)]
+    return [Series(pair) for pair in zip(_maps_of_models(sensors, order), channels, strict=True)]
 
 
-def _maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
-    """A x + noise of each plant or sensor; `check_model` has seen that all are linear."""
+def _maps_of_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
+    """Map A x + noise of each plant or sensor; `check_model` has seen that all are linear."""
     maps: list[GainAndNoise] = []
     before, noise = None, Tabulated(models[0].noise, order)
     for model in models:
@@ -373,7 +382,7 @@ def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int
     if check_count("degree of the lift", degree) > HIGHEST:
         got = f"{degree}: binomials of twice the degree are no numbers of 64 bits"
         raise fail("degree of the lift", f"at most {HIGHEST}", got)
-    n, m = count(states + 1, degree), count(outputs + 1, degree)
+    n, m = count_monomials(states + 1, degree), count_monomials(outputs + 1, degree)
     entries = horizon * (2 * (n * modes) ** 2 + n * modes * m + m * m)
     of_modes = f" in {modes} modes" if modes > 1 else ""
     if entries > MEMORY_LIMIT_ENTRIES:

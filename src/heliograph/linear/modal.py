@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.linear.jump_system import mix_modes, propagate
+from heliograph.linear.jump_system import mix_modes, propagate_by_mode
 from heliograph.linear.lift import each_step
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
@@ -99,4 +99,4 @@ def _propagate_modes(
     apart = np.einsum("ijl,jac,icd,lbd->jalb", chosen, whole, moments, whole)
     apart[np.arange(modes), :, np.arange(modes), :] += added
     transition = np.einsum("ij,jab->jaib", rows, whole).reshape(modes * size, modes * size)
-    return transition, apart.reshape(modes * size, modes * size), propagate(whole, before, added)
+    return transition, apart.reshape(modes * size, modes * size), propagate_by_mode(whole, before, added)

@@ -30,12 +30,14 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Series, Stack, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.monomials import exponents, symmetric_power
-from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 
-def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule) -> LinearSystem:
-    """Return the square of (x, q, z), with q the estimate of a linear filter: q+ = F q + K z+ + c.
+def quadratic_system_with_linear_estimate(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule
+) -> LinearSystem:
+    """Linear system of all products up to degree 2 of (x, q, z), q the estimate of a linear filter, measured by z's.
 
     Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
     `linear` is a schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
@@ -48,18 +50,18 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
     total = 2 * n + m
     refuse_lift(2, total, m + n, horizon)
     # (x_0, q_0, 0) is an affine function of x_0.
-    beginning = _homogeneous(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
+    beginning = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
     moments = push_known(beginning, 4, initial_moments(start, 4))
-    before = second_moments(moments, total + 1, 2)
+    before = products_of_monomials(moments, total + 1, 2)
     mean, spread = mean_and_spread(before)
-    received, parts, rounding, stored = _make_received_products(n, m), [], [], _Recorded()
+    received, parts, rounding, stored = _make_received_products(n, m), [], [], _MomentCache()
     for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
-        move, listen = stored.move(route.plant, m), _listen(Gains(*(field[k] for field in linear.gains)))
-        wide = stored.widen(route.measurement, n)
+        move, listen = stored.move(route.plant, m), _linear_filter_map(Gains(*(field[k] for field in linear.gains)))
+        wide = stored.append_measurement(route.measurement, n)
         # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
         transition = symmetric_power(listen, 2) @ wide[0] @ move.moments(2).matrix
-        moments = push_known(listen, 4, wide[1] @ push(move, 4, moments))
-        after = second_moments(moments, total + 1, 2)
+        moments = push_known(listen, 4, wide[1] @ push_moments(move, 4, moments))
+        after = products_of_monomials(moments, total + 1, 2)
         # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
         process = after - transition @ before @ transition.T
         nothing = np.zeros(len(received)), np.zeros((len(received), len(received)))
@@ -71,20 +73,21 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
     return believing(system, Premise(plant, sensor, channel, order=4))
 
 
-def _homogeneous(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
+def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
+    """[[A, a], [0, 1]] of x -> A x + a."""
     return np.block([[matrix, offset[:, None]], [np.zeros((1, matrix.shape[1])), np.ones((1, 1))]])
 
 
-def _listen(g: Gains) -> np.ndarray:
-    """(x+, q, z+) -> (x+, F q + K z+ + c, z+), homogeneous."""
+def _linear_filter_map(g: Gains) -> np.ndarray:
+    """Map (x+, q, z+) to (x+, F q + K z+ + c, z+), one step of the linear filter."""
     n, m = g.gain.shape
     after = np.eye(2 * n + m)
     after[n : 2 * n, n : 2 * n], after[n : 2 * n, 2 * n :] = g.transition, g.gain
-    return _homogeneous(after, np.concatenate([np.zeros(n), g.offset, np.zeros(m)]))
+    return _affine_matrix(after, np.concatenate([np.zeros(n), g.offset, np.zeros(m)]))
 
 
-class _Recorded:
-    """Cache of the noise's moments and those of the route to z, recomputed only where the model changes."""
+class _MomentCache:
+    """Moments of plant and link for the quadratic system, computed again only where the model changes."""
 
     def __init__(self) -> None:
         self.noise: AbstractNoise | None = None
@@ -102,8 +105,8 @@ class _Recorded:
         matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
         return GainAndNoise(Constant(1.0), matrix, self.joint)
 
-    def widen(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Moments of order 2 and 4 of (x+, q) -> (x+, q, z+)."""
+    def append_measurement(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Moments of order 2 and 4 of (x+, q, z+) from those of (x+, q)."""
         if route is not self.route:
             wide = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
             self.route, self.wide = route, (np.asarray(wide.moments(2).matrix), np.asarray(wide.moments(4).matrix))
@@ -111,7 +114,7 @@ class _Recorded:
 
 
 def _make_received_products(n: int, m: int) -> np.ndarray:
-    """Rows that read (monomials of z up to degree 2, z_i q_j) off the square of (x, q, z)."""
+    """Rows that read (monomials of z up to degree 2, z_i q_j) off all products of (x, q, z)."""
     total = 2 * n + m
     places = {powers: i for i, powers in enumerate(exponents(total + 1, 2))}
     expected = [(*(0,) * (2 * n), *powers) for powers in exponents(m + 1, 2)[:-1]]
@@ -198,7 +201,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
 
     k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), with a b a monomial of the square.
     """
-    x, z = _places(states), _places(outputs)
+    x, z = _product_positions(states), _product_positions(outputs)
     before = state_moments(square)
     worst = 0.0
     for k in range(square.horizon):
@@ -220,8 +223,8 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
     return worst
 
 
-def _places(variables: int) -> dict[tuple[int, ...], int]:
-    """Places of y_i and of y_i y_j among the monomials of degree 2."""
+def _product_positions(variables: int) -> dict[tuple[int, ...], int]:
+    """Positions of y_i and of y_i y_j among the monomials of degree 2."""
     index = {powers: i for i, powers in enumerate(exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)
     places: dict[tuple[int, ...], int] = {

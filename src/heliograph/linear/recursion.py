@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.factors.columns import rounding_of
 from heliograph.factors.roots import observe_root, roots_of, square
-from heliograph.linear.jump_system import propagate
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.premise import believing
@@ -22,14 +22,14 @@ DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above w
 Pair = tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]  # a covariance and its rounding
 
 
-class Noises(NamedTuple):
-    """Roots of the noises of one step, with the rounding of what they are added to: Cov(w) = W W', Cov(v) = V V'."""
+class NoiseRoots(NamedTuple):
+    """Roots of both noises of one step, with the rounding of what they are added to: Cov(w) = W W', Cov(v) = V V'."""
 
     process: Float[np.ndarray, "N _"]
     received: Float[np.ndarray, "m _"]
 
 
-class Corrected(NamedTuple):
+class RecursionStep(NamedTuple):
     """One step of the recursion: gain, and roots of the error covariance before and after the measurement."""
 
     gain: Float[np.ndarray, "N m"]
@@ -37,26 +37,26 @@ class Corrected(NamedTuple):
     root: Float[np.ndarray, "N N"]
 
 
-def noises_of(s: Steps, size: Float[np.ndarray, " N"]) -> Noises:
-    """Roots of Cov(w) and Cov(v), beside those of the rounding of a state that had the second moments `size`."""
+def take_noise_roots(s: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
+    """Roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
     reach = np.abs(s.output) @ np.sqrt(size)
-    return Noises(_take_rounded_root(s.process, size), _take_rounded_root(s.noise, reach**2))
+    return NoiseRoots(_root_with_rounding(s.process, size), _root_with_rounding(s.noise, reach**2))
 
 
-def _take_rounded_root(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
-    """Root of a noise and of the rounding of numbers with these second moments, which it is added to."""
+def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Root of a noise covariance and of the rounding of the numbers (of these second moments) that it is added to."""
     rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 
 
-def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: Noises) -> Corrected:
+def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: NoiseRoots) -> RecursionStep:
     """P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
 
     O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
     """
     predicted = np.concatenate([s.transition @ root, noises.process], axis=1)
     gain, after = observe_root(predicted, s.output, noises.received)
-    return Corrected(gain, predicted, after)
+    return RecursionStep(gain, predicted, after)
 
 
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
@@ -76,17 +76,17 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     instance("system", system, LinearSystem, "a LinearSystem")
     root, projection, parts = roots_of(system.covariance), system.projection, []
     size = system.mean**2 + np.diag(system.covariance)
-    noises = noises_of(system.step(0), size)
+    noises = take_noise_roots(system.step(0), size)
     rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
     steady, transition = system.steady_from, np.eye(len(root))
     last: tuple[np.ndarray, np.ndarray] | None = None
     for k in range(system.horizon):
         if k > steady and (k - steady) % SPAN == 0:
-            if last is not None and _is_still((square(root), rounding), last, transition):
+            if last is not None and _has_converged((square(root), rounding), last, transition):
                 break  # what follows is the same, to rounding
             last = square(root), rounding
         s = system.step(k)
-        noises = noises_of(s, size) if 0 < k <= steady else noises
+        noises = take_noise_roots(s, size) if 0 < k <= steady else noises
         gain, predicted, root = covariance_step(root, s, noises)
         keep = np.eye(len(root)) - gain @ s.output
         transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
@@ -107,8 +107,8 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     return believing(Schedule(gains, system.mean, _support_claim(claim, worst, when)), system.kept.premise)
 
 
-def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
-    """Return whether a covariance and its rounding are steady, to STILL of each entry's own scale.
+def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
+    """True if a covariance and its rounding are steady, to STILL of each entry's own scale.
 
     A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
     and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
@@ -127,7 +127,7 @@ def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool
 
 
 def _support_claim(claim: Claim, lost: float, step: int) -> Claim:
-    """The claim that is left where rounding is `lost` of a claimed variance."""
+    """Lower the claim where rounding is more than a small part (`lost`) of a claimed variance."""
     remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
     if lost > DIGITS_TOLERANCE:
         warnings.warn(
@@ -168,7 +168,9 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
         maps = np.concatenate([into @ s.transition, np.concatenate([nothing, now.transition, -now.output])], axis=1)
         shift = np.concatenate([np.zeros(len(nothing)), now.offset, -now.output_offset])
         mean = maps @ mean + into @ s.drift + received @ s.offset + shift
-        spread = propagate(maps, spread, propagate(into, s.process, propagate(received, s.noise, 0.0)))
+        spread = propagate_by_mode(
+            maps, spread, propagate_by_mode(into, s.process, propagate_by_mode(received, s.noise, 0.0))
+        )
         covariances.append(spread[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
         mean, spread = mean[:-q], spread[:-q, :-q]
     return np.array(covariances)

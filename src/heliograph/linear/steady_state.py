@@ -8,7 +8,7 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from heliograph.factors.roots import observe_root, roots_of, square
 from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certify_radius, find_gains
-from heliograph.linear.recursion import covariance_step, noises_of
+from heliograph.linear.recursion import covariance_step, take_noise_roots
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
@@ -79,12 +79,12 @@ def critical_arrival(
         what = "sensor" if fixed is None else "gain"
         raise fail(what, "one that keeps the error bounded where everything arrives", "an unstable mode that stays")
     # Upper bound: bisection over certified gains.
-    upper, certified = _smallest(gain_at, lower)
+    upper, certified = _bisect_critical_arrival(gain_at, lower)
     return CriticalArrival(lower if fixed is None else upper, upper, certified)
 
 
-def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tuple[float, np.ndarray]:
-    """The smallest arrival with a certified gain, by bisection, and that gain; `lower` itself if it is that close."""
+def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tuple[float, np.ndarray]:
+    """Find the smallest arrival probability with a certified gain, by bisection, and that gain."""
     near, gain = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
     if near is not None:
         return lower, near
@@ -106,7 +106,7 @@ def plant_matrices(
         or not isinstance(plant.noise, AbstractNoise)
         or isinstance(plant.matrix, OfInputs)
     ):
-        raise fail(what, "a LinearPlant that does not vary", _kind(plant))
+        raise fail(what, "a LinearPlant that does not vary", _describe_type(plant))
     refuse_angles(what, plant)
     return np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
 
@@ -116,13 +116,14 @@ def sensor_matrices(
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
     """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them."""
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
-        raise fail(what, "a LinearSensor that does not vary", _kind(sensor))
+        raise fail(what, "a LinearSensor that does not vary", _describe_type(sensor))
     check_sensor(sensor, states)
     refuse_angles(what, sensor)
     return np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
 
 
-def _kind(model: AnyPlant | AnySensor) -> str:
+def _describe_type(model: AnyPlant | AnySensor) -> str:
+    """Name the type of a model for an error message, with how it varies."""
     if isinstance(model, OverTime):
         return "one that varies"
     return f"one that varies with {list(model.inputs)}" if isinstance(model, LinearPlant) else type(model).__name__
@@ -169,18 +170,19 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     try:
         prior = solve_discrete_are(a.T, c.T, q, r)
     except (LinAlgError, ValueError) as error:
-        raise _none(str(error)) from None
+        raise _refuse_no_steady_state(str(error)) from None
     # One more correction and prediction gives the gain, and must come back to where it began.
-    noises = noises_of(step, np.diag(prior))
+    noises = take_noise_roots(step, np.diag(prior))
     gain, root = observe_root(roots_of(prior), c, noises.received)
     again = square(covariance_step(root, step, noises).predicted)
     unit = standard_deviations(prior)
     moved = np.abs(again - prior) / (unit[:, None] * unit)
     if not np.all(np.isfinite(prior)) or np.max(moved) > CLOSE or spectral_radius(a - a @ gain @ c) >= 1:
-        raise _none("none that is approached")
+        raise _refuse_no_steady_state("none that is approached")
     return SteadyState((prior + prior.T) / 2, square(root), gain)
 
 
-def _none(got: str) -> Exception:
+def _refuse_no_steady_state(got: str) -> Exception:
+    """Make the ValueError of a plant and sensor without a steady state."""
     expected = "unstable modes that the sensor sees, and noise in all those on the unit circle"
     return fail("steady state", expected, " ".join(got.split()).rstrip("."))

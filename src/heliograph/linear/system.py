@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.linear.jump_system import propagate
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import STRENGTH, Claim
 from heliograph.model.premise import NOTHING, Kept
 from heliograph.numerics import check
@@ -85,9 +85,9 @@ class LinearSystem(Module):
         self.mean = array("mean of the start", mean, (n,))
         self.covariance = check.covariance("covariance of the start", covariance, n)
         self.projection = array("what is to be known", projection, (None, n))
-        self.rounding = _rounding(rounding, (time, n))
-        self.received_rounding = _rounding(received_rounding, (time, m))
-        self.start_rounding = _rounding(start_rounding, (n,))
+        self.rounding = _rounding_or_zero(rounding, (time, n))
+        self.received_rounding = _rounding_or_zero(received_rounding, (time, m))
+        self.start_rounding = _rounding_or_zero(start_rounding, (n,))
 
     @property
     def horizon(self) -> int:
@@ -115,7 +115,8 @@ def repeat_last(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
 
 
-def _rounding(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
+def _rounding_or_zero(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Rounding as an array of this shape, zeros where none is given."""
     numbers: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
     return numbers
 
@@ -141,7 +142,7 @@ def state_moments(system: LinearSystem) -> StateMoments:
     for k in range(system.horizon):
         s = system.step(k)
         mean = s.transition @ mean + s.drift
-        spread = propagate(s.transition, spread, s.process)
+        spread = propagate_by_mode(s.transition, spread, s.process)
         means.append(mean)
         spreads.append(spread)
     return StateMoments(np.array(means), np.array(spreads))

@@ -28,7 +28,7 @@ from heliograph.random_affine.erasure import condition_on_arrival, outcomes, sec
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import Modes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.outliers import is_bounded
+from heliograph.random_affine.outliers import has_bounded_noise
 from heliograph.random_affine.superposed import Superposed
 
 ROUNDING = 1e-12  # relative: moments that were computed in another order
@@ -119,7 +119,7 @@ def _close(a: Any, b: Any) -> bool:
 def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
     if same(a, b):
         return True
-    if order != MEAN_AND_COVARIANCE or is_bounded(a) != is_bounded(b):
+    if order != MEAN_AND_COVARIANCE or has_bounded_noise(a) != has_bounded_noise(b):
         return False
     return _close(a.mean, b.mean) and _close(a.covariance, b.covariance)
 
@@ -275,7 +275,7 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
 
     Bounds of laws would have to be compared as laws.
     """
-    if is_bounded(a) != is_bounded(b):
+    if has_bounded_noise(a) != has_bounded_noise(b):
         return False
     believed, own = (_take_moments_by_arrival(channel) for channel in (a, b))
     whole = [moments for there, moments in believed if there.all()]
@@ -323,7 +323,7 @@ def _same_observation(
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False
     maps = [whole for observation in (a, b) if (whole := _compose_with_sensor(*observation)) is not None]
-    if len(maps) < 2 or is_bounded(a) != is_bounded(b):
+    if len(maps) < 2 or has_bounded_noise(a) != has_bounded_noise(b):
         return False
     return _same_map(drop_names(maps[0]), drop_names(maps[1]), order, True)
 

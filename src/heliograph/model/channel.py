@@ -18,8 +18,8 @@ from heliograph.random_affine.base import (
     all_inner_maps,
     check_forgets,
     check_maps,
-    independent,
     inner_maps,
+    separate_memories,
 )
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
 from heliograph.random_affine.delay import (
@@ -34,7 +34,7 @@ from heliograph.random_affine.delay import (
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate
-from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
+from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
 from heliograph.random_affine.superposed import Superposed
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
@@ -88,7 +88,7 @@ def hop(
     Source: cubature fusion under amplify-and-forward relays, equations (3) and (5).
     """
     law = gain if isinstance(gain, AbstractLaw) else Constant(gain)
-    count = components(noise) or check_count("dimension of a hop", dimension)
+    count = count_components(noise) or check_count("dimension of a hop", dimension)
     p = scalar("hop power", power, 0.0)
     factor = scalar("amplification", amplification) * library(p).sqrt(p)
     radio_hop = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
@@ -139,7 +139,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
         ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
-    return connect_in_series(independent(check_maps("series", hops)))
+    return connect_in_series(separate_memories(check_maps("series", hops)))
 
 
 def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> Delayed:
@@ -202,7 +202,7 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    both = independent(check_maps("stack", [relayed, direct]))
+    both = separate_memories(check_maps("stack", [relayed, direct]))
     past = max(c.past for c in both)
     return Stack([c if c.past == past else place_part(c, signal_size(c), 0, past) for c in both])
 
@@ -216,7 +216,7 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    channels = independent(check_maps("parallel channels", channels))
+    channels = separate_memories(check_maps("parallel channels", channels))
     parts, start, total, past = [], 0, sum(signal_size(c) for c in channels), max(c.past for c in channels)
     for c in channels:
         parts.append(place_part(c, total, start, past))
@@ -240,7 +240,7 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
         ValueError: links of other sizes; an erasure in a link, since a receiver of a sum does not see who is missing;
             flags or time stamps, which would be added up.
     """
-    links = independent(check_maps("links of a sum", links))
+    links = separate_memories(check_maps("links of a sum", links))
     for i, link in enumerate(links, 1):
         _check_added(f"link {i} of a sum", link)
     sizes, sent = [link.outputs for link in links], [signal_size(link) for link in links]

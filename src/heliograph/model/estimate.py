@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_value, standard_deviations
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.outliers import is_bounded
+from heliograph.random_affine.outliers import has_bounded_noise
 
 Claim = Literal["exact", "upper", "nominal", "none"]
 STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
@@ -102,7 +102,7 @@ def weakest(claims: list[Claim]) -> Claim:
 
 def lower_to_upper(claim: Claim, *models: PyTree) -> Claim:
     """Lower a claim to "upper" where some noise of these models is known by a bound of its covariance alone."""
-    return weakest([claim, "upper"]) if is_bounded(*models) else claim
+    return weakest([claim, "upper"]) if has_bounded_noise(*models) else claim
 
 
 def is_sound(estimate: Estimate) -> np.ndarray:

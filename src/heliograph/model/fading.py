@@ -19,13 +19,13 @@ from heliograph.random_affine.modes import (
     ModeOutput,
     Modes,
     OneStepLate,
-    forgetful,
-    harmless,
+    is_memory_irrelevant_for_linear_filter,
     joint_modes,
-    laws,
     mix_maps,
+    mode_laws_over_time,
+    redraw_modes_each_step,
 )
-from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, components
+from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, count_components
 from heliograph.random_affine.superposed import terms_without_common_memory
 
 
@@ -114,7 +114,7 @@ def autoregressive_fading(
     Raises:
         ValueError: a negative deviation, a correlation outside [-1, 1], a noise that is no covariance.
     """
-    count = components(noise) or check_count("dimension of a hop", dimension)
+    count = count_components(noise) or check_count("dimension of a hop", dimension)
     return Faded(Autoregression(correlation, name), mean, deviation, np.eye(count), as_noise("hop noise", noise, count))
 
 
@@ -196,9 +196,9 @@ def without_memory(channel: Channel) -> Channel:
     if not check_maps("channel", [first(channel)])[0].remembers:
         return channel
     if not isinstance(channel, OverTime):
-        return forgetful(channel)
+        return redraw_modes_each_step(channel)
     steps = [joint_modes(step, order=2) for step in unstack(channel)]
-    return over_time([mix_maps(step, law) for step, law in zip(steps, laws(steps), strict=True)])
+    return over_time([mix_maps(step, law) for step, law in zip(steps, mode_laws_over_time(steps), strict=True)])
 
 
 def memory_matters(channel: Channel) -> bool:
@@ -217,7 +217,12 @@ def memory_matters(channel: Channel) -> bool:
     if uncertain_chain(channel):
         return True
     terms = zip(*(terms_without_common_memory(step) for step in unstack(channel)), strict=True)
-    return any(not harmless([joint_modes(step) for step in term], not isinstance(channel, OverTime)) for term in terms)
+    return any(
+        not is_memory_irrelevant_for_linear_filter(
+            [joint_modes(step) for step in term], not isinstance(channel, OverTime)
+        )
+        for term in terms
+    )
 
 
 def uncertain_chain(channel: Channel) -> bool:

@@ -13,7 +13,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.check import items as as_items
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import one_memory
+from heliograph.random_affine.base import align_memories_over_time
 
 T = TypeVar("T")
 
@@ -92,7 +92,7 @@ def over_time(items: Sequence[object]) -> OverTime:
     items = as_items("over_time", items, "objects, one for each step")
     if not items:
         raise fail("over_time", "at least one item", "none")
-    return OverTime(stack(one_memory(items)))
+    return OverTime(stack(align_memories_over_time(items)))
 
 
 def at(tree: PyTree, k: int | np.integer | np.ndarray | Int[Array, ""]) -> PyTree:

@@ -98,7 +98,7 @@ class RelayNetwork(Module):
         covered = steps_covered(self)
         check_horizon(horizon, covered)
 
-    def steps(self, horizon: int) -> "Steps":
+    def steps(self, horizon: int) -> "RelaySteps":
         """Matrices and moments of each step, the first leading from x_0 to x_1.
 
         Raises:
@@ -118,7 +118,7 @@ class RelayNetwork(Module):
         means = [self.initial()[0]]
         for a, b in zip(transition[:-1], drift[:-1], strict=True):
             means.append(a @ means[-1] + b)
-        return Steps(
+        return RelaySteps(
             transition=transition,
             process=_tile(self.plant, horizon, lambda p: p.noise.covariance, 2),
             drift=drift,
@@ -129,18 +129,18 @@ class RelayNetwork(Module):
             gain=gain,
             offset=offset,
             spread=spread,
-            live=live,
-            talks=talks,
+            receives_in_slot=live,
+            transmits_in_slot=talks,
             received=self.received,
         )
 
 
-class Steps(Module):
+class RelaySteps(Module):
     """Matrices of a relay network that its second moments need, for each step (leading axis).
 
     The F filters together receive R numbers; T = (1 + relays) m numbers are sent: y, then the signal of each relay.
     With W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and conditional covariance spread_ij :
-    W (noise included). Rows with `live` = 1 have some link; `state_mean` is E x before the step.
+    W (noise included). Rows with `receives_in_slot` = 1 have some link; `state_mean` is E x before the step.
 
     Shapes: transition, process (time, n, n), drift, state_mean (time, n), sensing (time, m, n), sensor_noise
     (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, live (time, R), spread
@@ -157,8 +157,8 @@ class Steps(Module):
     gain: np.ndarray
     offset: np.ndarray
     spread: np.ndarray
-    live: np.ndarray
-    talks: np.ndarray
+    receives_in_slot: np.ndarray
+    transmits_in_slot: np.ndarray
     received: tuple[int, ...] = eqx.field(static=True)
 
     @property
@@ -179,7 +179,7 @@ class Steps(Module):
 
 
 def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
-    """Return gain, offset, spread, live rows and active senders of one slot, with the shapes of `Steps`."""
+    """Return gain, offset, spread, live rows and active senders of one slot, with the shapes of `RelaySteps`."""
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
     rows, columns = sum(network.received), len(senders) * m
     starts = dict(zip(network.filters, np.cumsum((0, *network.received[:-1])), strict=True))

@@ -18,7 +18,7 @@ from heliograph.numerics.check import array, fail, function, instance, name_list
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Float, Names
-from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
+from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
 
 T = TypeVar("T")
 LONG, SHORT = (97, 64), range(1, 13)  # lengths of a state at which a function is tried
@@ -89,11 +89,11 @@ class Sensor(AbstractSensor):
     ):
         self.function = _take_state_alone(measure)
         _refuse_function("sensor noise", noise)
-        dimension = (components(noise) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
+        dimension = (count_components(noise) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
         # A variance alone says nothing of the number of outputs, so the function is asked.
-        shape = (1,) if outputs is not None or components(noise) is not None else _shape_of(measure)
+        shape = (1,) if outputs is not None or count_components(noise) is not None else _shape_of(measure)
         if shape != (1,):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")

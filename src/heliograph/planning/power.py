@@ -184,7 +184,7 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
         if not all(np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME, SAME) for a, b in pairs):
             raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
     y = np.array([measurement_moment(relays.sensor, x, k) for k, x in enumerate(moments_over(relays.plant, steps))])
-    sensor = np.trace(y[:, :-1, :-1], axis1=1, axis2=2) * moved.talks[:, 0]
+    sensor = np.trace(y[:, :-1, :-1], axis1=1, axis2=2) * moved.transmits_in_slot[:, 0]
     return {SENSOR: sensor, **given_design(relays, gains).power}
 
 

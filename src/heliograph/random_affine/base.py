@@ -16,7 +16,7 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Float, PyTree
 from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.moments.monomials import Moments, count
+from heliograph.random_affine.moments.monomials import Moments, count_monomials
 
 T = TypeVar("T")
 
@@ -71,7 +71,7 @@ class AbstractRandomAffine(Module):
         if not held:
             return self._init(key)
         rest, *keys = jax.random.split(key, len(held) + 1)
-        return begin(self, rest, keys)
+        return init_with_shared_memories(self, rest, keys)
 
     def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw the next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
@@ -79,7 +79,7 @@ class AbstractRandomAffine(Module):
         if not held:
             return self._draw(state, key)
         rest, *keys = jax.random.split(key, len(held) + 1)
-        return advance(self, state, rest, keys)
+        return draw_with_shared_memories(self, state, rest, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """Draw the initial state of a map that contains no modes."""
@@ -146,7 +146,7 @@ def _check_sizes(written: Callable[[Any, int], object]) -> Callable[[Any, int], 
         result = written(channel, order)
         if isinstance(result, Moments):
             return result
-        shape = count(channel.outputs + 1, order), count(channel.inputs + 1, order)
+        shape = count_monomials(channel.outputs + 1, order), count_monomials(channel.inputs + 1, order)
         matrix = array(f"moments({order}) of {type(channel).__name__}", cast(Any, result), shape)
         return Moments(matrix, channel.outputs, channel.inputs, order)
 
@@ -280,36 +280,36 @@ class AbstractModal(AbstractRandomAffine):
         raise unwritten(self, "given")
 
 
-class Remembered(NamedTuple):
-    """States of the memories that a map holds, in order of appearance, and of the map given them."""
+class ChannelState(NamedTuple):
+    """State of a channel: of its memories, in order of appearance, and of the map given them."""
 
     memories: tuple[jax.Array, ...]
     rest: PyTree[jax.Array]
 
 
-def begin(channel: AbstractRandomAffine, key: jax.Array, keys: Sequence[jax.Array]) -> Remembered:
-    """State before the first draw of a map that holds modes, with one key for each of `memories`."""
+def init_with_shared_memories(channel: AbstractRandomAffine, key: jax.Array, keys: Sequence[jax.Array]) -> ChannelState:
+    """Draw a channel's state before the first draw, with one key for each of its `memories`."""
     states = tuple(m.begin(k) for m, k in zip(memories(channel).values(), keys, strict=True))
-    return Remembered(states, condition_on_memories(channel, states).init(key))
+    return ChannelState(states, condition_on_memories(channel, states).init(key))
 
 
-def advance(
-    channel: AbstractRandomAffine, state: Remembered, key: jax.Array, keys: Sequence[jax.Array]
-) -> tuple[Remembered, jax.Array]:
-    """H given the memories' states, and the states that follow."""
+def draw_with_shared_memories(
+    channel: AbstractRandomAffine, state: ChannelState, key: jax.Array, keys: Sequence[jax.Array]
+) -> tuple[ChannelState, jax.Array]:
+    """Draw H given the memories' states, and move these; memories of one key move alike."""
     rest, h = condition_on_memories(channel, state.memories).draw(state.rest, key)
     held = memories(channel).values()
-    return Remembered(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
+    return ChannelState(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
     """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
     parts = jax.tree.leaves(channel, is_leaf=_is_modal)
-    return distinct(leaf.memory for leaf in parts if _is_modal(leaf))
+    return unique_memories(leaf.memory for leaf in parts if _is_modal(leaf))
 
 
-def distinct(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Memories by what tells them apart, in order of appearance."""
+def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
+    """Memories without repetition, told apart by their labels, in order of appearance."""
     results: dict[str, AbstractMemory] = {}
     for memory in held:
         known = results.setdefault(memory.identity, memory)
@@ -336,8 +336,8 @@ def drop_names(channel: T) -> T:
     return replace_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
 
 
-def independent(maps: Sequence[T]) -> list[T]:
-    """The same maps as links apart: an unnamed memory that stands in several of them becomes one of each."""
+def separate_memories(maps: Sequence[T]) -> list[T]:
+    """Return maps that share no unnamed memory: one that stands in several of them becomes one of each."""
     apart, taken = [], set[str]()
     for index, affine in enumerate(maps):
         held = memories(affine)
@@ -347,8 +347,8 @@ def independent(maps: Sequence[T]) -> list[T]:
     return apart
 
 
-def one_memory(maps: Sequence[T]) -> list[T]:
-    """The same maps at later steps: unnamed memories of each are those of the first, in order of appearance."""
+def align_memories_over_time(maps: Sequence[T]) -> list[T]:
+    """Return the maps of later steps with the unnamed memories of the first step, in order of appearance."""
     by_map = [memories(affine) for affine in maps]
     if not by_map[0] or len({len(held) for held in by_map}) > 1:
         return list(maps)
@@ -372,6 +372,7 @@ def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
 
 
 def _is_modal(leaf: object) -> bool:
+    """True for a map whose law depends on the state of a memory."""
     return isinstance(leaf, AbstractModal)
 
 

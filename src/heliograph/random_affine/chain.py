@@ -70,16 +70,16 @@ class AbstractMemory(Module):
         """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
         raise unwritten(self, "nodes")
 
-    def read(self, number: jax.Array) -> jax.Array:
-        """The state that a number tells of."""
-        raise unwritten(self, "read")
+    def state_from_number(self, number: jax.Array) -> jax.Array:
+        """Return the state that a received number stands for."""
+        raise unwritten(self, "state_from_number")
 
-    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """States and weights that stand for the law of the next state given this one (None: of that at the first use).
+    def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """Points and weights for the next state's law given this one (None: for the law at the first use).
 
         Exact for polynomials of twice the `degree` in the state.
         """
-        raise unwritten(self, "following")
+        raise unwritten(self, "next_state_quadrature")
 
     def labelled(self, label: str) -> "AbstractMemory":
         """Return a copy that no link refers to yet, identified by `label` alone."""
@@ -90,7 +90,7 @@ class AbstractMemory(Module):
 
     def named(self, name: str) -> "AbstractMemory":
         """Return a copy with this name, one memory with all others of the name."""
-        twin = self.labelled(_identity(name))
+        twin = self.labelled(_identify_memory(name))
         object.__setattr__(twin, "name", name)
         return twin
 
@@ -132,7 +132,7 @@ class MarkovChain(AbstractMemory):
             probabilities(f"transition from mode {i}", row)
         self.radius = radii("radius of the transition", radius, rows)
         self.initial = stationary(rows) if initial is None else probabilities("initial law", initial, len(rows))
-        self.name, self.identity = name, _identity(name)
+        self.name, self.identity = name, _identify_memory(name)
 
     @property
     def modes(self) -> int:
@@ -151,11 +151,11 @@ class MarkovChain(AbstractMemory):
         """The modes."""
         return Nodes(np.arange(self.modes), self.initial, self.transition, self.radius)
 
-    def read(self, number: jax.Array) -> jax.Array:
+    def state_from_number(self, number: jax.Array) -> jax.Array:
         """The nearest mode from below."""
         return jnp.clip(jnp.asarray(number).astype(int), 0, self.modes - 1)
 
-    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+    def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
         """The modes with their probabilities."""
         law = jnp.asarray(self.initial) if state is None else jnp.asarray(self.transition)[state]
         return jnp.arange(self.modes), law
@@ -178,7 +178,7 @@ class Autoregression(AbstractMemory):
 
     def __init__(self, correlation: "Float[ArrayLike, '']", name: str | None = None):
         self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
-        self.name, self.identity = name, _identity(name)
+        self.name, self.identity = name, _identify_memory(name)
 
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw N(0, 1)."""
@@ -196,17 +196,17 @@ class Autoregression(AbstractMemory):
         the normalised Hermite polynomials. Expectations of polynomials of degree 2 N - 1 are exact; for a degree of 1
         this is a chain, x = -1, 1 that switches with probability (1 - rho) / 2.
         """
-        x, w, hermite = _hermite(check_count("degree", degree, 0) + 1)
+        x, w, hermite = _hermite_quadrature(check_count("degree", degree, 0) + 1)
         powers = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
         return Nodes(x, w, (hermite * powers) @ hermite.T * w)
 
-    def read(self, number: jax.Array) -> jax.Array:
+    def state_from_number(self, number: jax.Array) -> jax.Array:
         """The number."""
         return number
 
-    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+    def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
         """rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x; x itself at the first use."""
-        x, w, _ = _hermite(degree + 1)
+        x, w, _ = _hermite_quadrature(degree + 1)
         rho = jnp.asarray(self.correlation)
         return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
 
@@ -218,8 +218,13 @@ class Autoregression(AbstractMemory):
         n = check_count("modes of a fading", modes, 2) - 1
         xp = library(self.correlation)
         stays = (1 + xp.asarray(self.correlation)) / 2
-        rows = [xp.convolve(_binomial(i, stays), _binomial(n - i, 1 - stays)) for i in range(n + 1)]
-        return Nodes(np.sqrt(n) * np.linspace(-1, 1, n + 1), _binomial(n, np.asarray(0.5)), xp.stack(rows))
+        rows = [
+            xp.convolve(_binomial_probabilities(i, stays), _binomial_probabilities(n - i, 1 - stays))
+            for i in range(n + 1)
+        ]
+        return Nodes(
+            np.sqrt(n) * np.linspace(-1, 1, n + 1), _binomial_probabilities(n, np.asarray(0.5)), xp.stack(rows)
+        )
 
 
 def stationary(transition: Rows) -> Law:
@@ -234,14 +239,14 @@ def stationary(transition: Rows) -> Law:
     return normalised
 
 
-def _identity(name: str | None) -> str:
-    """Return the text that identifies a memory, through copies and in other processes; no draw depends on it."""
+def _identify_memory(name: str | None) -> str:
+    """Return a text that identifies a memory, through copies and in other processes; no draw depends on it."""
     if name is not None and (not isinstance(name, str) or not name):
         raise fail("name of a memory", "a text", repr(name))
     return uuid4().hex if name is None else f"named {name}"
 
 
-def _binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+def _binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     """Probabilities of 0, ..., n successes."""
     k = np.arange(n + 1)
     ways = np.array([comb(n, i) for i in k], dtype=float)
@@ -250,7 +255,7 @@ def _binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
 
 
 @cache_arrays
-def _hermite(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
     x, w = hermegauss(count)
     scale = np.sqrt([float(factorial(m)) for m in range(count)])

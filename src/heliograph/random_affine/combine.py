@@ -24,10 +24,10 @@ from heliograph.random_affine.base import (
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.moments.monomials import (
     Moments,
-    count,
+    count_monomials,
     degrees,
     exponents,
-    multiply,
+    multiply_polynomials,
     position,
     product_table,
     refuse_if_too_large,
@@ -103,9 +103,9 @@ class GainAndNoise(AbstractHop):
     @cache_by_object
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
         """Return B_k: E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)], |b| = k."""
-        rows, columns = count(self.outputs + 1, order), count(self.inputs + 1, order)
+        rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
-        deterministic = symmetric_power(homogeneous(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
+        deterministic = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
         row, column, rest, ways = sum_plan(self.outputs, order)
         terms = (ways * noise_vector(self.noise, order)[rest])[:, None] * deterministic[column]
         return scatter((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
@@ -129,8 +129,8 @@ class GainAndNoise(AbstractHop):
         return GainAndNoise(self.law.mean_law(), self.matrix, self.noise)
 
 
-def homogeneous(matrix: Matrix) -> Matrix:
-    """Return [[A, 0], [0, 1]]."""
+def affine_matrix(matrix: Matrix) -> Matrix:
+    """[[A, 0], [0, 1]], which maps (y, 1) to (A y, 1)."""
     outputs, inputs = matrix.shape
     right, below = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
     xp = library(matrix)
@@ -338,10 +338,16 @@ class Stack(AbstractCombination):
     def moments(self, order: int) -> Moments:
         """E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
         check_forgets("moments of a map", self)
-        refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
+        refuse_if_too_large(
+            count_monomials(self.outputs + 1, order),
+            count_monomials(self.inputs + 1, order),
+            f"moments of order {order}",
+        )
         items = [m.moments(order) for m in self.maps]
         tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in items]
-        return Moments(stack_parts(stack_rows(self, order, tables, multiply)), self.outputs, self.inputs, order)
+        return Moments(
+            stack_parts(stack_rows(self, order, tables, multiply_polynomials)), self.outputs, self.inputs, order
+        )
 
 
 def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]) -> list[Any]:
@@ -362,7 +368,7 @@ def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Calla
             if k:
                 factor = table[k][..., position(m.outputs + 1, k)[(*a, 0)], :]
                 polynomial, degree = times(polynomial, degree, factor, k, variables), degree + k
-        constant = np.zeros(count(variables, powers[-1]))
+        constant = np.zeros(count_monomials(variables, powers[-1]))
         constant[-1] = 1.0  # 1^(order - |a|)
         rows.append(times(polynomial, degree, constant, powers[-1], variables))
     return rows

@@ -88,8 +88,11 @@ class Delayed(AbstractDelayLine):
         (self.link,) = check_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
-        self.times, self.timestamped = _times(delay), instance("timestamped", timestamped, bool, "True or False")
-        items = [_chosen(d, self.past, link.inputs, timestamped) for d in self.times]
+        self.times, self.timestamped = (
+            _delay_weights(delay),
+            instance("timestamped", timestamped, bool, "True or False"),
+        )
+        items = [_selection_matrix(d, self.past, link.inputs, timestamped) for d in self.times]
         match delay:
             case Discrete():
                 self.delay = Mixture(items, delay.probabilities, delay.radius)
@@ -119,10 +122,11 @@ class Delayed(AbstractDelayLine):
 
     def given(self, d: int) -> AbstractRandomAffine:
         """Return the map of the line for one delay d, without the time stamp."""
-        return Series([_chosen(d, self.past, self.link.inputs, False), self.link])
+        return Series([_selection_matrix(d, self.past, self.link.inputs, False), self.link])
 
 
-def _times(delay: Delay) -> tuple[int, ...]:
+def _delay_weights(delay: Delay) -> tuple[int, ...]:
+    """List the possible delays in steps."""
     match delay:
         case Discrete():
             values = [int(d) if d == int(d) else float(d) for d in np.asarray(delay.values)]
@@ -135,8 +139,8 @@ def _times(delay: Delay) -> tuple[int, ...]:
     return tuple(check_count("delay", d, 0) for d in values)
 
 
-def _chosen(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
-    """S_d, and below it the number d."""
+def _selection_matrix(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
+    """S_d, which selects the signal of d steps ago from the line, and below it the number d if time stamped."""
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:
         return known(rows)
@@ -259,14 +263,14 @@ def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAf
             stages[-1].append(link)
     # Only random delays after the first stage need storage.
     if len(stages) == 1:
-        return _stage(stages[0])
+        return _join_stage(stages[0])
     if any(isinstance(link, Delayed) and link.timestamped for link in links):
         raise fail("time stamps", "those of one link", "those of several in series")
-    return Relayed(tuple(_stage(stage) for stage in stages))
+    return Relayed(tuple(_join_stage(stage) for stage in stages))
 
 
-def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """Return links in series of which only the first may have a random delay."""
+def _join_stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
+    """Join links in series of which only the first may have a random delay."""
     delays = [link for link in links if isinstance(link, Delayed)]
     if not delays:
         return Series(links)
@@ -283,11 +287,11 @@ def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
             raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
     chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
     more = sum(link.times[0] for link in added)
-    return Delayed(chain, more if start is None else _longer(start, more), any(timestamped))
+    return Delayed(chain, more if start is None else _add_delay(start, more), any(timestamped))
 
 
-def _longer(link: Delayed, more: int) -> Delay:
-    """The link's delay and so many steps, none after a chain."""
+def _add_delay(link: Delayed, more: int) -> Delay:
+    """Add a number of steps to a link's delay, none after a chain."""
     match link.delay:
         case Mixture():
             times = np.array(link.times, dtype=float) + more

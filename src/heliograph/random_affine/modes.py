@@ -215,7 +215,7 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     held = memories(channel)
-    chains = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
+    chains = [_nodes_of_memory(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
@@ -233,7 +233,8 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     return JointModes(initial, transition, most - transition, maps)
 
 
-def _nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
+def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
+    """Return a memory as finitely many states, as many as its degree in the channel asks for."""
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)
     return memory.nodes(degree)
@@ -255,8 +256,8 @@ ROUNDING = 1e-12  # relative: of sums over modes that cancel
 DOUBLINGS = 60  # of the steps after which the law of the modes is that of the long run
 
 
-def forgetful(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """The channel with its modes drawn anew at each step, by their law in the long run; moments up to order 4 are kept.
+def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return the channel with its modes drawn anew at each step, by their law in the long run.
 
     A channel without memory is itself.
     """
@@ -280,16 +281,16 @@ def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, 
     return np.asarray(initial @ rows)
 
 
-def laws(steps: Sequence[JointModes]) -> list[np.ndarray]:
-    """Law of the mode at each step."""
+def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
+    """Probabilities of the modes at each step."""
     over_steps = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
         over_steps.append(over_steps[-1] @ np.asarray(step.transition))
     return over_steps
 
 
-def harmless(steps: Sequence[JointModes], constant: bool) -> bool:
-    """Return whether the linear filter that ignores memory is the best linear one: Cov(Hbar_k, Hbar_l) = 0 for k < l.
+def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant: bool) -> bool:
+    """True if the best linear filter may ignore memory: Cov(Hbar_k, Hbar_l) = 0 for k < l.
 
     Hbar_k = E[H_k | mode]. Where nothing varies (`constant`, one step given), the law of the modes must be that of all
     steps, and lags up to the number of modes decide, since Pi^t is a combination of lower powers (Cayley-Hamilton).
@@ -301,7 +302,7 @@ def harmless(steps: Sequence[JointModes], constant: bool) -> bool:
     means = means * len(items) if constant else means
     size = max(float(np.max(np.abs(m))) for m in means) ** 2
     starts = 1 if constant else len(items)
-    for k, law in enumerate(laws(items)[:starts]):
+    for k, law in enumerate(mode_laws_over_time(items)[:starts]):
         apart = law[:, None] * (means[k] - law @ means[k])
         for step, later in zip(items[k:-1], means[k + 1 :], strict=True):
             apart = np.asarray(step.transition).T @ apart

@@ -77,7 +77,7 @@ class Gaussian(AbstractNoise):
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
             self.factor, self.weights = eliminate(jnp.asarray(self.covariance))
             return
-        self.factor = _root(self.covariance)
+        self.factor = _eigenvector_root(self.covariance)
         self.weights = np.ones(n)
 
     @property
@@ -109,7 +109,7 @@ class Gaussian(AbstractNoise):
         return expectation(tuple(powers))
 
 
-def _root(covariance: Square) -> np.ndarray:
+def _eigenvector_root(covariance: Square) -> np.ndarray:
     """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
 
     Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
@@ -199,8 +199,8 @@ class Independent(AbstractNoise):
         return value
 
 
-def in_groups(noise: AbstractNoise, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-    """Return the noise of each group of components, where groups in order are independent and complete; else None."""
+def split_into_groups(noise: AbstractNoise, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
+    """Split a noise into those of groups of components, None unless the groups are independent and complete."""
     if [i for group in groups for i in group] != list(range(noise.dimension)) or is_traced(noise):
         return None
     label = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
@@ -281,8 +281,8 @@ def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
     return value
 
 
-def components(value: NoiseLike) -> int | None:
-    """Return the number of components of a noise law or covariance; None for a number, which is a variance alone."""
+def count_components(value: NoiseLike) -> int | None:
+    """Count the components of a noise law or covariance; None for a number, which is a variance alone."""
     if isinstance(value, AbstractNoise):
         return value.dimension
     try:

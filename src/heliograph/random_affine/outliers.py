@@ -110,9 +110,9 @@ class Contaminated(AbstractNoise):
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
         inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
         n = inlier.shape[-1]
-        parts, several = _shares(share)
-        outliers = _several("covariance of the outliers", outlier_covariance, len(parts), several)
-        biases = _several("bias of the outliers", bias, len(parts), several)
+        parts, several = _check_shares(share)
+        outliers = _check_matrices("covariance of the outliers", outlier_covariance, len(parts), several)
+        biases = _check_matrices("bias of the outliers", bias, len(parts), several)
         xp = library(inlier, parts, outliers, biases)
         spreads = [check.covariance("covariance of the outliers", r, n) for r in outliers]
         centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
@@ -189,20 +189,20 @@ class Branches(NamedTuple):
     variance: Matrix
 
 
-def branches(noise: AbstractNoise) -> Branches:
-    """Branches of each component: those of the law, 25 of Student's, one of any other law, with its two moments."""
+def branches_of_noise(noise: AbstractNoise) -> Branches:
+    """Mixture of Gaussian branches for each component: the law's, 25 of Student's, one of any other law."""
     match noise:
         case Independent():
-            return _stack_branches([branches(component) for component in noise.parts])
+            return _stack_branches([branches_of_noise(component) for component in noise.parts])
         case Contaminated():
             xp, n = library(noise.shares), noise.dimension
-            shares = xp.broadcast_to(_log(noise.shares), (n, len(noise.shares)))
+            shares = xp.broadcast_to(_log_or_minus_infinity(noise.shares), (n, len(noise.shares)))
             variances = xp.diagonal(noise.covariances, axis1=1, axis2=2).T
             return Branches(shares, (noise.means - noise.mean).T, variances)
         case StudentT():
             xp, n = library(noise.degrees, noise.scale), noise.dimension
             shape = (n, len(PRECISIONS))
-            shares = xp.broadcast_to(_log(precision_shares(noise.degrees)), shape)
+            shares = xp.broadcast_to(_log_or_minus_infinity(precision_shares(noise.degrees)), shape)
             return Branches(shares, np.zeros(shape), xp.diagonal(noise.scale)[:, None] / PRECISIONS)
     variances = library(noise.covariance).diagonal(noise.covariance)[:, None]
     return Branches(np.zeros((noise.dimension, 1)), np.zeros((noise.dimension, 1)), variances)
@@ -220,25 +220,25 @@ def precision_shares(degrees: ArrayLike) -> Vector:
     return shares
 
 
-class Nominal(NamedTuple):
+class NoiseWithoutOutliers(NamedTuple):
     """The noise without its outliers: mean (n,), relative to that of the whole, and covariance (n, n)."""
 
     mean: Vector
     covariance: Square
 
 
-def nominal(noise: AbstractNoise) -> Nominal:
-    """The first branch of contaminated noise, the scale of Student's, the law's own moments else."""
+def noise_without_outliers(noise: AbstractNoise) -> NoiseWithoutOutliers:
+    """Noise without its outliers: the first branch of contaminated noise, Student's scale, else the law."""
     match noise:
         case Independent():
-            items = [nominal(law) for law in noise.parts]
+            items = [noise_without_outliers(law) for law in noise.parts]
             mean = library(items).concatenate([law.mean for law in items])
-            return Nominal(mean, block_diagonal([law.covariance for law in items]))
+            return NoiseWithoutOutliers(mean, block_diagonal([law.covariance for law in items]))
         case Contaminated():
-            return Nominal(noise.means[0] - noise.mean, noise.covariances[0])
+            return NoiseWithoutOutliers(noise.means[0] - noise.mean, noise.covariances[0])
         case StudentT():
-            return Nominal(np.zeros(noise.dimension), noise.scale)
-    return Nominal(np.zeros(noise.dimension), noise.covariance)
+            return NoiseWithoutOutliers(np.zeros(noise.dimension), noise.scale)
+    return NoiseWithoutOutliers(np.zeros(noise.dimension), noise.covariance)
 
 
 def has_outliers(noise: AbstractNoise) -> bool:
@@ -248,8 +248,8 @@ def has_outliers(noise: AbstractNoise) -> bool:
     return isinstance(noise, StudentT | Contaminated)
 
 
-def is_bounded(*parts: PyTree) -> bool:
-    """Ask whether some noise in these parts of a network is known by a bound of its covariance alone."""
+def has_bounded_noise(*parts: PyTree) -> bool:
+    """True if some noise in these parts of a network is known by a bound of its covariance alone."""
 
     def is_law(leaf: object) -> bool:
         return isinstance(leaf, Contaminated)
@@ -261,8 +261,8 @@ def _size(value: ArrayLike) -> int | None:
     return None if rank("covariance", value) else 1
 
 
-def _shares(share: ArrayLike) -> tuple[list[Number], bool]:
-    """Shares of the kinds of outliers, and whether a list of them was given."""
+def _check_shares(share: ArrayLike) -> tuple[list[Number], bool]:
+    """Return the probabilities of the kinds of outliers, and whether a list of them was given."""
     if not rank("share of outliers", share):
         return [scalar("share of outliers", share, 0.0, 1.0)], False
     values = array("shares of outliers", share, ("kinds",))
@@ -273,7 +273,8 @@ def _shares(share: ArrayLike) -> tuple[list[Number], bool]:
     return list(values), True
 
 
-def _several(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
+def _check_matrices(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
+    """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many."""
     if not several:
         return [value]
     if not rank(name, value):
@@ -296,7 +297,7 @@ def _exponential_slices(count: int) -> tuple[np.ndarray, np.ndarray]:
     return first, second - first**2
 
 
-def _log(value: Vector) -> Vector:
+def _log_or_minus_infinity(value: Vector) -> Vector:
     """Logarithms, -inf of zero without a warning."""
     if is_traced(value):
         return jnp.log(value)

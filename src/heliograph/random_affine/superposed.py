@@ -25,16 +25,16 @@ from heliograph.random_affine.combine import (
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.monomials import (
     Moments,
-    count,
+    count_monomials,
     exponents,
-    factors,
+    factor_variables,
     place,
     position,
     refuse_if_too_large,
     sum_plan,
     times_one,
 )
-from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise, in_groups, noise_vector
+from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise, noise_vector, split_into_groups
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y
 
@@ -137,15 +137,17 @@ class Superposed(AbstractCombination):
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
         """E[Sym^order] of the sum from those of the parts, each (corners, rows, columns)."""
-        columns = count(self.inputs + 1, order)
-        refuse_if_too_large(count(self.outputs + 1, order), columns, f"moments of order {order}")
+        columns = count_monomials(self.inputs + 1, order)
+        refuse_if_too_large(count_monomials(self.outputs + 1, order), columns, f"moments of order {order}")
         terms = [
-            _terms(matrix, m.outputs, chosen, order)
+            _polynomials_of_map(matrix, m.outputs, chosen, order)
             for matrix, m, chosen in zip(parts, self.maps, self.places, strict=True)
         ]
         law = noise_vector(self.noise, order)[None, :, None]
-        whole = _plus(_halves(terms, self.outputs), _terms(law, self.outputs, (), order), self.outputs)
-        return _whole(whole, self.outputs, self.inputs, order)
+        whole = _add_powers(
+            _sum_by_halves(terms, self.outputs), _polynomials_of_map(law, self.outputs, (), order), self.outputs
+        )
+        return _assemble_moments(whole, self.outputs, self.inputs, order)
 
 
 class _Powers(NamedTuple):
@@ -158,15 +160,15 @@ class _Powers(NamedTuple):
     by_degree: list[Corners]
 
 
-def _terms(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers:
-    """Polynomials of one map from its E[Sym^order(H)] at each corner."""
+def _polynomials_of_map(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers:
+    """Polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner."""
     ordered = tuple(sorted(places))
     ones = library(matrix).ones((len(matrix), 1, 1))
     where = [ordered.index(i) for i in places] + [len(places)]  # of each variable of the map, and of 1
     by_degree = [ones]
     for degree in range(1, order + 1):
         rows, columns = _find_degree(outputs, degree, order), times_one(len(places) + 1, degree, order)
-        target = np.argsort(place(np.array(where)[factors(len(places) + 1, degree)], len(places) + 1))
+        target = np.argsort(place(np.array(where)[factor_variables(len(places) + 1, degree)], len(places) + 1))
         by_degree.append(matrix[:, rows[:, None], columns[target]])
     return _Powers(ordered, by_degree)
 
@@ -174,39 +176,39 @@ def _terms(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers
 @cache_arrays
 def _find_degree(outputs: int, degree: int, order: int) -> np.ndarray:
     """Positions at `order` of the monomials of z alone of this degree, times powers of 1."""
-    alone = factors(outputs, degree)
+    alone = factor_variables(outputs, degree)
     return place(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
 
 
-def _halves(terms: Sequence[_Powers], outputs: int) -> _Powers:
-    """The sum of terms, from those of its halves: polynomials of few variables are multiplied first."""
+def _sum_by_halves(terms: Sequence[_Powers], outputs: int) -> _Powers:
+    """E[t^a | y] of a sum of terms from those of its halves: polynomials of few variables are multiplied first."""
     if len(terms) == 1:
         return terms[0]
     middle = len(terms) // 2
-    return _plus(_halves(terms[:middle], outputs), _halves(terms[middle:], outputs), outputs)
+    return _add_powers(_sum_by_halves(terms[:middle], outputs), _sum_by_halves(terms[middle:], outputs), outputs)
 
 
-def _plus(a: _Powers, b: _Powers, outputs: int) -> _Powers:
+def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
     """E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y], at each pair of corners, the first slowest."""
     places = tuple(sorted({*a.places, *b.places}))
     size, corners = len(places) + 1, len(a.by_degree[0]) * len(b.by_degree[0])
     left_variables, right_variables = ((*(places.index(i) for i in part.places), size - 1) for part in (a, b))
     by_degree = [library(a.by_degree[0], b.by_degree[0]).ones((corners, 1, 1))]
     for degree in range(1, len(a.by_degree)):
-        total: Corners = np.zeros((count(size, degree), count(outputs, degree), corners))
-        for first, (row, mine, other, ways) in enumerate(_ways(outputs, degree)):
+        total: Corners = np.zeros((count_monomials(size, degree), count_monomials(outputs, degree), corners))
+        for first, (row, mine, other, ways) in enumerate(_binomial_terms(outputs, degree)):
             left = a.by_degree[first][:, None, mine, :, None] * ways[:, None, None]
             right = b.by_degree[degree - first][None, :, other, None, :]
             products = (left * right).reshape(corners, len(row), -1)
             where = _products(left_variables, right_variables, first, degree - first, size).reshape(-1)
-            rows = scatter((count(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
-            total = total + scatter((count(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
+            rows = scatter((count_monomials(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
+            total = total + scatter((count_monomials(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
         by_degree.append(total.transpose(2, 1, 0))
     return _Powers(places, by_degree)
 
 
 @cache_arrays
-def _ways(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
+def _binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     """Terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
     names = exponents(outputs + 1, degree)
     ways: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
@@ -220,21 +222,21 @@ def _ways(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
 @cache_arrays
 def _products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
     """Positions of the products of monomials of two sets of variables among those of all `size`."""
-    left, right = np.array(a)[factors(len(a), first)], np.array(b)[factors(len(b), second)]
+    left, right = np.array(a)[factor_variables(len(a), first)], np.array(b)[factor_variables(len(b), second)]
     shape = len(left), len(right)
     both = [np.broadcast_to(left[:, None], (*shape, first)), np.broadcast_to(right, (*shape, second))]
     return place(np.concatenate(both, axis=-1), size)
 
 
-def _whole(powers: _Powers, outputs: int, inputs: int, order: int) -> Corners:
-    """E[Sym^order(H)] at each corner from the polynomials of each degree."""
+def _assemble_moments(powers: _Powers, outputs: int, inputs: int, order: int) -> Corners:
+    """Assemble E[Sym^order(H)] at each corner from the polynomials of each degree."""
     size, corners = len(powers.places) + 1, len(powers.by_degree[0])
     names = np.array([*powers.places, inputs])
     xp = library(powers.by_degree)
-    matrix: Corners = xp.zeros((corners, count(outputs + 1, order), count(inputs + 1, order)))
+    matrix: Corners = xp.zeros((corners, count_monomials(outputs + 1, order), count_monomials(inputs + 1, order)))
     for degree, polynomials in enumerate(powers.by_degree):
         rows = _find_degree(outputs, degree, order)
-        chosen = np.pad(names[factors(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
+        chosen = np.pad(names[factor_variables(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
         columns = place(chosen, inputs + 1)
         if xp is np:
             matrix[:, rows[:, None], columns] = polynomials
@@ -249,7 +251,7 @@ def sensed_by_link(matrix: Matrix, noise: AbstractNoise, channel: AbstractRandom
     That holds where the parts of v that links carry are independent; else, and for another channel, there is none.
     """
     first, *rest = maps_in_series(channel)
-    if not isinstance(first, Superposed) or (parts := in_groups(noise, first.places)) is None:
+    if not isinstance(first, Superposed) or (parts := split_into_groups(noise, first.places)) is None:
         return None
     links = [
         Series([GainAndNoise(Constant(1.0), np.asarray(matrix)[list(at)], part), link])

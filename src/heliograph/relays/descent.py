@@ -99,6 +99,7 @@ class _Limited:
 def _backtrack(
     function: Function, x: np.ndarray, value: float, direction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, float, np.ndarray] | None:
+    """Shorten the step until the value is finite and falls enough (Armijo); None where no step does."""
     length = 1.0
     while length >= SHORTEST:
         new_value, gradient = function(x + length * direction)

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import propagate
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.estimate import lower_to_upper
 from heliograph.model.premise import Premise, believing
-from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
+from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import contract
@@ -153,7 +153,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         error = slice((1 + f) * n, (2 + f) * n)
         believed = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, mine, mine]
         # Gains on what nobody transmits are not used.
-        gain = design.gains[name] * np.asarray(steps.live)[:, None, mine]
+        gain = design.gains[name] * np.asarray(steps.receives_in_slot)[:, None, mine]
         expected, constant = rows[:, mine], constants[:, mine]
         # s+ = (A - K B) s + K z + a - K b.
         transition = steps.transition - gain @ expected
@@ -176,7 +176,7 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
 
 
 @compile_in_float64
-def _predict_covariances(steps: Steps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
+def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
     """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
     return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
 
@@ -241,7 +241,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
-    known, received, white = _sides(steps, start_moments(network), joined)
+    known, received, white = _relay_sides(steps, start_moments(network), joined)
     d, r = known.shape[-1], received.shape[1]
     none = np.zeros((len(known), d + r, r))
     # Means: x+ has drift a, z the constant b.
@@ -259,7 +259,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
     mean[:n], covariance[:d, :d] = network.initial()[0], start_moments(network)[:d, :d]
     # Gains on what nobody transmits are not used.
-    ends, live = np.cumsum(network.received), np.asarray(steps.live)
+    ends, live = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
     relayed = {
         name: np.asarray(gains[name]) * live[:, None, end - size : end]
         for name, size, end in zip(network.relays, network.received, ends, strict=False)
@@ -294,30 +294,30 @@ class RelaySide(NamedTuple):
     noise: Float[jax.Array, "*time d+r d+r"]
 
 
-def relay_side(p: Steps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
+def relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
     """Return the linear system of (x, e_relays) that the receiver estimates in one step."""
-    n, r = p.transition.shape[-1], p.received[-1]
-    maps, d = linear_maps(p), moments.shape[0]
-    known, rows = d - n, p.gain.shape[0] - r  # without the receiver's error, without its received rows
-    received = (p.gain @ maps.sent)[rows:]
+    n, r = step.transition.shape[-1], step.received[-1]
+    maps, d = linear_maps(step), moments.shape[0]
+    known, rows = d - n, step.gain.shape[0] - r  # without the receiver's error, without its received rows
+    received = (step.gain @ maps.sent)[rows:]
     full = jnp.concatenate([maps.moved[:known], maps.innovation[:rows], received])
-    relays = jnp.concatenate([jnp.zeros((n, rows)), -(gain * p.live)[: known - n, :rows]])
+    relays = jnp.concatenate([jnp.zeros((n, rows)), -(gain * step.receives_in_slot)[: known - n, :rows]])
     close = jnp.concatenate([jnp.eye(known), relays, jnp.zeros((known, r))], axis=1)
     close = jnp.concatenate([close, jnp.eye(r, known + rows + r, known + rows)])
     moved = close @ full
-    noise = jax.scipy.linalg.block_diag(p.process, p.sensor_noise)
-    _, sent = step_moments(p, moments)
-    random = contract(p.spread, sent.second)
-    white = propagate(moved[:, d:], noise, propagate(close[:, known:], random, 0.0))
+    noise = jax.scipy.linalg.block_diag(step.process, step.sensor_noise)
+    _, sent = step_moments(step, moments)
+    random = contract(step.spread, sent.second)
+    white = propagate_by_mode(moved[:, d:], noise, propagate_by_mode(close[:, known:], random, 0.0))
     return RelaySide(moved[:known, :known], moved[known:, :known], white)
 
 
 @compile_in_float64
-def _sides(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
+def _relay_sides(steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
     """`relay_side` at each step."""
 
-    def single(moments: jax.Array, row: tuple[Steps, jax.Array]) -> tuple[jax.Array, RelaySide]:
+    def single(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, RelaySide]:
         p, gain = row
-        return correct(step_moments(p, moments)[0], gain * p.live), relay_side(p, moments, gain)
+        return correct(step_moments(p, moments)[0], gain * p.receives_in_slot), relay_side(p, moments, gain)
 
     return jax.lax.scan(single, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import make_entry_matrix, propagate, solve_fixed_point
+from heliograph.linear.jump_system import make_entry_matrix, propagate_by_mode, solve_fixed_point
 from heliograph.model.over_time import steps_covered
-from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
+from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import fail, instance, repeat_per_step
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.lapack import spectral_radius
@@ -37,7 +37,7 @@ INDEFINITE = 1e-9  # relative: a fixed point below this is no covariance, so the
 SteadyState = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
 
 
-def periodic_steps(network: RelayNetwork) -> Steps:
+def periodic_steps(network: RelayNetwork) -> RelaySteps:
     """Return the steps of one period, at the stationary mean of the state."""
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     if steps_covered(network) is not None:
@@ -47,7 +47,7 @@ def periodic_steps(network: RelayNetwork) -> Steps:
     if radius >= 1:
         raise fail("steady state", "a plant with spectral radius below 1", f"{radius:.6g}")
     mean = np.linalg.solve(np.eye(len(network.states)) - steps.transition[0], steps.drift[0])
-    steady_steps: Steps = eqx.tree_at(lambda s: s.state_mean, steps, np.broadcast_to(mean, steps.state_mean.shape))
+    steady_steps: RelaySteps = eqx.tree_at(lambda s: s.state_mean, steps, np.broadcast_to(mean, steps.state_mean.shape))
     return steady_steps
 
 
@@ -98,11 +98,11 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     return np.asarray(_steady_behind(_converging_steps(network, joined), joined))[:, :n, :n]
 
 
-def _converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Steps:
+def _converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
     """Steps of one period, checked for gains under which the second moments converge."""
     check_slots(network, gains)
     steps = periodic_steps(network)
-    radius = spectral_radius(np.asarray(_operator(steps, gains)))
+    radius = spectral_radius(np.asarray(_period_operator(steps, gains)))
     if not radius < 1:
         raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
     return steps
@@ -120,8 +120,8 @@ def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[
     return jnp.asarray(solve_fixed_point(jax.vmap(linear), constant))
 
 
-def steady(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Propagated:
-    """Moments over a period that ends as it begins; differentiable in the gains. Meaningful if `is_covariance`."""
+def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Propagated:
+    """Moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`."""
     d = gains.shape[1] + steps.transition.shape[-1]
     return propagate_slots(steps, affine_fixed_point(lambda m: propagate_slots(steps, m, gains).moments[-1], d), gains)
 
@@ -133,24 +133,24 @@ def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
     return smallest > -INDEFINITE * jnp.max(jnp.abs(fixed))
 
 
-def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
+def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
     """Steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
 
     The receiver's gains are held while differentiating: they minimise the error, so their change has no first-order
     effect, and the fixed point with given gains is affine.
     """
-    moments = steady(steps, gains).moments[:-1]
+    moments = steady_moments(steps, gains).moments[:-1]
     side = jax.vmap(relay_side)(steps, moments, gains)
     d = side.transition.shape[-1]
 
     def predict(spread: jax.Array, at_slot: RelaySide) -> jax.Array:
         both = jnp.concatenate([at_slot.transition, at_slot.output])
-        return jnp.asarray(propagate(both, spread, at_slot.noise))
+        return jnp.asarray(propagate_by_mode(both, spread, at_slot.noise))
 
     def corrected(z: jax.Array, gain: jax.Array) -> jax.Array:
         """Joseph's form: affine in the covariance of the state and of what is received."""
         close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
-        return jnp.asarray(propagate(close, z, 0.0))
+        return jnp.asarray(propagate_by_mode(close, z, 0.0))
 
     # Riccati recursion of the receiver, held constant under differentiation.
     def best(spread: jax.Array, at_slot: RelaySide) -> tuple[jax.Array, jax.Array]:
@@ -177,20 +177,20 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     return jnp.asarray(period(affine_fixed_point(lambda e: period(e)[0], d))[1])
 
 
-_steady = compile_in_float64(steady)
-_steady_behind = compile_in_float64(steady_behind)
+_steady = compile_in_float64(steady_moments)
+_steady_behind = compile_in_float64(steady_receiver_covariance)
 
 
 @compile_in_float64
-def _operator(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
-    """Linear part of one period of the second moments."""
+def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
+    """Linear part of the map of second moments over one period."""
     d = gains.shape[1] + steps.transition.shape[-1]
     _, linear = jax.linearize(lambda m: propagate_slots(steps, m, gains).moments[-1], jnp.zeros((d, d)))
     return jnp.asarray(make_entry_matrix(jax.vmap(linear), (d, d)))
 
 
 @compile_in_float64
-def _solve_local_steady(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
+def _solve_local_steady(steps: RelaySteps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
     """Repeat the period until its moments change by less than CONVERGED."""
 
     moments, change = _solve_steady(lambda m: propagate_slots(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
@@ -221,7 +221,7 @@ ROUNDS = 10  # of the multipliers
 STIFFNESS = 1000.0  # of the augmented Lagrangian, against a cost that is a logarithm
 
 # value, gradient and power of gains base + x unit at `where`, from x, steps, base, where, unit, limit, multipliers
-Cost = Callable[[Array, Steps, Array, tuple[Array, ...], Array, Array, Array], tuple[Array, Array, Array]]
+Cost = Callable[[Array, RelaySteps, Array, tuple[Array, ...], Array, Array, Array], tuple[Array, Array, Array]]
 
 
 def periodic_receiver_error_design(
@@ -243,7 +243,9 @@ def periodic_receiver_error_design(
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     design = periodic_local_error_design(network)
     gains = join_gains(network, design.gains if start is None else start)
-    return periodic_given_design(network, split_gains(network, _tune(network, gains, _receiver_cost, power_limit)))
+    return periodic_given_design(
+        network, split_gains(network, _minimise_over_gains(network, gains, _receiver_cost, power_limit))
+    )
 
 
 def periodic_relays_for_best_receiver(
@@ -264,26 +266,28 @@ def periodic_relays_for_best_receiver(
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     gains = relay_gains(network, periodic_local_error_design(network).gains if start is None else start)
-    tuned = split_gains(network, _tune(network, gains, _behind_cost, power_limit))
+    tuned = split_gains(network, _minimise_over_gains(network, gains, _behind_cost, power_limit))
     return {name: gain for name, gain in tuned.items() if name != RECEIVER}
 
 
-def _tune(
+def _minimise_over_gains(
     network: RelayNetwork, start: Float[np.ndarray, "slots Fn R"], cost: Cost, power_limit: ArrayLike | None
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Descend over the free entries of the gains, those of each filter in units of its largest."""
+    """Minimise a cost over the free entries of the gains by descent, those of each filter in units of its largest."""
     steps = periodic_steps(network)
     check_slots(network, start)
     # Free entries: those that multiply a received number.
-    used = gain_mask(steps) & (steps.live[:, None, :] > 0)
+    used = gain_mask(steps) & (steps.receives_in_slot[:, None, :] > 0)
     if cost is _behind_cost:
         used[:, :, -network.received[-1] :] = False
     where = np.nonzero(used)
-    unit = _units(network, start)[where]
+    unit = _largest_entries(network, start)[where]
     # Scaled gains x, and a multiplier for the power of each slot.
     slots = len(network.slots)
     limit = np.full(slots, np.inf) if power_limit is None else repeat_per_step("power limit", power_limit, slots)
-    limit = np.where(steps.talks[:, 1:].any(axis=1), limit, np.inf)  # silent relays send nothing, whatever they may
+    limit = np.where(
+        steps.transmits_in_slot[:, 1:].any(axis=1), limit, np.inf
+    )  # silent relays send nothing, whatever they may
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
     if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
         raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")
@@ -312,7 +316,7 @@ def _within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.nda
     return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
 
 
-def _units(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Float[np.ndarray, "slots Fn R"]:
+def _largest_entries(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Float[np.ndarray, "slots Fn R"]:
     """The largest entry of each filter's gain in each slot, at every entry of that gain."""
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
@@ -340,11 +344,17 @@ def _penalise(
     return jnp.where(sound, jnp.log(jnp.where(sound, total, 1.0)) + penalty, jnp.inf)
 
 
-def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
+def _make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
     """Value, gradient and power of a cost given by its traces, soundness and power."""
 
     def value(
-        x: Array, steps: Steps, base: Array, where: tuple[Array, ...], unit: Array, limit: Array, multipliers: Array
+        x: Array,
+        steps: RelaySteps,
+        base: Array,
+        where: tuple[Array, ...],
+        unit: Array,
+        limit: Array,
+        multipliers: Array,
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         def inner(x: jax.Array) -> tuple[jax.Array, jax.Array]:
             trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
@@ -356,18 +366,18 @@ def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.
     return compile_in_float64(value)
 
 
-def _receiver_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    end, n = steady(steps, gains), steps.transition.shape[-1]
+def _receiver_traces(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    end, n = steady_moments(steps, gains), steps.transition.shape[-1]
     last = end.moments[1:, -n:, -n:]
     return jnp.trace(last, axis1=1, axis2=2), is_covariance(end.moments), jnp.sum(end.power[:, 1:], axis=1)
 
 
-def _behind_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    end, n = steady(steps, gains), steps.transition.shape[-1]
-    spread = steady_behind(steps, gains)
+def _behind_traces(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    end, n = steady_moments(steps, gains), steps.transition.shape[-1]
+    spread = steady_receiver_covariance(steps, gains)
     sound = is_covariance(end.moments[:, :-n, :-n]) & is_covariance(spread)
     return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(end.power[:, 1:], axis=1)
 
 
-_receiver_cost = _value(_receiver_traces)
-_behind_cost = _value(_behind_traces)
+_receiver_cost = _make_penalised_cost(_receiver_traces)
+_behind_cost = _make_penalised_cost(_behind_traces)

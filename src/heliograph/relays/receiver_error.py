@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.relays import RelayNetwork, Steps
+from heliograph.model.relays import RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, check_count, fail, instance, repeat_per_step
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
@@ -24,10 +24,10 @@ from heliograph.relays.design import (
 from heliograph.relays.second_moments import (
     best_gain,
     correct,
+    gain_hessian,
     gain_mask,
-    normal_matrix,
+    moment_adjoint,
     propagate_slots,
-    pull_back,
     step_moments,
 )
 
@@ -53,18 +53,18 @@ class PowerLimit(NamedTuple):
 class Limited(NamedTuple):
     """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start`."""
 
-    steps: Steps
+    steps: RelaySteps
     start: Float[Array, "d d"]
     cost: Float[Array, "time d d"]
     power: PowerLimit
 
 
-def power_limit_of(steps: Steps, value: ArrayLike, d: int) -> PowerLimit:
+def power_limit_of(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
     """The limit on the moments after each step, from one on the power that all relays send at each step."""
-    horizon = len(steps.live)
+    horizon = len(steps.receives_in_slot)
     limit = repeat_per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
     mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
-    talkers = steps.talks[:, 1:].sum(axis=1)
+    talkers = steps.transmits_in_slot[:, 1:].sum(axis=1)
     fixed = mean_signal * talkers  # estimates are unbiased: E s = E x
     low = np.flatnonzero((limit <= fixed) & (talkers > 0))
     if len(low):
@@ -76,7 +76,7 @@ def power_limit_of(steps: Steps, value: ArrayLike, d: int) -> PowerLimit:
     return PowerLimit(np.concatenate([forms[1:], np.zeros((1, d, d))]), np.append(left[1:], 1.0))
 
 
-def power_forms(steps: Steps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
+def power_forms(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
     """Matrices with <form_k, moments before step k> = sum over talking relays of tr Cov(C s_r)."""
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
@@ -84,11 +84,11 @@ def power_forms(steps: Steps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
         s = np.zeros((n, d))
         s[:, :n], s[:, (1 + r) * n : (2 + r) * n] = np.eye(n), -np.eye(n)  # s_r = x - e_r
         sent = steps.sensing @ s
-        forms += np.swapaxes(sent, 1, 2) @ sent * steps.talks[:, 1 + r, None, None]
+        forms += np.swapaxes(sent, 1, 2) @ sent * steps.transmits_in_slot[:, 1 + r, None, None]
     return forms
 
 
-def best_within(
+def minimise_within_limit(
     problem: Limited, local_gains: Float[np.ndarray, "time Fn R"], iterations: int
 ) -> Float[np.ndarray, "time Fn R"]:
     """Gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
@@ -97,16 +97,16 @@ def best_within(
     steps at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that
     happens to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
     """
-    whole = float(_judge(problem, local_gains)[0])
+    whole = float(_cost_and_slack(problem, local_gains)[0])
     problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))
-    results = [local_gains, _inside(problem, local_gains)]
+    results = [local_gains, _scale_into_limit(problem, local_gains)]
     for barrier in BARRIERS / len(local_gains):
         gains = results[-1]
-        units = np.asarray(_units(problem, gains, barrier))
+        units = np.asarray(_curvature_units(problem, gains, barrier))
         function = partial(_evaluate_barrier, problem, gains, units, barrier)
         x = bfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION, MEMORY)
         results.append(np.asarray(_change_gains(gains, units, x.reshape(units.shape[:2]), problem.steps)))
-    judged = [_judge(problem, gains) for gains in results]
+    judged = [_cost_and_slack(problem, gains) for gains in results]
     costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
@@ -114,8 +114,8 @@ def best_within(
     return results[best]
 
 
-def _inside(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
-    """`local_gains` with the relays' gains smaller by one factor, so that ROOM is left; without gains all of it is."""
+def _scale_into_limit(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
+    """Scale the relays' gains by one factor so that ROOM of the limit is left; without gains all of it is."""
     relays = local_gains.shape[1] - problem.steps.transition.shape[-1]
 
     def smaller(factor: float) -> np.ndarray:
@@ -124,7 +124,7 @@ def _inside(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Fl
     low, high = 0.0, 2.0  # the first half is 1, the gains as they are
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if np.min(_judge(problem, smaller(middle))[1]) < ROOM:
+        if np.min(_cost_and_slack(problem, smaller(middle))[1]) < ROOM:
             high = middle
         elif middle == 1.0:
             return local_gains
@@ -134,8 +134,10 @@ def _inside(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Fl
 
 
 @compile_in_float64
-def _judge(problem: Limited, gains: Float[Array, "time Fn R"]) -> tuple[Float[Array, ""], Float[Array, "time"]]:
-    """The cost of given gains, and the part of each limit that they leave free."""
+def _cost_and_slack(
+    problem: Limited, gains: Float[Array, "time Fn R"]
+) -> tuple[Float[Array, ""], Float[Array, "time"]]:
+    """Return the cost of given gains, and the share of each limit that they leave free."""
     moments = propagate_slots(problem.steps, problem.start, gains).moments[1:]
     form, limit = problem.power
     return jnp.sum(problem.cost * moments), 1 - jnp.sum(form * moments, axis=(1, 2)) / limit
@@ -143,7 +145,7 @@ def _judge(problem: Limited, gains: Float[Array, "time Fn R"]) -> tuple[Float[Ar
 
 @compile_in_float64
 def _change_gains(
-    gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: Steps
+    gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: RelaySteps
 ) -> Float[Array, "time Fn R"]:
     """Gains changed by x in given units."""
     rows, columns = np.nonzero(gain_mask(steps))
@@ -151,13 +153,13 @@ def _change_gains(
 
 
 @compile_in_float64
-def _barrier(
+def _cost_with_barrier(
     problem: Limited, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
-    """Cost and barrier at gains moved by x, infinite outside, and its gradient."""
+    """Cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
 
     def value(x: jax.Array) -> jax.Array:
-        cost, slack = _judge(problem, _change_gains(gains, units, x, problem.steps))
+        cost, slack = _cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
         inside = jnp.all(slack > 0)
         logarithms = jnp.log(jnp.where(inside, slack, 1.0))
         return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
@@ -169,14 +171,14 @@ def _barrier(
 def _evaluate_barrier(
     problem: Limited, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
-    """`_barrier` of all variables in one vector."""
-    value, gradient = _barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
+    """`_cost_with_barrier` of all variables in one vector."""
+    value, gradient = _cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
 
 
 @compile_in_float64
-def _units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
-    """L'^-1 for each step, L L' the normal matrix of its gains: in these units the cost curves alike in all directions.
+def _curvature_units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
+    """L'^-1 for each step, L L' the Hessian of its gains: in these units the cost curves alike in all directions.
 
     The gradient with respect to moments, cost and barrier, is pulled back step by step.
     """
@@ -185,13 +187,13 @@ def _units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
     slope = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
 
-    def back(ahead: jax.Array, row: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def back(ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain, before, slope_k = row
         ahead = ahead + slope_k
-        normal, _ = normal_matrix(step_moments(p, before)[0], ahead, p, DAMPING)
-        free = jnp.asarray(p.live)[np.nonzero(gain_mask(p))[1]]
+        normal, _ = gain_hessian(step_moments(p, before)[0], ahead, p, DAMPING)
+        free = jnp.asarray(p.receives_in_slot)[np.nonzero(gain_mask(p))[1]]
         unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(normal).T, jnp.diag(free))
-        return pull_back(p, gain, ahead), free[:, None] * unit
+        return moment_adjoint(p, gain, ahead), free[:, None] * unit
 
     items = (steps, jnp.asarray(gains), moments[:-1], slope)
     return jax.lax.scan(back, jnp.zeros_like(jnp.asarray(start)), items, reverse=True)[1]
@@ -240,38 +242,38 @@ def receiver_error_design(
     cost = receiver_weight(weights, len(network.filters), len(network.states))
     first = join_gains(network, design.gains)
     if power_limit is None:
-        gains = _sweeps(steps, start, cost, first, np.arange(sweeps))
+        gains = _alternate_sweeps(steps, start, cost, first, np.arange(sweeps))
     else:
         limit = power_limit_of(steps, power_limit, start.shape[0])
-        gains = best_within(Limited(steps, start, cost, limit), first, STEPS * sweeps)
+        gains = minimise_within_limit(Limited(steps, start, cost, limit), first, STEPS * sweeps)
     return given_design(network, split_gains(network, np.asarray(gains)))
 
 
-def _backward(
-    steps: Steps, start: Array, cost: Float[Array, "time d d"], gains: jax.Array
+def _backward_sweep(
+    steps: RelaySteps, start: Array, cost: Float[Array, "time d d"], gains: jax.Array
 ) -> Float[jax.Array, "time d d"]:
     """Gradient of the cost with respect to the moments after each step, gains improved."""
 
-    def ahead_of(moments: jax.Array, row: tuple[Steps, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def ahead_of(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain = row
         z, _ = step_moments(p, moments)
         return correct(z, gain), z
 
-    def back(ahead: jax.Array, row: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def back(ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain, z_k, cost_k = row
         ahead = ahead + cost_k
-        return pull_back(p, best_gain(z_k, ahead, gain, p), ahead), ahead
+        return moment_adjoint(p, best_gain(z_k, ahead, gain, p), ahead), ahead
 
     _, z = jax.lax.scan(ahead_of, jnp.asarray(start), (steps, gains))
     items = (steps, gains, z, jnp.asarray(cost))
     return jax.lax.scan(back, jnp.zeros_like(start), items, reverse=True)[1]
 
 
-def _forward(steps: Steps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _forward_sweep(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Best gains step by step and the moments after each step."""
 
     def single(
-        moments: jax.Array, row: tuple[Steps, jax.Array, jax.Array]
+        moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         p, gain, ahead_k = row
         z, _ = step_moments(p, moments)
@@ -291,17 +293,17 @@ class Search(NamedTuple):
 
 
 @compile_in_float64
-def _sweeps(
-    steps: Steps,
+def _alternate_sweeps(
+    steps: RelaySteps,
     start: Float[Array, "d d"],
     cost: Float[Array, "time d d"],
     local_gains: Float[Array, "time Fn R"],
     count: Int[Array, "sweeps"],
 ) -> Float[Array, "time Fn R"]:
-    """The best gains of sweeps from the own-error gains."""
+    """Alternate backward and forward sweeps from the local gains, and keep the best gains."""
 
     def sweep(search: Search, _: jax.Array) -> tuple[Search, None]:
-        gains, moments = _forward(steps, start, search.gains, _backward(steps, start, cost, search.gains))
+        gains, moments = _forward_sweep(steps, start, search.gains, _backward_sweep(steps, start, cost, search.gains))
         value = jnp.sum(cost * moments)
         better = value < search.cost
         best = jnp.where(better, gains, search.best)

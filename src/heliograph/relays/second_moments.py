@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import propagate
-from heliograph.model.relays import Steps
+from heliograph.linear.jump_system import propagate_by_mode
+from heliograph.model.relays import RelaySteps
 from heliograph.numerics.linalg import contract, psd_solve, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 
@@ -38,43 +38,48 @@ def initial_moments(covariance: Float[np.ndarray, "n n"], filters: int) -> Float
     return np.asarray(np.kron(np.ones((1 + filters, 1 + filters)), covariance))
 
 
-def linear_maps(p: Steps) -> LinearMaps:
+def linear_maps(step: RelaySteps) -> LinearMaps:
     """Return the deterministic part of one step."""
-    (m, n), filters = p.sensing.shape, len(p.received)
+    (m, n), filters = step.sensing.shape, len(step.received)
     d = (1 + filters) * n
     unit = jnp.eye(d + n + m)
     state, w, v = unit[:d].reshape(1 + filters, n, -1), unit[d : d + n], unit[d + n :]
-    moved = jnp.einsum("ab,fbc->fac", p.transition, state) + w
+    moved = jnp.einsum("ab,fbc->fac", step.transition, state) + w
     estimates = state[0] - state[1:]  # s_f = x - e_f
-    relayed = jnp.einsum("mn,fnc->fmc", p.sensing, estimates[:-1])
-    sent = jnp.concatenate([(p.sensing @ moved[0] + v)[None], relayed]).reshape(-1, d + n + m)
-    local_sends = [p.sensing @ p.transition, *[p.sensing] * (filters - 1)]  # as if each estimate were everybody's
+    relayed = jnp.einsum("mn,fnc->fmc", step.sensing, estimates[:-1])
+    sent = jnp.concatenate([(step.sensing @ moved[0] + v)[None], relayed]).reshape(-1, d + n + m)
+    local_sends = [
+        step.sensing @ step.transition,
+        *[step.sensing] * (filters - 1),
+    ]  # as if each estimate were everybody's
     believed = jnp.stack([jnp.asarray(c) for c in local_sends])
-    expects = jnp.asarray(p.gain) @ believed.reshape(-1, n)  # prediction of each row, as a map of its filter's estimate
-    expected = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
-    return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - expected, sent)
+    expects = jnp.asarray(step.gain) @ believed.reshape(
+        -1, n
+    )  # prediction of each row, as a map of its filter's estimate
+    expected = jnp.einsum("rn,rnc->rc", expects, estimates[step.owner])
+    return LinearMaps(moved.reshape(d, -1), jnp.asarray(step.gain) @ sent - expected, sent)
 
 
-def sent_mean(p: Steps) -> Float[jax.Array, "sent"]:
+def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
     """E (sent, 1): every estimate is unbiased, so it does not depend on the gains."""
-    y = p.sensing @ (p.transition @ p.state_mean + p.drift) + p.sensor_offset
-    relayed = p.sensing @ p.state_mean
-    return jnp.concatenate([y, *[relayed] * (len(p.received) - 1), jnp.ones(1)])
+    y = step.sensing @ (step.transition @ step.state_mean + step.drift) + step.sensor_offset
+    relayed = step.sensing @ step.state_mean
+    return jnp.concatenate([y, *[relayed] * (len(step.received) - 1), jnp.ones(1)])
 
 
-def step_moments(p: Steps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], Sent]:
+def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], Sent]:
     """Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
 
     d = (1 + F) n, z = d + R.
     """
-    maps, mean = linear_maps(p), sent_mean(p)
-    sources = jax.scipy.linalg.block_diag(moments, p.process, p.sensor_noise)
-    second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate(maps.sent, sources, 0.0))
+    maps, mean = linear_maps(step), sent_mean(step)
+    sources = jax.scipy.linalg.block_diag(moments, step.process, step.sensor_noise)
+    second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate_by_mode(maps.sent, sources, 0.0))
     known = jnp.concatenate([maps.moved, maps.innovation])
     d = maps.moved.shape[0]
-    z = propagate(known, sources, 0.0).at[d:, d:].add(contract(p.spread, second))
-    m = p.sensing.shape[0]
-    power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * p.talks
+    z = propagate_by_mode(known, sources, 0.0).at[d:, d:].add(contract(step.spread, second))
+    m = step.sensing.shape[0]
+    power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * step.transmits_in_slot
     return z, Sent(second, power)
 
 
@@ -83,47 +88,49 @@ def correct(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Arr
     rows, received = gain.shape
     d = z.shape[0] - received
     full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, received)), -gain])], axis=1)
-    return symmetrize(propagate(full, z, 0.0))
+    return symmetrize(propagate_by_mode(full, z, 0.0))
 
 
-def gain_mask(p: Steps) -> Bool[np.ndarray, "Fn R"]:
+def gain_mask(step: RelaySteps) -> Bool[np.ndarray, "Fn R"]:
     """Return True where a gain may differ from zero: each filter uses what it receives itself."""
-    n = p.transition.shape[-1]
-    return np.asarray(np.repeat(np.arange(len(p.received)), n)[:, None] == p.owner)
+    n = step.transition.shape[-1]
+    return np.asarray(np.repeat(np.arange(len(step.received)), n)[:, None] == step.owner)
 
 
 ROUNDING = 64 * float(np.finfo(float).eps)  # of what is sent: an innovation of less says nothing
 
 
-def beyond_rounding(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "R"]:
-    """Return 1 for innovations with more variance than what is sent leaves by rounding, 0 for others.
+def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "R"]:
+    """1 for each innovation whose variance is above the rounding of what is sent, 0 for the others.
 
     Of a relay that receives nothing but itself through a known gain the innovation is zero, computed from large ones.
     """
-    n, relays, d = p.transition.shape[-1], len(p.received) - 1, z.shape[0] - sum(p.received)
-    reach = jnp.sqrt(jnp.maximum(jnp.diagonal(z)[:d], 0.0)).reshape(-1, n)  # of x, e_1 .. e_F
-    state = reach[0] + jnp.abs(p.state_mean)
-    sizes = jnp.concatenate([state[None], state + reach[1 : 1 + relays]]) @ jnp.abs(p.sensing).T
+    n, relays, d = step.transition.shape[-1], len(step.received) - 1, predicted.shape[0] - sum(step.received)
+    reach = jnp.sqrt(jnp.maximum(jnp.diagonal(predicted)[:d], 0.0)).reshape(-1, n)  # of x, e_1 .. e_F
+    state = reach[0] + jnp.abs(step.state_mean)
+    sizes = jnp.concatenate([state[None], state + reach[1 : 1 + relays]]) @ jnp.abs(step.sensing).T
     sent = jnp.append(sizes.ravel(), 1.0)
-    known = ROUNDING * jnp.abs(p.gain) @ sent[:-1]
-    spread = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(p.spread), sent, sent)
-    return jnp.where(jnp.diagonal(z)[d:] > known**2 + spread, 1.0, 0.0)
+    known = ROUNDING * jnp.abs(step.gain) @ sent[:-1]
+    spread = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(step.spread), sent, sent)
+    return jnp.where(jnp.diagonal(predicted)[d:] > known**2 + spread, 1.0, 0.0)
 
 
-def local_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]:
+def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "Fn R"]:
     """K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
 
     Source: for two alternating relays, filter-and-forward successive relays, Theorems 1 and 2.
     """
-    n, received = p.transition.shape[-1], sum(p.received)
-    d = z.shape[0] - received
+    n, received = step.transition.shape[-1], sum(step.received)
+    d = predicted.shape[0] - received
     gain, start = jnp.zeros((d - n, received)), 0
-    used = p.live * beyond_rounding(z, p)
-    for f, length in enumerate(p.received):
+    used = step.receives_in_slot * innovations_above_rounding(predicted, step)
+    for f, length in enumerate(step.received):
         rows = slice(start, start + length)
         says = used[rows]
-        inner = z[d:, d:][rows, rows] * says[:, None] * says + jnp.diag(1.0 - says)  # what says nothing: solve with 1
-        cross = z[(1 + f) * n : (2 + f) * n, d:][:, rows] * says
+        inner = predicted[d:, d:][rows, rows] * says[:, None] * says + jnp.diag(
+            1.0 - says
+        )  # what says nothing: solve with 1
+        cross = predicted[(1 + f) * n : (2 + f) * n, d:][:, rows] * says
         gain = gain.at[f * n : (f + 1) * n, rows].set(psd_solve(inner, cross.T).T)
         start += length
     return gain
@@ -138,17 +145,17 @@ class Propagated(NamedTuple):
 
 
 def propagate_slots(
-    steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None
+    steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None
 ) -> Propagated:
     """Propagate the covariance of eta from `start`, under given gains, or with each filter's own best next error.
 
     Entries of given gains on rows that receive nothing are not used.
     """
 
-    def single(moments: jax.Array, row: tuple[Steps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def single(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         p, gain = row
         z, sent = step_moments(p, moments)
-        used = local_gain(z, p) if gain is None else gain * p.live
+        used = local_gain(z, p) if gain is None else gain * p.receives_in_slot
         after = correct(z, used)
         return after, (used if gain is None else gain, after, sent.power)
 
@@ -161,18 +168,18 @@ def propagate_slots(
 DAMPING = 1e-9  # relative, on the change of a gain: decides only what the receiver's error does not
 
 
-def normal_matrix(
-    z: Float[Array, "z z"], ahead: Float[Array, "d d"], p: Steps, damping: float
+def gain_hessian(
+    predicted: Float[Array, "z z"], ahead: Float[Array, "d d"], step: RelaySteps, damping: float
 ) -> tuple[Float[jax.Array, "r r"], Float[jax.Array, ""]]:
-    """Half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the r gains that may be free, damped, and the damping.
+    """Half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the free gains, damped, and the damping.
 
     Its entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that receives nothing. `damping` is
     relative to the mean of the diagonal.
     """
-    rows, columns = np.nonzero(gain_mask(p))
-    n, d = p.transition.shape[-1], ahead.shape[0]
-    free = jnp.asarray(p.live)[columns]
-    normal = jnp.asarray(ahead)[n:, n:][np.ix_(rows, rows)] * z[d:, d:][np.ix_(columns, columns)]
+    rows, columns = np.nonzero(gain_mask(step))
+    n, d = step.transition.shape[-1], ahead.shape[0]
+    free = jnp.asarray(step.receives_in_slot)[columns]
+    normal = jnp.asarray(ahead)[n:, n:][np.ix_(rows, rows)] * predicted[d:, d:][np.ix_(columns, columns)]
     normal = normal * free[:, None] * free
     trace = jnp.trace(normal)
     added = jnp.where(trace > 0, damping * trace / len(rows), 1.0)  # 1 where nothing hangs on any gain
@@ -180,21 +187,21 @@ def normal_matrix(
 
 
 def best_gain(
-    z: Float[Array, "z z"], ahead: Float[Array, "d d"], old: Float[Array, "Fn R"], p: Steps
+    predicted: Float[Array, "z z"], ahead: Float[Array, "d d"], old: Float[Array, "Fn R"], step: RelaySteps
 ) -> Float[jax.Array, "Fn R"]:
     """argmin over gains K of tr Lam [I -(0; K)] Z [I -(0; K)]', nearly; all filters together.
 
     (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab for each free entry ab: a linear system of the size of the gains.
     """
-    rows, columns = np.nonzero(gain_mask(p))
-    n, d = p.transition.shape[-1], ahead.shape[0]
-    normal, damping = normal_matrix(z, ahead, p, DAMPING)
-    cross = ahead[n:] @ z[:d, d:]
-    right = (cross[rows, columns] + damping * old[rows, columns]) * p.live[columns]
+    rows, columns = np.nonzero(gain_mask(step))
+    n, d = step.transition.shape[-1], ahead.shape[0]
+    normal, damping = gain_hessian(predicted, ahead, step, DAMPING)
+    cross = ahead[n:] @ predicted[:d, d:]
+    right = (cross[rows, columns] + damping * old[rows, columns]) * step.receives_in_slot[columns]
     return jnp.zeros_like(old).at[rows, columns].set(jnp.linalg.solve(normal, right))
 
 
-def pull_back(p: Steps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:
-    """Gradient of <Lam, moments after the step> with respect to the moments before it (an affine map)."""
-    _, pull = jax.vjp(lambda m: correct(step_moments(p, m)[0], gain), jnp.zeros_like(ahead))
+def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:
+    """Gradient of <Lam, moments after the step> by the moments before it, the adjoint of the propagation."""
+    _, pull = jax.vjp(lambda m: correct(step_moments(step, m)[0], gain), jnp.zeros_like(ahead))
     return symmetrize(pull(ahead)[0])

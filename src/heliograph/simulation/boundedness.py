@@ -10,11 +10,11 @@ from heliograph.linear.known_losses import (
     BELOW_ONE,
     KindGains,
     KnownLossSystem,
-    Unseen,
+    UnobservedGrowth,
     certify_radius,
-    fastest_unseen,
+    fastest_unobserved_mode,
     find_gains,
-    is_reached,
+    is_excited_by_noise,
 )
 from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, parallel
@@ -101,7 +101,7 @@ def certify_boundedness(network: Network) -> Boundedness:
             bound = known.system.bound(gains).sum(axis=0) if known.exact else None
             return Boundedness("certified", _describe_certificate(a, radius), radius, 0.0, known.gains(gains), bound)
     # Not certified: is there an unstable mode that losses hide?
-    unseen = fastest_unseen(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
+    unseen = fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
     verdict, reason = _judge_unseen(network, links, growing, known, unseen, radius)
     return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
 
@@ -244,7 +244,12 @@ def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
 
 
 def _judge_unseen(
-    network: Network, links: JointLinks, growing: np.ndarray, channel: KnownLosses, unseen: Unseen, radius: float
+    network: Network,
+    links: JointLinks,
+    growing: np.ndarray,
+    channel: KnownLosses,
+    unseen: UnobservedGrowth,
+    radius: float,
 ) -> tuple[Verdict, str]:
     """Return "impossible" if an unobserved eigenvector grows and noise keeps exciting it, else "undecided"."""
     if unseen.growth < 1:
@@ -256,7 +261,7 @@ def _judge_unseen(
     return "impossible", reason
 
 
-def _why(links: JointLinks, system: KnownLossSystem, unseen: Unseen) -> str:
+def _why(links: JointLinks, system: KnownLossSystem, unseen: UnobservedGrowth) -> str:
     value = unseen.eigenvalue
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
     if len(unseen.modes) < len(system.chain):
@@ -268,16 +273,16 @@ def _why(links: JointLinks, system: KnownLossSystem, unseen: Unseen) -> str:
     return f"{mode} is not seen at all"
 
 
-def _is_excited(network: Network, growing: np.ndarray, channel: KnownLosses, unseen: Unseen) -> bool:
+def _is_excited(network: Network, growing: np.ndarray, channel: KnownLosses, unseen: UnobservedGrowth) -> bool:
     """Test whether P stays above eps v v': noise enters along v at once, or reaches it and every measurement has noise.
 
     The noise of random gains grows only where noise reaches all that is unstable.
     """
     a, q = channel.system.transition, channel.system.process
     expected = np.concatenate([unseen.vectors, growing], axis=1) if channel.random else unseen.vectors
-    if is_reached(expected, np.zeros_like(a), q):
+    if is_excited_by_noise(expected, np.zeros_like(a), q):
         return True
     if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in channel.system.noises):
         return False
     start = q + np.asarray(first(network.plant).initial_covariance)
-    return is_reached(expected, a, q) or (unseen.growth > 1 and is_reached(expected, a, start))
+    return is_excited_by_noise(expected, a, q) or (unseen.growth > 1 and is_excited_by_noise(expected, a, start))

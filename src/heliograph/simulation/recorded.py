@@ -35,7 +35,7 @@ from heliograph.simulation.plausible_step import (
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.smoothed import Smoother, add_truth, record_of, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters, initial_states
-from heliograph.smoothing.modes import AbstractSmoothing
+from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 

@@ -12,7 +12,15 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, drop_names, memories
+from heliograph.random_affine.base import (
+    AbstractRandomAffine,
+    apply,
+    draw_with_shared_memories,
+    drop_names,
+    init_with_shared_memories,
+    memories,
+    unique_memories,
+)
 from heliograph.random_affine.delay import signal_size
 from heliograph.simulation.draws import (
     CHANNEL,
@@ -34,7 +42,7 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
         ValueError: one name for memories that differ.
     """
     held = {id(channel): memories(channel) for channel in {id(c): c for c in channels.values()}.values()}
-    distinct(memory for by_identity in held.values() for memory in by_identity.values())
+    unique_memories(memory for by_identity in held.values() for memory in by_identity.values())
     return {
         name: np.array(
             [
@@ -89,7 +97,7 @@ def start(channel: Channel, key: jax.Array, source: Number, shared: Places) -> P
     """Return a channel's state before the first step."""
     now, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
-    state = begin(now, link_key, keys) if len(shared) else now.init(link_key)
+    state = init_with_shared_memories(now, link_key, keys) if len(shared) else now.init(link_key)
     return Late(state, jnp.zeros(now.past * signal_size(now))) if now.past else state
 
 
@@ -111,4 +119,4 @@ def _advance_memory(
 ) -> tuple[PyTree, jax.Array]:
     if not len(shared):
         return now.draw(state, link_key)
-    return advance(now, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])
+    return draw_with_shared_memories(now, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])

@@ -41,7 +41,7 @@ from heliograph.simulation.runs.native import natively
 from heliograph.simulation.smoothed import Recorded, Smoother, finish, reduce_run, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World
-from heliograph.smoothing.modes import AbstractSmoothing
+from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
 Progress = TypeAliasType("Progress", Callable[[int, int], None])
 Seed = TypeAliasType("Seed", int | jax.Array)  # or a JAX key

@@ -32,7 +32,7 @@ from heliograph.simulation.results.reducer import (
     trajectories_record,
 )
 from heliograph.simulation.stepping import AllFilters
-from heliograph.smoothing.modes import AbstractSmoothing, nis_sums, warn_of
+from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, nis_sums, warn_if_inconsistent
 
 
 class Smoother(Module):
@@ -66,7 +66,7 @@ class Smoother(Module):
             "reports": {},
         }
         if "truth" in outputs:
-            truth = self.smoothing.about(outputs["truth"])
+            truth = self.smoothing.select_reference(outputs["truth"])
             smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_by_kind])}
         # Sums of the NIS, for the test of consistency.
         surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
@@ -176,9 +176,9 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
     for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
         for f, name in enumerate(names):
             for i, node in enumerate(network.groups[group]):
-                warn_of(f"{node}/{name}", np.asarray(sums[f, i]))
+                warn_if_inconsistent(f"{node}/{name}", np.asarray(sums[f, i]))
     for name, sums in nis["fused"].items():
-        warn_of(f"{FUSED}/{name}", np.asarray(sums))
+        warn_if_inconsistent(f"{FUSED}/{name}", np.asarray(sums))
 
 
 def record_of(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, time: np.ndarray) -> Record:
@@ -203,7 +203,7 @@ def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Abs
     later = record.smoothed
     if later is not None and smoothing is not None:
         later = add_truth(
-            later, plant, np.broadcast_to(smoothing.about(truth), (len(later.time), truth.shape[1])), None
+            later, plant, np.broadcast_to(smoothing.select_reference(truth), (len(later.time), truth.shape[1])), None
         )
     estimates = {
         node: {name: near(filter, truth) for name, filter in filters.items()}

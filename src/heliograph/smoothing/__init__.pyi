@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .modes import (
+from .fixed_interval_lag_point import (
     AbstractSmoothing as AbstractSmoothing,
     FixedInterval as FixedInterval,
     FixedLag as FixedLag,

@@ -59,11 +59,11 @@ def plan_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
     planned = filter.planned(inputs)
     if planned is filter:
         return filter
-    return planned.with_past(quiet_steps(filter, inputs))
+    return planned.with_past(data_free_smoother_steps(filter, inputs))
 
 
-def quiet_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
-    """Return smoother steps for measurements of zero: right but for means, if no gain depends on data."""
+def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
+    """Smoother steps for z = 0: covariances and gains are right where none depends on data, means are placeholders."""
     quiet = jnp.zeros((len(inputs), filter.received))
     steps: SmootherStep = step_rows(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
     return steps
@@ -79,9 +79,9 @@ def sweep_back(steps: SmootherStep) -> Estimate:
         return law, previous.estimate_from(law)
 
     # From the last step, whose smoothed state is the filtered one.
-    last = row(steps, -1)
-    _, earlier = jax.lax.scan(body, last.after, _neighbours(steps), reverse=True)
-    return _append(earlier, last.estimate_from(last.after))
+    last = take_step(steps, -1)
+    _, earlier = jax.lax.scan(body, last.after, _pair_with_next(steps), reverse=True)
+    return _append_last(earlier, last.estimate_from(last.after))
 
 
 def sweep_means(steps: SmootherStep) -> jax.Array:
@@ -92,10 +92,10 @@ def sweep_means(steps: SmootherStep) -> jax.Array:
         mean = step.before.mean_given(later)
         return mean, _plant_mean(previous, mean)
 
-    last = row(steps, -1)
+    last = take_step(steps, -1)
     end = jnp.asarray(last.mean)
-    _, earlier = jax.lax.scan(body, end, _neighbours(steps), reverse=True)
-    return _append(earlier, _plant_mean(last, end))
+    _, earlier = jax.lax.scan(body, end, _pair_with_next(steps), reverse=True)
+    return _append_last(earlier, _plant_mean(last, end))
 
 
 def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
@@ -106,14 +106,14 @@ def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     def body(done: jax.Array, later: Gaussian) -> Gaussian:
         """Pass from the state after step k + lag - done to the one before it, unless the data end earlier."""
         ahead = times + lag - done
-        before = jax.vmap(lambda step, law: step.back(law))(rows_of(steps, jnp.minimum(ahead, last)), later)
+        before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(ahead, last)), later)
         passed: Gaussian = jax.tree.map(
             lambda a, b: jnp.where((ahead <= last).reshape(-1, *[1] * (a.ndim - 1)), a, b), before, later
         )
         return passed
 
     # From the newest step that each one may use, as many steps back as the lag has.
-    newest = rows_of(steps.after, jnp.minimum(times + lag, last))
+    newest = take_steps(steps.after, jnp.minimum(times + lag, last))
     estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(
         steps, jax.lax.fori_loop(0, lag, body, newest)
     )
@@ -122,13 +122,13 @@ def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
 
 def carry_ahead(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
-    start = row(steps, step)
+    start = take_step(steps, step)
 
     def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
         after = later_step.ahead(point)
         return after, start.estimate_from(later_step.reached(after))
 
-    _, later = jax.lax.scan(body, start.start(), rows_of(steps, slice(step + 1, None)))
+    _, later = jax.lax.scan(body, start.start(), take_steps(steps, slice(step + 1, None)))
     whole: Estimate = jax.tree.map(
         lambda first, rest: jnp.concatenate([first[None], rest]), start.estimate_from(start.after), later
     )
@@ -140,23 +140,24 @@ def _plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
     return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
 
 
-def _neighbours(steps: SmootherStep) -> tuple[SmootherStep, SmootherStep]:
+def _pair_with_next(steps: SmootherStep) -> tuple[SmootherStep, SmootherStep]:
     """Pair each step with the one after it."""
-    return rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
+    return take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None))
 
 
-def _append(rows: T, last: T) -> T:
+def _append_last(rows: T, last: T) -> T:
+    """Append the last step's value to those of the steps before."""
     whole: T = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, last)
     return whole
 
 
-def row(steps: T, k: int) -> T:
-    """Return one step of what is stacked along time."""
+def take_step(steps: T, k: int) -> T:
+    """Take step k of what is stacked along time."""
     step: T = jax.tree.map(lambda leaf: leaf[k], steps)
     return step
 
 
-def rows_of(steps: T, which: slice | jax.Array) -> T:
-    """Return some steps of what is stacked along time."""
+def take_steps(steps: T, which: slice | jax.Array) -> T:
+    """Take some steps of what is stacked along time."""
     chosen: T = jax.tree.map(lambda leaf: leaf[which], steps)
     return chosen

@@ -13,8 +13,8 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import plan_with_past, quiet_steps, step_rows
-from heliograph.smoothing.modes import AbstractSmoothing, FixedInterval
+from heliograph.smoothing.backward_pass import data_free_smoother_steps, plan_with_past, step_rows
+from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, FixedInterval
 
 
 @readable
@@ -82,7 +82,7 @@ class PlannedSmoother(Module):
 
     def means(self, z: ArrayLike) -> Float[jax.Array, "time n"]:
         """Smoothed means of one run's z (horizon, received), also for `hg.simulation.over_runs` and `jax.vmap`."""
-        return _means(self, array("measurements", z, (len(self.inputs), self.filter.received), missing=True))
+        return _smoothed_means(self, array("measurements", z, (len(self.inputs), self.filter.received), missing=True))
 
 
 def planned_smoother(
@@ -106,24 +106,27 @@ def planned_smoother(
     instance("smoothing", smoothing, AbstractSmoothing, "one such as FixedInterval()")
     smoothing.check(check_horizon(horizon))
     u = array("inputs", np.zeros((horizon, 0)) if inputs is None else inputs, (horizon, len(filter.inputs)))
-    planned = _plan(filter, u)
+    planned = _plan_or_none(filter, u)
     if planned is None:
         raise fail("filter", "one whose gains depend on no data", type(filter).__name__)
-    return PlannedSmoother(planned, smoothing, u, _estimate(filter, smoothing, u))
+    return PlannedSmoother(planned, smoothing, u, _smoothed_covariances(filter, smoothing, u))
 
 
 @compile_on_call
-def _means(planned: PlannedSmoother, z: Array) -> jax.Array:
+def _smoothed_means(planned: PlannedSmoother, z: Array) -> jax.Array:
+    """Smoothed means of one run's measurements (horizon, received)."""
     _, steps = step_rows(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
     return planned.smoothing.means(jax.tree.map(jnp.asarray, steps))
 
 
 @compile_on_call
-def _plan(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
+def _plan_or_none(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
+    """Planned filter with its smoother steps; None where gains depend on data."""
     planned = plan_with_past(filter, u)
     return None if planned is filter else planned
 
 
 @compile_on_call
-def _estimate(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    return smoothing.sweep(quiet_steps(filter, u))
+def _smoothed_covariances(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
+    """Smoothed estimates for z = 0, of which the covariances are those of all data."""
+    return smoothing.sweep(data_free_smoother_steps(filter, u))

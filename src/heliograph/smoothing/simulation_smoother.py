@@ -1,4 +1,4 @@
-"""Paths of the past, drawn given all data: a filter ahead, and draws on the way back."""
+"""Draw paths of the state given all data: a filter ahead, and draws on the way back (FFBS)."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import row, rows_of, step_rows
+from heliograph.smoothing.backward_pass import step_rows, take_step, take_steps
 
 
 def simulation_smoother(
@@ -49,33 +49,34 @@ def simulation_smoother(
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
     keys = jax.random.split(jax.random.key(check_seed("seed", seed)), check_count("draws", draws))
-    return np.asarray(_drawn(filter, rows, inputs, keys))
+    return np.asarray(_draw_paths(filter, rows, inputs, keys))
 
 
 @compile_in_float64
-def _drawn(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
+def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
+    """Draw one path for each key, by one filter pass."""
     _, steps = step_rows(filter, z, u, filter.init(), np.asarray(0))
-    drawn: jax.Array = jax.vmap(lambda key: _path(steps, key))(keys)
+    drawn: jax.Array = jax.vmap(lambda key: _draw_path_back(steps, key))(keys)
     return drawn
 
 
-def _path(steps: SmootherStep, key: jax.Array) -> jax.Array:
+def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
     """Draw one path back from the last step."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
         previous, step, key = pair
         left = step.before.left
-        x = _draw(left._replace(mean=step.before.mean_given(later)), key)
+        x = _draw_gaussian(left._replace(mean=step.before.mean_given(later)), key)
         return x, _plant_state(previous, x)
 
-    last, keys = row(steps, -1), jax.random.split(key, len(steps.mean))
-    end = _draw(last.after, keys[-1])
-    pairs = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None)), keys[:-1]
+    last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))
+    end = _draw_gaussian(last.after, keys[-1])
+    pairs = take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None)), keys[:-1]
     _, earlier = jax.lax.scan(body, end, pairs, reverse=True)
     return jnp.concatenate([earlier, _plant_state(last, end)[None]])
 
 
-def _draw(law: Gaussian, key: jax.Array) -> jax.Array:
+def _draw_gaussian(law: Gaussian, key: jax.Array) -> jax.Array:
     """Draw m + L diag(d)^1/2 e with e standard normal."""
     normal = jax.random.normal(key, law.variances.shape, dtype=float)
     return jnp.asarray(law.mean + law.root @ (square_root(law.variances) * normal))

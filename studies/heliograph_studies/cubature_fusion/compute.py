@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal, square_root
+from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal_or_zero, square_root
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
@@ -146,7 +146,7 @@ class MixedCross(AbstractFilter):
         spread = apart @ apart.T / count + sensor.noise.covariance
         cross = (points - x.mean[:, None]) @ apart.T / count
         # What of Cov y is not by these slopes may be less than nothing: the reading is of no joint law.
-        slopes = decorrelate(x.root, cross).T * reciprocal(x.variances)
+        slopes = decorrelate(x.root, cross).T * reciprocal_or_zero(x.variances)
         weights, vectors = eigh(spread - (slopes * x.variances) @ slopes.T)
         second = spread + jnp.outer(mean, mean)
         signal = Signal(x, mean, slopes, Columns(vectors, weights), second, jnp.diagonal(second))

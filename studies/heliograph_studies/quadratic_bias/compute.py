@@ -10,7 +10,7 @@ import heliograph as hg
 from heliograph.filters import AbstractFilter, PolynomialFilter, ScheduledFilter
 from heliograph.filters.linear.polynomial import MemoryFilter
 from heliograph.linear.lift import lifted_system
-from heliograph.linear.polynomial import memory_system, skewness
+from heliograph.linear.polynomial import quadratic_system_with_linear_estimate, skewness
 from heliograph.linear.recursion import lmmse, true_covariance
 from heliograph.linear.system import LinearSystem, Schedule, state_moments
 from heliograph.model.channel import Channel
@@ -134,7 +134,7 @@ def design(model: Model, resolution: float) -> Designs:
     filters: dict[str, AbstractFilter] = {
         name: PolynomialFilter(ScheduledFilter(schedule), DEGREES[name]) for name, schedule in schedules.items()
     }
-    memory = lmmse(memory_system(*parts, schedules["linear"]))
+    memory = lmmse(quadratic_system_with_linear_estimate(*parts, schedules["linear"]))
     linear = ScheduledFilter(schedules["linear"])
     filters["memory"] = MemoryFilter(linear=linear, products=ScheduledFilter(memory), claim="exact")
     printed = printed_quadratic(*parts, model.horizon)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.over_time import at
-from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps
+from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, RelaySteps
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.relays.design import GainsByFilter
@@ -96,7 +96,7 @@ def _greedy(recomputed: Recomputed) -> Assumption:
     return Assumption(text, f"correlation {largest:.2g}", largest <= GREEDY)
 
 
-def _state_bound(steps: Steps, recomputed: Recomputed, greedy: Assumption) -> Bound:
+def _state_bound(steps: RelaySteps, recomputed: Recomputed, greedy: Assumption) -> Bound:
     """E e_f e_f' <= cov x_k; the values are the largest eigenvalues of cov x_k."""
     radius = max(float(np.max(np.abs(np.linalg.eigvals(a)))) for a in steps.transition)
     still = bool(np.all(steps.transition == steps.transition[0]))
@@ -110,7 +110,7 @@ def _state_bound(steps: Steps, recomputed: Recomputed, greedy: Assumption) -> Bo
     return Bound("state covariance", "E e e' <= cov x", (greedy, stable), values, gap >= -ROUNDING)
 
 
-def _constants(network: RelayNetwork, steps: Steps) -> dict[str, float]:
+def _constants(network: RelayNetwork, steps: RelaySteps) -> dict[str, float]:
     """The scalars of Assumption 1; NaN where the network is not of the published kind."""
 
     def extremes(matrices: ArrayLike) -> tuple[float, float]:
@@ -123,7 +123,7 @@ def _constants(network: RelayNetwork, steps: Steps) -> dict[str, float]:
     # Extreme eigenvalues of A A', C C', W, P_0 and V.
     tau, f, w = extremes(gram(steps.transition)), extremes(gram(steps.sensing)), extremes(steps.process)
     p0, v = extremes(network.initial()[1][None]), extremes(steps.sensor_noise)
-    mu, phi, g, o = _link_constants(network, len(steps.live))
+    mu, phi, g, o = _link_constants(network, len(steps.receives_in_slot))
     rounding = 1e-14 * w[1]  # of an eigenvalue of a singular matrix
     return {
         "tau_lower": tau[0], "tau_upper": tau[1], "f_lower": f[0], "f_upper": f[1],

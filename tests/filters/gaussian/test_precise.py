@@ -9,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, given, observe
+from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_covariance
 from tests.follow import follow
 
 A, C = [[1, 1], [0, 1]], [[1, 0]]
@@ -324,7 +324,7 @@ def exact_after_dropout(matrix, mean, tenths):
 def updated(x, rows, variances):
     """Gain, and x given what rows (m, n) with uncorrelated noises of these variances show of it."""
     noise = Columns(np.eye(len(rows)), jnp.asarray(variances))
-    ways = jax.vmap(lambda z: observe(x, rows @ x.root, z, noise)[0])(jnp.eye(len(rows)))
+    ways = jax.vmap(lambda z: condition_on_observation(x, rows @ x.root, z, noise)[0])(jnp.eye(len(rows)))
     return ways.mean.T, jax.tree.map(lambda leaf: leaf[0], ways)
 
 
@@ -340,7 +340,7 @@ def test_noise_counts_next_to_a_precise_output():
         order = [1, 0] if swap else [0, 1]
         rows, variances = rows[order], variances[np.ix_(order, order)]
         with jax.enable_x64(True):
-            gain, after = jax.jit(updated)(given(np.zeros(1), np.array([[prior]])), rows, np.diag(variances))
+            gain, after = jax.jit(updated)(from_covariance(np.zeros(1), np.array([[prior]])), rows, np.diag(variances))
         k, h = [Fraction(float(x)) for x in gain[0]], [Fraction(float(x)) for x in rows[:, 0]]
         left = 1 - sum(a * b for a, b in zip(k, h, strict=True))
         of_noise = sum(a * a * Fraction(float(v)) for a, v in zip(k, np.diag(variances), strict=True))

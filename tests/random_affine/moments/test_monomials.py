@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from heliograph.random_affine.moments.monomials import (
-    count,
+    count_monomials,
     exponents,
     monomials,
-    multiply,
+    multiply_polynomials,
     position,
     symmetric_power,
 )
@@ -27,7 +27,7 @@ def test_degree_two_in_order():
 
 @pytest.mark.parametrize(("variables", "degree"), [(1, 4), (3, 2), (4, 3), (5, 4)])
 def test_count_and_positions(variables, degree):
-    assert len(exponents(variables, degree)) == count(variables, degree)
+    assert len(exponents(variables, degree)) == count_monomials(variables, degree)
     assert all(exponents(variables, degree)[i] == p for p, i in position(variables, degree).items())
 
 
@@ -60,8 +60,8 @@ def test_jax_and_numpy_agree():
 
 def test_multiply_is_the_product_of_values():
     rng = np.random.default_rng(1)
-    a, b, y = rng.normal(size=count(3, 2)), rng.normal(size=count(3, 1)), rng.normal(size=2)
-    value = multiply(a, 2, b, 1, 3) @ monomials(y, 3)
+    a, b, y = rng.normal(size=count_monomials(3, 2)), rng.normal(size=count_monomials(3, 1)), rng.normal(size=2)
+    value = multiply_polynomials(a, 2, b, 1, 3) @ monomials(y, 3)
     np.testing.assert_allclose(value, (a @ monomials(y, 2)) * (b @ monomials(y, 1)), rtol=1e-10)
 
 

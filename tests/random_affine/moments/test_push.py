@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments.monomials import count, exponents, monomials
-from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.moments.monomials import count_monomials, exponents, monomials
+from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
 from heliograph.random_affine.noise import noise_vector
 from tests.random_affine.test_contract import CHANNELS
 
@@ -23,14 +23,16 @@ def test_pushed_moments_are_those_of_the_matrix(name, order):
     channel = CHANNELS[name]
     before = atoms_moments(channel.inputs, order)
     expected = channel.moments(order).expect(before)
-    np.testing.assert_allclose(push(channel, order, before), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        push_moments(channel, order, before), expected, rtol=0, atol=1e-12 * np.abs(expected).max()
+    )
 
 
 def test_lifted_maps_are_pushed_by_their_matrix():
     square = hg.random_affine.square(CHANNELS["discrete"])
     point = monomials(np.array([0.3, -0.7]), 2)[:-1]
     before = monomials(point, 2)
-    np.testing.assert_allclose(push(square, 2, before), square.moments(2).expect(before), rtol=1e-14)
+    np.testing.assert_allclose(push_moments(square, 2, before), square.moments(2).expect(before), rtol=1e-14)
 
 
 def test_a_known_map_moves_points():
@@ -44,7 +46,7 @@ def test_a_known_map_moves_points():
 def test_second_moments_are_gathered_from_the_vector():
     y = np.array([0.4, -0.2, 1.5])
     lifted = monomials(y, 2)
-    np.testing.assert_allclose(second_moments(monomials(y, 4), 4, 2), np.outer(lifted, lifted), rtol=1e-14)
+    np.testing.assert_allclose(products_of_monomials(monomials(y, 4), 4, 2), np.outer(lifted, lifted), rtol=1e-14)
 
 
 def test_a_table_knows_what_the_law_knows():
@@ -60,11 +62,11 @@ def test_a_large_order_needs_no_large_matrix():
     """16 states, order 4: the vector has 4845 entries; the matrix that is not formed has 23 million."""
     plant = hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), 0.5 * np.eye(16), 0.3)
     gaussian = noise_vector(hg.Gaussian(np.eye(16)), 4)
-    assert len(gaussian) == count(17, 4) == 4845
+    assert len(gaussian) == count_monomials(17, 4) == 4845
     expected = noise_vector(hg.Gaussian((0.25 + 0.3) * np.eye(16)), 4)
-    np.testing.assert_allclose(push(plant, 4, gaussian), expected, rtol=1e-12)
+    np.testing.assert_allclose(push_moments(plant, 4, gaussian), expected, rtol=1e-12)
 
 
 def test_moments_of_the_wrong_length_are_refused():
     with pytest.raises(ValueError, match=r"moments of order 2: expected shape \(6,\), got shape \(5,\)"):
-        push(CHANNELS["known"], 2, np.zeros(5))
+        push_moments(CHANNELS["known"], 2, np.zeros(5))

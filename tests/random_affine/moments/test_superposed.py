@@ -131,7 +131,7 @@ def test_bounds_hold_under_every_corner(name, few, monkeypatch):
     if not few:
         monkeypatch.setattr(second_moments, "CORNERS", 1)
     seen, generator = (
-        second_moments.describe_second_moments(*second_moments._bounds(channel), True),
+        second_moments.describe_second_moments(*second_moments._bound_moments(channel), True),
         np.random.default_rng(3),
     )
     present = np.ones(channel.outputs, dtype=bool)

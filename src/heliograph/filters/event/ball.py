@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, eliminate, join_columns, nothing
-from heliograph.factors.gaussian import Gaussian, observe, of_columns
+from heliograph.factors.columns import Columns, eliminate, join_columns, zero_covariance
+from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.filters.event.gaussian_sum import CERTAIN, GaussianSum
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.lapack import eigh
@@ -78,10 +78,10 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
         moments = ball_moments(centre, size, radius, inside)
         varies = (variance > least) & jnp.isfinite(moments.log_mass)
         gain = jnp.where(varies, (x.root * x.variances) @ rows.T / size, 0.0)
-        given, _ = observe(x, rows, jnp.zeros(len(rows)), nothing(len(rows)), varies)
+        given, _ = condition_on_observation(x, rows, jnp.zeros(len(rows)), zero_covariance(len(rows)), varies)
         mean = x.mean + gain @ jnp.where(varies, moments.mean - centre, 0.0)
         spread = eliminate(moments.covariance).through(gain)
-        return moments.log_mass, of_columns(mean, join_columns(given.columns, spread))
+        return moments.log_mass, from_columns(mean, join_columns(given.columns, spread))
 
     log_mass, after = jax.lax.map(truncate_one, parts.gaussian)
     return GaussianSum(parts.log_weight + log_mass, after, parts.label)

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, append_rows, given, leading
+from heliograph.factors.gaussian import Gaussian, append_rows, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import truncate_to_ball
 from heliograph.filters.event.belief import EventBelief
@@ -99,7 +99,7 @@ class EventFilter(AbstractSizedFilter):
     def init(self) -> EventBelief:
         """The prior, and no reference yet."""
         start, m = at(self.plant, 0), self.outputs
-        x = given(start.initial_mean, start.initial_covariance)
+        x = from_covariance(start.initial_mean, start.initial_covariance)
         both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
@@ -377,7 +377,7 @@ class EventFilter(AbstractSizedFilter):
 
     def _merge_state(self, state: EventBelief) -> Gaussian:
         """Merge the sum into one Gaussian of the plant's state."""
-        whole = leading(merge_groups(state.parts).gaussian, len(self.states))
+        whole = take_leading(merge_groups(state.parts).gaussian, len(self.states))
         first: Gaussian = jax.tree.map(lambda leaf: leaf[0], whole)
         return first
 

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, leading, merge, of_columns, revise
+from heliograph.factors.gaussian import (
+    Gaussian,
+    from_columns,
+    impose_moments_of_combination,
+    merge_mixture,
+    take_leading,
+)
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.types import Array, Float
 
@@ -49,10 +55,10 @@ class GaussianSum(NamedTuple):
     def select_components(self, places: np.ndarray) -> "GaussianSum":
         """Select components of the Gaussians' vector, in the order of `places`."""
         if np.array_equal(places, np.arange(len(places))):
-            return self._replace(gaussian=leading(self.gaussian, len(places)))
+            return self._replace(gaussian=take_leading(self.gaussian, len(places)))
 
         def keep_one(x: Gaussian) -> Gaussian:
-            return of_columns(x.mean[places], Columns(x.root[places], x.variances))
+            return from_columns(x.mean[places], Columns(x.root[places], x.variances))
 
         return self._replace(gaussian=jax.vmap(keep_one)(self.gaussian))
 
@@ -117,7 +123,7 @@ def _truncate(
     changes = jnp.isfinite(log_mass) & ~certain
     shift = deviation * jnp.where(changes, moments.mean, 0.0)
     ratio = jnp.where(changes, moments.variance, 1.0)
-    after = jax.vmap(revise)(parts.gaussian, jnp.where(changes[:, None], row, 0.0), shift, ratio)
+    after = jax.vmap(impose_moments_of_combination)(parts.gaussian, jnp.where(changes[:, None], row, 0.0), shift, ratio)
     return GaussianSum(parts.log_weight + log_mass, after, parts.label)
 
 
@@ -135,7 +141,7 @@ def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
         total = log_total(parts.log_weight)
         share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
-        return GaussianSum(total, merge(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
+        return GaussianSum(total, merge_mixture(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
 
     size = len(parts.log_weight) // groups
     few: GaussianSum = jax.vmap(merge_group)(

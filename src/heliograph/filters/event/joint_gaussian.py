@@ -6,8 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns, sum_unexplained
+from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of, triangularise
+from heliograph.factors.gaussian import (
+    Gaussian,
+    append_rows,
+    condition_on_observation,
+    from_columns,
+    sum_unexplained,
+    take_leading,
+)
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.gaussian.belief import image_of, process_noise
 from heliograph.filters.gaussian.signal import gain_noise, signal_of
@@ -38,9 +45,11 @@ def augment(
     n = len(start)
 
     def augment_one(both: Gaussian) -> Gaussian:
-        signal = signal_of(plant, sensor, transform, leading(both, n), start)
+        signal = signal_of(plant, sensor, transform, take_leading(both, n), start)
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
-        return append_rows(both, signal.mean, slopes, triangular(join_columns(signal.noise, rounding_of(signal.size))))
+        return append_rows(
+            both, signal.mean, slopes, triangularise(join_columns(signal.noise, rounding_of(signal.size)))
+        )
 
     return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
 
@@ -51,12 +60,12 @@ def predict_jointly(
     """Move (x, r) by one step of the plant; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
     rest = len(both.mean) - n
-    image = image_of(plant, transform, leading(both, n), u)
+    image = image_of(plant, transform, take_leading(both, n), u)
     noise = sum_unexplained(image, process_noise(plant, u, start))
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, rest))), both.root[n:]])
     fresh = Columns(jnp.pad(noise.matrix, ((0, rest), (0, 0))), noise.weights)
     mean = jnp.concatenate([image.mean + plant.noise_mean(), both.mean[n:]])
-    return of_columns(mean, join_columns(Columns(slopes, both.variances), fresh))
+    return from_columns(mean, join_columns(Columns(slopes, both.variances), fresh))
 
 
 def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
@@ -80,7 +89,7 @@ def condition_parts(
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
-        after, innovations = observe(x, slopes, z - expected, noise, arrived)
+        after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
         if delivers:  # y is z, to the last digit
             after = set_known_components(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
         return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
@@ -94,7 +103,7 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
 
     def receive_one(x: Gaussian) -> Gaussian:
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
-        return of_columns(expected, join_columns(Columns(slopes, x.variances), noise))
+        return from_columns(expected, join_columns(Columns(slopes, x.variances), noise))
 
     received: Gaussian = jax.vmap(receive_one)(x)
     return received

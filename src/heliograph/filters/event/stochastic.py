@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns, eliminate, join_columns
-from heliograph.factors.gaussian import Gaussian, given, observe, of_columns
+from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate, merge_groups, safe_log
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
@@ -79,7 +79,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def init(self) -> StochasticBelief:
         """The prior."""
         start = at(self.plant, 0)
-        x = given(start.initial_mean, start.initial_covariance)
+        x = from_covariance(start.initial_mean, start.initial_covariance)
         return StochasticBelief(*x, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False))
 
     @predicts
@@ -177,8 +177,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         (gain, spread), mean, total = link, signal.mean, signal.covariance
         # Of y.
         silent = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)
-        y = of_columns(mean, join_columns(Columns(signal.slopes, signal.prior.variances), signal.noise))
-        quiet, _ = observe(y, y.root, reference - mean, eliminate(self._inverse_weight()))
+        y = from_columns(mean, join_columns(Columns(signal.slopes, signal.prior.variances), signal.noise))
+        quiet, _ = condition_on_observation(y, y.root, reference - mean, eliminate(self._inverse_weight()))
         d = quiet.mean - mean
         shift = -silent * d / (1 - silent)
         about = (total - silent * (quiet.covariance + jnp.outer(d, d))) / (1 - silent) - total
@@ -219,7 +219,7 @@ class StochasticEventFilter(AbstractSizedFilter):
             return jnp.where(due, -jnp.inf, 0.0), prior
         value = reference - signal.mean
         noise = join_columns(signal.noise, eliminate(self._inverse_weight()))
-        after, innovations = observe(prior, signal.slopes, value, noise)
+        after, innovations = condition_on_observation(prior, signal.slopes, value, noise)
         size = jnp.abs(reference) + jnp.abs(signal.mean)
         return innovations.log_density(jnp.ones(len(value), bool), size) + self._log_silence_normaliser(), after
 

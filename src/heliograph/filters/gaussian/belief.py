@@ -6,9 +6,9 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, columns_of, join_columns, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, Image, given, move, sum_unexplained
-from heliograph.factors.gaussian import transform as transformed
+from heliograph.factors.columns import Columns, columns_of, join_columns, rounding_of, triangularise
+from heliograph.factors.gaussian import Gaussian, Image, from_covariance, predict_affine, sum_unexplained
+from heliograph.factors.gaussian import add_noise_to_image as transformed
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -50,7 +50,7 @@ class AbstractBeliefFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> Gaussian:
         """Return the belief before any data."""
-        return given(self.initial_mean, self.initial_covariance)
+        return from_covariance(self.initial_mean, self.initial_covariance)
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
@@ -94,7 +94,7 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
 def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> Columns:
     """Factors of Cov w, and of the rounding of a state that had the second moments `start`, (n,)."""
     own = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    return triangular(join_columns(own, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
+    return triangularise(join_columns(own, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
 
 
 def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
@@ -110,7 +110,7 @@ def predict_gaussian(
     """f(x, u) + w."""
     noise = process_noise(plant, u, start)
     if isinstance(plant, LinearPlant):
-        return move(x, plant.transition_matrix(u), plant.shift(u), noise)
+        return predict_affine(x, plant.transition_matrix(u), plant.shift(u), noise)
     image = transform.image(plant.moves(u, x.mean), x)
     return transformed(image._replace(mean=image.mean + plant.noise_mean()), noise)
 

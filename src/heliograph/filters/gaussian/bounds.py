@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal, triangular
-from heliograph.factors.gaussian import Gaussian, observe, of_columns
+from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal_or_zero, triangularise
+from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.filters.gaussian.scalars import (
     trace_minimising_scalars,
     young_fixed_point_map,
@@ -84,7 +84,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
     # The same bound as a Kalman update.
     noise = a**2 * (base + (1 / beta[0] + 1 / beta[1]) * shift + b * of_noise) + a * (a * b - 1) * of_state
     wide = prior._replace(variances=a * prior.variances)
-    return observe(wide, slopes, a * z.innovation, factor_spread(noise), present)[0]
+    return condition_on_observation(wide, slopes, a * z.innovation, factor_spread(noise), present)[0]
 
 
 def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
@@ -103,15 +103,17 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
     used = mask_received(channel, present)[:, None]
     signals = join_columns(Columns(signal.slopes, prior.variances), signal.noise)
-    factors = triangular(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
+    factors = triangularise(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
     explained = decorrelate(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
-    share = reciprocal(factors.weights)
+    share = reciprocal_or_zero(factors.weights)
     # The best beta, then the update with what is left of Omega as noise.
     cross = (slopes * prior.variances) @ prior.root.T
     parts = base + unit_variance_where_absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
     beta = trace_minimising_scalars(zero_mean_fixed_point_map, scalar, parts)[0]
-    after = observe(prior, slopes, z.innovation, factor_spread(base + shift / beta - of_state), present)[0]
-    wider = of_columns(after.mean, join_columns(after.columns, Columns(explained, beta * share)))
+    after = condition_on_observation(
+        prior, slopes, z.innovation, factor_spread(base + shift / beta - of_state), present
+    )[0]
+    wider = from_columns(after.mean, join_columns(after.columns, Columns(explained, beta * share)))
     return keep_where_unchanged(jnp.any(present), wider, after)
 
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, columns_of, nothing
+from heliograph.factors.columns import Columns, columns_of, zero_covariance
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     FilterAngles,
@@ -194,7 +194,7 @@ def signal_without_noise(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Gaussian, start: jax.Array
 ) -> Signal:
     """Moments of h(x) and the mean of its noise, without the noise's spread."""
-    return signal_of(plant, sensor, transform, state, start, nothing(len(sensor.outputs)))
+    return signal_of(plant, sensor, transform, state, start, zero_covariance(len(sensor.outputs)))
 
 
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:

@@ -8,8 +8,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, join_columns, triangular
-from heliograph.factors.gaussian import Gaussian, append_rows, leading, observe, of_columns, revise
+from heliograph.factors.columns import Columns, join_columns, triangularise
+from heliograph.factors.gaussian import (
+    Gaussian,
+    append_rows,
+    condition_on_observation,
+    from_columns,
+    impose_moments_of_combination,
+    take_leading,
+)
 from heliograph.filters.robust_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
 
@@ -54,7 +61,7 @@ def score_update(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches)
     Source: Masreliez, Approximate non-Gaussian filtering with linear state and observation relations (1975).
     """
     n, m, present = len(before.prior.mean), len(before.signal), ~jnp.isnan(z)
-    both = append_rows(before.prior, before.signal, before.slopes, triangular(before.noise))
+    both = append_rows(before.prior, before.signal, before.slopes, triangularise(before.noise))
     weights, density = [], jnp.zeros_like(z[0])
     for i in range(m):
         row = both.root[n + i]
@@ -66,8 +73,8 @@ def score_update(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches)
             jnp.where(present[i], score.weight / _compute_score(jnp.zeros_like(e), v, *branches).weight, jnp.nan)
         )
         density = density + jnp.where(present[i], score.log_density, 0.0)
-        both = revise(both, jnp.where(present[i], row, 0.0), v * score.slope, score.left)
-    return ScoreUpdate(leading(both, n), _stack_entries(weights), density)
+        both = impose_moments_of_combination(both, jnp.where(present[i], row, 0.0), v * score.slope, score.left)
+    return ScoreUpdate(take_leading(both, n), _stack_entries(weights), density)
 
 
 class _Score(NamedTuple):
@@ -130,15 +137,15 @@ def reweight(noise: Columns, w: jax.Array) -> Columns:
 
 def joint_update(before: PredictedMeasurement, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
     """State after the components that are present, with noise of this covariance besides that of t."""
-    return observe(before.prior, before.slopes, e, join_columns(before.noise, noise), present)[0]
+    return condition_on_observation(before.prior, before.slopes, e, join_columns(before.noise, noise), present)[0]
 
 
 def expected_squared_residuals(
     before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
 ) -> jax.Array:
     """E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,)."""
-    t = of_columns(jnp.zeros_like(e), before.columns)
-    after, _ = observe(t, t.root, e, noise, present)
+    t = from_columns(jnp.zeros_like(e), before.columns)
+    after, _ = condition_on_observation(t, t.root, e, noise, present)
     return (e - after.mean) ** 2 + after.columns.diagonal
 
 

@@ -9,8 +9,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, eliminate, join_columns, rounding_of, square_root, triangular, unit_of
-from heliograph.factors.gaussian import Gaussian, Innovations, observe
+from heliograph.factors.columns import (
+    Columns,
+    eliminate,
+    join_columns,
+    rounding_of,
+    square_root,
+    triangularise,
+    unit_of,
+)
+from heliograph.factors.gaussian import Gaussian, Innovations, condition_on_observation
 from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
@@ -113,7 +121,7 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
-    plain = triangular(join_columns(signal.noise.through(gain), link, rounding))
+    plain = triangularise(join_columns(signal.noise.through(gain), link, rounding))
     return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
 
 
@@ -135,7 +143,7 @@ def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> Colu
 def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> tuple[Gaussian, Innovations]:
     """Condition the prior on what arrived behind the nominal law of the channel."""
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
-    return observe(signal.prior, slopes, z.innovation, make_received_noise(signal, channel), z.present)
+    return condition_on_observation(signal.prior, slopes, z.innovation, make_received_noise(signal, channel), z.present)
 
 
 def condition_on_measurement(
@@ -145,7 +153,7 @@ def condition_on_measurement(
     present = ~jnp.isnan(z)
     z = nearest(z, expected, angles)
     value = z - expected
-    after, innovations = observe(x, slopes, value, noise, present)
+    after, innovations = condition_on_observation(x, slopes, value, noise, present)
     total = join_columns(Columns(slopes, x.variances), noise).covariance
     density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
     return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)

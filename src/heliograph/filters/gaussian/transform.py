@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, eliminate, reciprocal, square_root
-from heliograph.factors.gaussian import Gaussian, Image, given, image_by_slopes
+from heliograph.factors.columns import Columns, decorrelate, eliminate, reciprocal_or_zero, square_root
+from heliograph.factors.gaussian import Gaussian, Image, from_covariance, image_by_slopes
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array
@@ -40,7 +40,7 @@ class AbstractTransform(Module):
         """Moments of function(x) for x with mean (n,) and covariance (n, n)."""
         if type(self).image is AbstractTransform.image:
             raise unwritten(self, "apply")
-        x = given(mean, covariance)
+        x = from_covariance(mean, covariance)
         image = self.image(function, x)
         cross = (x.root * x.variances) @ image.slopes.T
         return Transformed(image.mean, image.columns.covariance, cross)
@@ -52,7 +52,7 @@ class AbstractTransform(Module):
 
 def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
     """Slopes (D^-1 L^-1 Cov(x, f))' and as curvature what Cov f has more than slopes D slopes'."""
-    slopes = decorrelate(x.root, moments.cross).T * reciprocal(x.variances)
+    slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
     rest = moments.covariance - (slopes * x.variances) @ slopes.T
     return image_by_slopes(moments.mean, slopes, x, eliminate(rest))
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, given
+from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.gaussian.bounds import (
     Scalars,
     as_array,
@@ -88,7 +88,7 @@ class AbstractUpdate(Module):
         """
         prior = signal.prior
         gain, bound = self.correct(prior.covariance, signal, channel, z.present)
-        after = given(prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0), bound)
+        after = from_covariance(prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0), bound)
         return keep_where_unchanged(jnp.any(z.present), after, prior)
 
     def claim(self, uncertain: bool) -> Claim:

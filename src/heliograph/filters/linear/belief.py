@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, given, move
+from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.gaussian.belief import process_noise
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.linalg import symmetric
@@ -61,12 +61,12 @@ class LinearBelief(NamedTuple):
 def prior_belief(start: AbstractPlant) -> LinearBelief:
     """Return the prior, both as estimate and as the state's moments before data."""
     mean, covariance = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
-    return LinearBelief(*given(start.initial_mean, start.initial_covariance), mean, covariance)
+    return LinearBelief(*from_covariance(start.initial_mean, start.initial_covariance), mean, covariance)
 
 
 def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
     """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
-    estimate = move(belief.estimate, step.matrix, step.shift, step.noise)
+    estimate = predict_affine(belief.estimate, step.matrix, step.shift, step.noise)
     mean = step.matrix @ belief.state_mean + step.shift
     covariance = step.matrix @ belief.state_covariance @ step.matrix.T + step.covariance
     return LinearBelief(*estimate, *_within_range(mean, symmetric(covariance)))

@@ -33,7 +33,7 @@ from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
-from heliograph.random_affine.outliers import is_bounded
+from heliograph.random_affine.outliers import has_bounded_noise
 
 
 class LinearFilter(AbstractSizedFilter):
@@ -165,7 +165,7 @@ def linear_filter(
     if first(channel).remembers:
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
-        if is_bounded(plant, sensor, channel):
+        if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         if first(channel).erases:
             return side_information_filter(plant, sensor, channel)

@@ -13,7 +13,7 @@ from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFil
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.linear.lift import check_model, lifted_system
-from heliograph.linear.polynomial import memory_system
+from heliograph.linear.polynomial import quadratic_system_with_linear_estimate
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
@@ -30,10 +30,10 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.moments.moment_noise import about_mean
-from heliograph.random_affine.moments.monomials import count, monomials, position
+from heliograph.random_affine.moments.monomials import count_monomials, monomials, position
 from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.outliers import is_bounded
+from heliograph.random_affine.outliers import has_bounded_noise
 
 Part = TypeVar("Part", AbstractPlant, AbstractSensor, AbstractRandomAffine)
 T = TypeVar("T")
@@ -125,7 +125,7 @@ class PolynomialFilter(AbstractSizedFilter):
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
         self.centre, self.kept = centre, inner.kept
         self.states, self.inputs = inner.states, inner.inputs
-        fitting = [m for m in range(1, inner.received + 1) if count(m + 1, degree) == inner.received + 1]
+        fitting = [m for m in range(1, inner.received + 1) if count_monomials(m + 1, degree) == inner.received + 1]
         if not fitting:
             raise fail(
                 "inner filter", f"one that receives monomials up to degree {degree}", f"{inner.received} numbers"
@@ -364,7 +364,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     centre, system = _lift_about_mean(plant, sensor, channel, 1, horizon)
     linear = lmmse(system, claim)
     about = plant if centre is None else centre_plant(plant)
-    products = lmmse(memory_system(about, sensor, channel, linear), linear.claim)
+    products = lmmse(quadratic_system_with_linear_estimate(about, sensor, channel, linear), linear.claim)
     names = first(plant).states
     filter = MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
     return believing(filter, Premise(plant, sensor, channel, order=4))
@@ -376,7 +376,7 @@ def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degre
     Where noise is known by a bound of its covariance alone, "upper" at degree 1, and "nominal" beyond, since no higher
     moment has a bound.
     """
-    if degree > 1 and is_bounded(plant, sensor, channel):
+    if degree > 1 and has_bounded_noise(plant, sensor, channel):
         return "nominal"
     if first(channel).remembers:
         claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, triangular
-from heliograph.factors.gaussian import Gaussian, given, move
+from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, triangularise
+from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.signal import condition_on_measurement
 from heliograph.filters.innovation import gaussian_innovation
@@ -157,13 +157,13 @@ class LinearSystemFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> Gaussian:
         """Return the system's initial belief."""
-        return given(self.mean, self.covariance)
+        return from_covariance(self.mean, self.covariance)
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
         """A y + a and A P A' + Cov(w)."""
         s: Steps = at(self.steps, k)
-        return move(state, s.transition, s.drift, at(self.noises, k).process)
+        return predict_affine(state, s.transition, s.drift, at(self.noises, k).process)
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
@@ -206,7 +206,7 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
 
         def of_step(own: Columns, seconds: jax.Array) -> Columns:
-            return triangular(join_columns(own, rounding_of(seconds)))
+            return triangularise(join_columns(own, rounding_of(seconds)))
 
         each: Callable[..., Columns] = jax.vmap(of_step)
         factors = each(columns_of_each(covariances), rounding)

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import LinearStep, PlannedFilter
 from heliograph.filters.modes.modal import ObservationModel, observation_models
-from heliograph.linear.jump_system import mix_modes, propagate
+from heliograph.linear.jump_system import mix_modes, propagate_by_mode
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.enlarged import with_past
 from heliograph.model.over_time import at, first
@@ -114,7 +114,7 @@ def _propagate_moments(
     move[n + 1 :, n + 1 :], move[n + 1 :, n] = step.transition, step.drift
     noise[:n, :n] = plant.noise_covariance(given)
     before = mix_modes(rows, moments)
-    return np.asarray(propagate(move, before, before[:, n, n, None, None] * noise))
+    return np.asarray(propagate_by_mode(move, before, before[:, n, n, None, None] * noise))
 
 
 def _correct_moments(
@@ -131,8 +131,8 @@ def _correct_moments(
     use[:, n + 1 :, : n + 1] += gain @ mean @ measure
     use[:, n + 1 :, n + 1 :] -= gain @ step.output
     use[:, n + 1 :, n] -= gain @ step.offset
-    second = propagate(measure, moments[:, : n + 1, : n + 1], law * noise)
-    added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * propagate(mean, noise, 0.0)
-    after: np.ndarray = propagate(use, moments, 0.0)
-    after[:, n + 1 :, n + 1 :] += propagate(gain, added, 0.0)
+    second = propagate_by_mode(measure, moments[:, : n + 1, : n + 1], law * noise)
+    added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * propagate_by_mode(mean, noise, 0.0)
+    after: np.ndarray = propagate_by_mode(use, moments, 0.0)
+    after[:, n + 1 :, n + 1 :] += propagate_by_mode(gain, added, 0.0)
     return after

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
 
-from heliograph.factors.columns import Columns, join_columns, rounding_of, side_by_side, triangular
-from heliograph.factors.gaussian import Gaussian, given, of_columns
+from heliograph.factors.columns import Columns, join_columns, rounding_of, side_by_side, triangularise
+from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.modal import (
@@ -105,7 +105,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         parts = [spread, *(jnp.kron(_indicator_covariance(law), second) for law in laws if len(law) > 1)]
         centre = jnp.asarray(start.initial_mean)
         mean = self._embed_first_block(jnp.append(centre, 1.0))
-        return AdditiveBelief(*given(mean, block_diag(*parts)), second, laws, centre, jnp.asarray(False))
+        return AdditiveBelief(*from_covariance(mean, block_diag(*parts)), second, laws, centre, jnp.asarray(False))
 
     @predicts
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
@@ -118,7 +118,7 @@ class AdditiveModalFilter(AbstractModalFilter):
             centre
         )
         root, fresh = self._transition_factors(state, u, k)
-        after = of_columns(mean, join_columns(Columns(root, state.variances), fresh))
+        after = from_columns(mean, join_columns(Columns(root, state.variances), fresh))
         second = move @ state.second @ move.T + noise
         return AdditiveBelief(*after, second, _next_laws(state.laws, rows), centre, jnp.asarray(True))
 
@@ -136,7 +136,7 @@ class AdditiveModalFilter(AbstractModalFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step given its prediction."""
         slopes, fresh = self._transition_factors(step.before, step.u, step.k)
-        moved, projection = (slopes, triangular(fresh)), self._projection_to_state()
+        moved, projection = (slopes, triangularise(fresh)), self._projection_to_state()
         return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:

@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of_each, join_columns, rounding_of, square_root
-from heliograph.factors.gaussian import Gaussian, given, merge, move, observe
+from heliograph.factors.gaussian import (
+    Gaussian,
+    condition_on_observation,
+    from_covariance,
+    merge_mixture,
+    predict_affine,
+)
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -112,7 +118,7 @@ class MixtureFilter(AbstractSizedFilter):
     def init(self) -> MixtureBelief:
         """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)
-        prior = given(start.initial_mean, start.initial_covariance)
+        prior = from_covariance(start.initial_mean, start.initial_covariance)
         return MixtureBelief(*prior, jnp.asarray(self.initial), jnp.asarray(False))
 
     @predicts
@@ -120,7 +126,7 @@ class MixtureFilter(AbstractSizedFilter):
         """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = process_noise(plant, u, second_moments_at_start(self.plant))
-        moved = move(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
+        moved = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
         return MixtureBelief(*moved, law, jnp.asarray(True))
 
@@ -135,7 +141,7 @@ class MixtureFilter(AbstractSizedFilter):
         def condition(gain: jax.Array, offset: jax.Array, noise: Columns) -> tuple[Gaussian, tuple[jax.Array, ...]]:
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
-            after, innovations = observe(x, slopes, value, noise, present)
+            after, innovations = condition_on_observation(x, slopes, value, noise, present)
             likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
             total = join_columns(Columns(slopes, x.variances), noise).covariance
             return after, (likelihood, jnp.sum(present & innovations.determined), value, total)
@@ -147,7 +153,7 @@ class MixtureFilter(AbstractSizedFilter):
         total = jnp.where(present[:, None] & present, total, jnp.nan)
         innovation = mixed_innovation(prior, value, total, density)
         modes = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
-        updated = MixtureBelief(*merge(after, weight), modes, state.moved)
+        updated = MixtureBelief(*merge_mixture(after, weight), modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @estimates

@@ -22,9 +22,9 @@ from heliograph.factors.columns import (
     join_columns,
     rounding_of,
     side_by_side,
-    triangular,
+    triangularise,
 )
-from heliograph.factors.gaussian import Gaussian, given, of_columns
+from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.gaussian.signal import condition_on_measurement, factor_spread
@@ -41,7 +41,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import divide_spread, nominal_spread, undivided
+from heliograph.random_affine.moments.second_moments import divide_spread, join_gain_and_noise, nominal_spread
 
 
 class ObservationModel(Module):
@@ -62,7 +62,7 @@ class ObservationModel(Module):
     @property
     def spread(self) -> Float[Array, "M m m p1 p1"]:
         """E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor."""
-        spread: Array = undivided(self.gain_spread, self.noise)
+        spread: Array = join_gain_and_noise(self.gain_spread, self.noise)
         return spread
 
 
@@ -178,7 +178,7 @@ class ModalFilter(AbstractJointModalFilter):
         centred = state.mean - mean_from_centre(state.law, state.centre)
         mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
         root, fresh = self._transition_factors(state, u, k)
-        after = of_columns(mean, join_columns(Columns(root, state.variances), fresh))
+        after = from_columns(mean, join_columns(Columns(root, state.variances), fresh))
         moments = jnp.einsum("ij,iab->jab", rows, _propagate_moments(state, move)) + law[:, None, None] * noise
         return ModalBelief(*after, moments, centre, jnp.asarray(True))
 
@@ -220,7 +220,7 @@ class ModalFilter(AbstractJointModalFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step given its prediction."""
         slopes, fresh = self._transition_factors(step.before, step.u, step.k)
-        moved, projection = (slopes, triangular(fresh)), self._projection_to_state()
+        moved, projection = (slopes, triangularise(fresh)), self._projection_to_state()
         return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
 
 
@@ -314,7 +314,7 @@ def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
     """
     spread, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
-    state = given(start.initial_mean, start.initial_covariance)
+    state = from_covariance(start.initial_mean, start.initial_covariance)
     mode = separate_modes((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
     # Factors of both, x before the indicator in each part.
     last = np.zeros((len(spread), len(spread)))

@@ -131,7 +131,7 @@ def _condition_channel(channel: AbstractRandomAffine, numbers: jax.Array) -> Sec
     """Condition the channel on the memories' states, given as numbers; return its second moments."""
     held = memories(channel).values()
     return _nominal_moments(
-        condition_on_memories(channel, [m.read(number) for m, number in zip(held, numbers, strict=True)])
+        condition_on_memories(channel, [m.state_from_number(number) for m, number in zip(held, numbers, strict=True)])
     )
 
 
@@ -141,7 +141,11 @@ def _predict_channel(
     """Moments of the channel given the memories' states one step before; without them, of the first step."""
     choices = []
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
-        choices.append(memory.following(None if last is None else memory.read(number), degree_in(channel, identity)))
+        choices.append(
+            memory.next_state_quadrature(
+                None if last is None else memory.state_from_number(number), degree_in(channel, identity)
+            )
+        )
     chosen = list(product(*(range(len(weights)) for _, weights in choices)))
     maps = [condition_on_memories(channel, [choices[i][0][j] for i, j in enumerate(places)]) for places in chosen]
     weights = [prod(choices[i][1][j] for i, j in enumerate(places)) for places in chosen]

@@ -15,7 +15,13 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
-from heliograph.factors.gaussian import Gaussian, given, merge, moments_of_mixture, of_matrix
+from heliograph.factors.gaussian import (
+    Gaussian,
+    from_covariance,
+    from_covariance_by_elimination,
+    merge_mixture,
+    moments_of_mixture,
+)
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -190,7 +196,7 @@ class MergeByMode(AbstractMerging):
         """One component for each present mode."""
         modes = math.isqrt(len(weight))
         pairs = weight[:, None] * (self.update_pairs(modes)[1][:, None] == np.arange(modes))
-        return jax.vmap(partial(merge, parts), in_axes=1)(normalise_columns(pairs)), jnp.sum(pairs, axis=0)
+        return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs)), jnp.sum(pairs, axis=0)
 
 
 def normalise_columns(weight: jax.Array) -> jax.Array:
@@ -211,7 +217,7 @@ def mix_and_predict(
     """f(x, u) + w of each mixture (components, mixtures), by two moments; a linear plant moves the parts first."""
     share = normalise_columns(weight)
     if not isinstance(plant, LinearPlant):
-        mixtures = jax.vmap(partial(merge, parts), in_axes=1)(share)
+        mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
     matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
@@ -219,7 +225,7 @@ def mix_and_predict(
 
     def mix(weights: jax.Array) -> Gaussian:
         mean, covariance = moments_of_mixture(means, spreads, weights)
-        return of_matrix(mean, covariance + noise)
+        return from_covariance_by_elimination(mean, covariance + noise)
 
     moved: Gaussian = jax.vmap(mix, in_axes=1)(share)
     return moved
@@ -250,7 +256,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes."""
         start = at(self.plant, 0)
-        parts = replicate(given(start.initial_mean, start.initial_covariance), len(self.initial))
+        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(self.initial))
         return ModalBeliefs(*parts, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
 
     @predicts
@@ -291,7 +297,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:
     """Merge the mixture: mean and covariance of the state."""
-    return merge(state.parts, jnp.sum(state.weight, axis=1))
+    return merge_mixture(state.parts, jnp.sum(state.weight, axis=1))
 
 
 def replicate(x: T, count: int) -> T:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, given, moments_of_mixture
+from heliograph.factors.gaussian import Gaussian, from_covariance, moments_of_mixture
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -95,7 +95,7 @@ class ParticleFilter(AbstractSizedFilter):
     def init(self) -> Particles:
         """Return the prior in every particle, with modes in proportion to their initial law."""
         start, n = at(self.plant, 0), self.particles
-        parts = replicate(given(start.initial_mean, start.initial_covariance), n)
+        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
         mode = _invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
         return Particles(*parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
 

@@ -11,7 +11,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes
-from heliograph.random_affine.moments.second_moments import divide_spread, undivided
+from heliograph.random_affine.moments.second_moments import divide_spread, join_gain_and_noise
 from heliograph.random_affine.moments.tensors import symmetric_product
 
 
@@ -37,7 +37,7 @@ class SideInformation(Module):
     @property
     def spread(self) -> Float[Array, "M A m m p1 p1"]:
         """E[((G, n) - mean) Y ((G, n) - mean)' | mode, pattern] as a tensor."""
-        return undivided(self.gain_spread, self.noise)
+        return join_gain_and_noise(self.gain_spread, self.noise)
 
 
 def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:

@@ -12,15 +12,15 @@ from heliograph.factors.columns import (
     Columns,
     below_diagonal,
     join_columns,
-    reciprocal,
+    reciprocal_or_zero,
     rounding_of,
     side_by_side,
     square_root,
-    triangular,
+    triangularise,
     unit_lower,
     unit_of,
 )
-from heliograph.factors.gaussian import Innovations, given
+from heliograph.factors.gaussian import Innovations, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
@@ -108,7 +108,10 @@ class SideInformationFilter(AbstractSizedFilter):
     def init(self) -> SideInformationBelief:
         """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        prior, unit = given(start.initial_mean, start.initial_covariance), np.eye(len(self.states) + 1)[:, -1:]
+        prior, unit = (
+            from_covariance(start.initial_mean, start.initial_covariance),
+            np.eye(len(self.states) + 1)[:, -1:],
+        )
         # q in each mode of x - c and of what is known there, x~ = (0, 1) and e = (1{mode} - p) x (0, 1).
         x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
         constant = jnp.zeros_like(x).at[:, -1:].set(unit)
@@ -117,7 +120,7 @@ class SideInformationFilter(AbstractSizedFilter):
             jnp.stack([jnp.concatenate([e, x]) for e in errors]), outer(law, jnp.append(prior.variances, 1.0))
         )
         mean = jnp.kron(law, unit[:, 0])
-        return _make_belief(mean, jax.vmap(triangular)(moments), jnp.asarray(start.initial_mean), jnp.asarray(False))
+        return _make_belief(mean, jax.vmap(triangularise)(moments), jnp.asarray(start.initial_mean), jnp.asarray(False))
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
@@ -140,7 +143,7 @@ class SideInformationFilter(AbstractSizedFilter):
         def into(j: jax.Array, chances: jax.Array, law: jax.Array) -> Columns:
             moved = Columns(jax.vmap(to)(j - rows, errors, x), weights)
             own = Columns(kron(jnp.append(j, 1.0)[:, None], noise.matrix), law * noise.weights)
-            return triangular(join_columns(side_by_side(moved, chances), own))
+            return triangularise(join_columns(side_by_side(moved, chances), own))
 
         moments = jax.vmap(into)(jnp.eye(modes), rows.T, law)
         mean = predict_by_mode(state.mean[:, None], move, rows)[:, 0]
@@ -245,7 +248,7 @@ def _describe_received(
         sent = x.through(measure).covariance + p * noise
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)
-        return triangular(join_columns(plain, rounding, factor_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
+        return triangularise(join_columns(plain, rounding, factor_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
 
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = subtract_mean_output(gains @ measure, law)
@@ -276,7 +279,7 @@ def _project_on_data(
     size = jnp.tile(jnp.square(_join_modes(x)) @ weights, modes) + jnp.square(basis[1:]) @ weights
     smallest = jnp.append(0.0, np.sqrt(unit_of(weights)) * size)
     basis, basis_values, variances = gram_schmidt_first(basis, jnp.append(1.0, state.mean), weights, 1 + count)
-    inverses = reciprocal(jnp.where(variances > smallest, variances, 0.0))
+    inverses = reciprocal_or_zero(jnp.where(variances > smallest, variances, 0.0))
     gains = (rows @ (excess * basis).T) * inverses
     rows, values = rows - gains @ basis, jnp.append(values, -state.mean) - gains @ basis_values
     expected = PredictedInnovation(values[:m], Columns(rows[:m], weights).covariance)
@@ -285,7 +288,7 @@ def _project_on_data(
     innovations = Innovations(values[:m], variances, jnp.diagonal(expected.covariance))
     # Factors of each mode.
     left = jnp.moveaxis(rows[m:].reshape(count, modes, -1), 1, 0)
-    moments = jax.vmap(triangular)(Columns(jnp.concatenate([left, x], axis=1), weights.reshape(modes, -1)))
+    moments = jax.vmap(triangularise)(Columns(jnp.concatenate([left, x], axis=1), weights.reshape(modes, -1)))
     return _make_belief(-values[m:], moments, state.centre, state.moved), innovations, expected
 
 
@@ -306,7 +309,7 @@ def gram_schmidt_first(
     for i in range(count):
         weighted = weights * rows[i]
         variances.append(rows[i] @ weighted)
-        share = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal(variances[i]), 0.0)
+        share = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal_or_zero(variances[i]), 0.0)
         rows, numbers = rows - outer(share, rows[i]), numbers - share * numbers[i]
     return rows, numbers, jnp.stack(variances)
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, join_columns, triangular
-from heliograph.factors.gaussian import Gaussian, of_columns
+from heliograph.factors.columns import Columns, join_columns, triangularise
+from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.modal import (
@@ -91,7 +91,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         root, young, fresh = self._transition_factors(state, u, k)
         centred, law = x.mean - mean_from_centre(state.law, state.centre), state.law @ rows
         mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
-        after = of_columns(mean, join_columns(Columns(root, (1 + young) * x.variances), fresh))
+        after = from_columns(mean, join_columns(Columns(root, (1 + young) * x.variances), fresh))
         # E[x~ x~'] and nominal law one step later.
         second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
         return UncertainBelief(*after, second, centre, law, low, high, jnp.asarray(True))
@@ -143,7 +143,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step; the filter's bound is not proved for smoothed estimates."""
         slopes, young, fresh = self._transition_factors(step.before, step.u, step.k)
-        noise = triangular(join_columns(Columns(slopes, young * step.before.variances), fresh))
+        noise = triangularise(join_columns(Columns(slopes, young * step.before.variances), fresh))
         moved, projection = (slopes, noise), self._projection_to_state()
         return smoother_step_of(step.before, step.prior, step.after, moved, "nominal", projection=projection)
 

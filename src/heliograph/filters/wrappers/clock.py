@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.factors.columns import Columns, join_columns
-from heliograph.factors.gaussian import Gaussian, of_columns
+from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -188,7 +188,7 @@ def _correct_by_gain(signal: Signal, channel: SecondOrder, gain: jax.Array, inno
     """Correct the mean to m + K e with any gain: the error is then (L - K slopes) xi - K v."""
     prior, slopes = signal.prior, jnp.asarray(channel.mean_gain) @ signal.slopes
     left = Columns(prior.root - gain @ slopes, prior.variances)
-    return of_columns(
+    return from_columns(
         prior.mean + gain @ innovation, join_columns(left, make_received_noise(signal, channel).through(gain))
     )
 

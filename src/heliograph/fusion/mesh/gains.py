@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, eliminate, square_root
-from heliograph.factors.gaussian import given, observe
+from heliograph.factors.gaussian import condition_on_observation, from_covariance
 from heliograph.numerics.linalg import psd_solve, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 
 
-class Believed(NamedTuple):
-    """Knowledge of one node about the estimates that its neighbours sent, itself first, and which of them arrived.
+class NeighbourEstimates(NamedTuple):
+    """What one node knows of the estimates that its neighbours sent, itself first: covariances, and which arrived.
 
     Shapes: covariance (n, n) of the node itself; traces (degree,) of all covariances, information (degree, n, n), their
     inverses; joint (degree, n, degree, n), None where it is not propagated; present (degree,).
@@ -37,7 +37,7 @@ class Believed(NamedTuple):
     present: Bool[jax.Array, " degree"]
 
 
-class Weights(NamedTuple):
+class NeighbourWeights(NamedTuple):
     """Weights C_j = front parts_j of the neighbours' estimates, and the covariance Pc of what is fused.
 
     Shapes: front (n, n), parts (degree, n, n) or their diagonals (degree, n), covariance (n, n). Two factors, since
@@ -49,8 +49,8 @@ class Weights(NamedTuple):
     covariance: Float[jax.Array, "n n"]
 
 
-class Step(NamedTuple):
-    """Plant over one step, A and Q, and what the measurements say: S of those that arrived, and of all neighbours."""
+class NodeStep(NamedTuple):
+    """Plant over one step, A and Q, and information of measurements: of those that arrived, and of all."""
 
     matrix: Float[Array, "n n"]
     noise: Float[Array, "n n"]
@@ -58,7 +58,7 @@ class Step(NamedTuple):
     complete: Float[Array, "n n"]
 
 
-class Gains(NamedTuple):
+class NodeGains(NamedTuple):
     """Gains of one node's step: M_j = front parts_j, of others than itself; W and F = I - W S; P.
 
     Shapes: front, gain, innovation and covariance (n, n), parts (degree, n, n) or their diagonals (degree, n).
@@ -71,12 +71,12 @@ class Gains(NamedTuple):
     covariance: Float[jax.Array, "n n"]
 
 
-def gains_of(weights: Weights, step: Step) -> Gains:
+def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
     """Gains of the step with these weights of the estimates: fuse what was believed, predict once, correct."""
     a = jnp.asarray(step.matrix)
     predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
     corrected, innovation = correct(predicted, jnp.asarray(step.arrived))
-    return Gains(innovation @ a @ weights.front, weights.parts, corrected, innovation, corrected)
+    return NodeGains(innovation @ a @ weights.front, weights.parts, corrected, innovation, corrected)
 
 
 def correct(
@@ -88,8 +88,8 @@ def correct(
     """
     n, said = len(predicted), eliminate(information)
     rows = jnp.diag(square_root(said.weights)) @ said.matrix.T
-    x = given(np.zeros(n), predicted)
-    after, _ = observe(x, rows @ x.root, jnp.zeros(n), Columns(np.eye(n), jnp.ones(n)))
+    x = from_covariance(np.zeros(n), predicted)
+    after, _ = condition_on_observation(x, rows @ x.root, jnp.zeros(n), Columns(np.eye(n), jnp.ones(n)))
     return after.covariance, np.eye(n) - after.covariance @ information
 
 

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.fusion.mesh.gains import Gains
-from heliograph.linear.jump_system import propagate
+from heliograph.fusion.mesh.gains import NodeGains
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Bool, Float, Int
 
 
-def transitions(gains: Gains, matrix: Float[Array, "n n"]) -> Float[Array, "node degree n n"]:
-    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
+def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Array, "node degree n n"]:
+    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: e_i+ = sum_j M_ij e_j + noise."""
     parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * np.eye(len(matrix))
     others = (gains.front[:, None] @ parts)[:, 1:]
     alone = gains.innovation @ matrix - others.sum(axis=1)
@@ -26,16 +26,18 @@ def transitions(gains: Gains, matrix: Float[Array, "n n"]) -> Float[Array, "node
     return moves
 
 
-def used(gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]) -> Float[Array, "node degree n n"]:
-    """W_i where the neighbour's measurement arrived."""
+def measurement_weights(
+    gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]
+) -> Float[Array, "node degree n n"]:
+    """W_i of the measurements that arrived, zero for the others."""
     taken: Float[Array, "node degree n n"] = library(gain, arrived).where(arrived[..., None, None], gain[:, None], 0.0)
     return taken
 
 
-def spread(
+def scatter_blocks(
     blocks: Float[Array, "node degree n n"], senders: Int[Array, "node degree"], present: Bool[Array, "node degree"]
 ) -> Any:
-    """Matrix (N, N) with these blocks where they are present, sparse unless it is traced."""
+    """Matrix (N, N) with these blocks at (node, sender) where present, sparse unless it is traced."""
     nodes, _, n, _ = blocks.shape
     if is_traced(blocks):
         there = jnp.where(present[:, :, None, None], blocks, 0.0)
@@ -52,8 +54,8 @@ def joint_after(
 ) -> Float[Array, "N N"]:
     """J+ from M, F, Q, and the matrices of W_i S_j and of W_i over the measurements that node i has."""
     measured = ws @ w.T
-    added = propagate(f.reshape(len(joint), -1), noise, measured if is_traced(measured) else measured.toarray())
-    after = propagate(m, joint, added)
+    added = propagate_by_mode(f.reshape(len(joint), -1), noise, measured if is_traced(measured) else measured.toarray())
+    after = propagate_by_mode(m, joint, added)
     joined: Float[Array, "N N"] = (after + after.T) / 2
     return joined
 

@@ -10,7 +10,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import GainAndNoise, Series, Stack, stack_rows
 from heliograph.random_affine.law import Discrete
-from heliograph.random_affine.moments.monomials import count, product_table
+from heliograph.random_affine.moments.monomials import count_monomials, product_table
 from heliograph.random_affine.superposed import Superposed
 
 CORNERS = 2048  # corner laws evaluated one by one; above, intervals are combined (sound, but looser)
@@ -89,7 +89,7 @@ def _multiply_rows(a: Entries, first: int, b: Entries, second: int, variables: i
     Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.
     """
     table = product_table(variables, first, second)
-    size = (count(variables, first + second),)
+    size = (count_monomials(variables, first + second),)
     products = a.reshape(-1, 1, a.shape[-1], 1) * b.reshape(1, -1, 1, b.shape[-1])
     return stack_parts(
         [scatter(size, table, products.min(axis=(0, 1))), scatter(size, table, products.max(axis=(0, 1)))]

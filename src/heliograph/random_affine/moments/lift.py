@@ -10,7 +10,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_forgets, check_maps
 from heliograph.random_affine.moments.monomials import (
     Moments,
-    count,
+    count_monomials,
     exponents,
     monomials,
     position,
@@ -43,12 +43,12 @@ class Lift(AbstractWrapper):
     @property
     def outputs(self) -> int:
         """Monomials of z of degree 1 to `degree`."""
-        return count(self.base.outputs + 1, self.degree) - 1
+        return count_monomials(self.base.outputs + 1, self.degree) - 1
 
     @property
     def inputs(self) -> int:
         """Monomials of y of degree 1 to `degree`."""
-        return count(self.base.inputs + 1, self.degree) - 1
+        return count_monomials(self.base.inputs + 1, self.degree) - 1
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw Sym^degree(H)."""

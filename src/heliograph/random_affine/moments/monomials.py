@@ -43,17 +43,17 @@ def position(variables: int, degree: int) -> dict[Exponents, int]:
     return {powers: i for i, powers in enumerate(exponents(variables, degree))}
 
 
-def count(variables: int, degree: int) -> int:
-    """Number of monomials of total degree `degree`: C(variables + degree - 1, degree)."""
+def count_monomials(variables: int, degree: int) -> int:
+    """Count the monomials of total degree `degree`: C(variables + degree - 1, degree)."""
     return comb(variables + degree - 1, degree)
 
 
 @cache_arrays
-def factors(variables: int, degree: int) -> np.ndarray:
-    """Variables that each monomial of `exponents` multiplies, in order: (count, degree)."""
+def factor_variables(variables: int, degree: int) -> np.ndarray:
+    """List the variables that each monomial of `exponents` multiplies, in order: (count, degree)."""
     choices = combinations_with_replacement(range(variables), degree)
     flat = np.fromiter((variable for choice in choices for variable in choice), np.int64)
-    return flat.reshape(count(variables, degree), degree)
+    return flat.reshape(count_monomials(variables, degree), degree)
 
 
 def place(chosen: np.ndarray, variables: int) -> np.ndarray:
@@ -66,7 +66,9 @@ def place(chosen: np.ndarray, variables: int) -> np.ndarray:
     rank = np.zeros(chosen.shape[:-1], dtype=np.int64)
     for t in range(chosen.shape[-1]):
         rest = chosen.shape[-1] - t
-        starting = np.array([count(n, rest) for n in range(variables + 1)])  # of `rest` variables among the last n
+        starting = np.array(
+            [count_monomials(n, rest) for n in range(variables + 1)]
+        )  # of `rest` variables among the last n
         rank += starting[variables - before[..., t]] - starting[variables - before[..., t + 1]]
     return rank
 
@@ -94,7 +96,7 @@ def monomials(y: Numbers, degree: int) -> Numbers:
 def _raise_table(variables: int, degree: int) -> np.ndarray:
     """Entry (i, c): position at degree - 1 of monomial i divided by variable c; one past the end if it has no c."""
     lower = position(variables, degree - 1)
-    table = np.full((count(variables, degree), variables), len(lower), dtype=np.int64)
+    table = np.full((count_monomials(variables, degree), variables), len(lower), dtype=np.int64)
     for i, powers in enumerate(exponents(variables, degree)):
         for c, power in enumerate(powers):
             if power:
@@ -119,7 +121,7 @@ def symmetric_power(h: Numbers, degree: int) -> Numbers:
     Shapes: (m + 1, p + 1) -> (C(m + k, k), C(p + k, k)).
     """
     outputs, inputs = h.shape
-    refuse_if_too_large(count(outputs, degree), count(inputs, degree), f"moments of order {degree}")
+    refuse_if_too_large(count_monomials(outputs, degree), count_monomials(inputs, degree), f"moments of order {degree}")
     power = h
     for k in range(2, degree + 1):
         divisor, parent = _last_factor(outputs, k)
@@ -140,16 +142,16 @@ def _append_zero_column(a: Numbers) -> Numbers:
 @cache_arrays
 def product_table(variables: int, first: int, second: int) -> np.ndarray:
     """Entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
-    a, b = factors(variables, first), factors(variables, second)
+    a, b = factor_variables(variables, first), factor_variables(variables, second)
     shape = len(a), len(b)
     both = [np.broadcast_to(a[:, None], (*shape, first)), np.broadcast_to(b, (*shape, second))]
     return place(np.concatenate(both, axis=-1), variables)
 
 
-def multiply(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
-    """Product of two homogeneous polynomials given by coefficients."""
+def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
+    """Multiply two homogeneous polynomials given by coefficients."""
     terms = a[:, None] * b
-    return scatter((count(variables, first + second),), product_table(variables, first, second), terms)
+    return scatter((count_monomials(variables, first + second),), product_table(variables, first, second), terms)
 
 
 @cache_arrays
@@ -210,5 +212,5 @@ def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, 
 @cache_arrays
 def times_one(variables: int, low: int, high: int) -> np.ndarray:
     """Positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
-    chosen = factors(variables, low)
+    chosen = factor_variables(variables, low)
     return place(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)

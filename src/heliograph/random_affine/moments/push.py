@@ -16,10 +16,10 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, plain, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, gain_moments, homogeneous
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, affine_matrix, gain_moments
 from heliograph.random_affine.moments.monomials import (
     Exponents,
-    count,
+    count_monomials,
     degrees,
     exponents,
     position,
@@ -34,7 +34,7 @@ Array2 = Float[jax.Array | np.ndarray, "n m"]
 
 
 @singledispatch
-def push(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     """E[mono_order(z)] from E[mono_order(y)], for y independent of the map.
 
     The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
@@ -44,10 +44,10 @@ def push(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     return channel.moments(order).expect(_check_moments(channel, order, moments))
 
 
-@push.register
+@push_moments.register
 def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
     """(A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
-    known = push_known(homogeneous(channel.matrix), order, _check_moments(channel, order, moments))
+    known = push_known(affine_matrix(channel.matrix), order, _check_moments(channel, order, moments))
     scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
     row, column, noise, weight = sum_plan(channel.outputs, order)
     terms = weight * noise_vector(channel.noise, order)[noise] * scaled[column]
@@ -56,14 +56,14 @@ def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
     return np.bincount(row, np.asarray(terms), minlength=len(scaled))
 
 
-@push.register
+@push_moments.register
 def _(channel: Series, order: int, moments: Array1) -> Array1:
-    return reduce(lambda m, affine: push(affine, order, m), channel.maps, moments)
+    return reduce(lambda m, affine: push_moments(affine, order, m), channel.maps, moments)
 
 
-@push.register
+@push_moments.register
 def _(channel: Mixture, order: int, moments: Array1) -> Array1:
-    parts = [push(affine, order, moments) for affine in channel.maps]
+    parts = [push_moments(affine, order, moments) for affine in channel.maps]
     return channel.choice.probabilities @ stack_parts(parts)
 
 
@@ -78,7 +78,7 @@ def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
         return propagated
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
-    second = lifted @ second_moments(moments, inputs, order // 2) @ lifted.T
+    second = lifted @ products_of_monomials(moments, inputs, order // 2) @ lifted.T
     propagated = second.reshape(-1)[_one_place(outputs, order // 2)]
     return propagated
 
@@ -107,17 +107,17 @@ class Tabulated(AbstractNoise):
 
 @noise_vector.register
 def _(noise: Tabulated, order: int) -> Array1:
-    return noise.table[_lower(noise.dimension, order, noise.order)]
+    return noise.table[_positions_of_lower_order(noise.dimension, order, noise.order)]
 
 
 @cache_arrays
-def _lower(dimension: int, order: int, above: int) -> np.ndarray:
+def _positions_of_lower_order(dimension: int, order: int, above: int) -> np.ndarray:
     """Return the positions of monomials of total degree `order` in (n, 1) among those of degree `above`."""
     places = position(dimension + 1, above)
     return np.array([places[(*p[:-1], p[-1] + above - order)] for p in exponents(dimension + 1, order)])
 
 
-def second_moments(moments: Array1, variables: int, degree: int) -> Array2:
+def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array2:
     """E[Y Y'] of the monomials Y of `degree` in (y, 1), gathered from the moments of order 2 degree; last row E[Y'].
 
     Shapes: (C(p + 2 k, 2 k),) -> (C(p + k, k), C(p + k, k)), with variables p + 1.
@@ -127,7 +127,7 @@ def second_moments(moments: Array1, variables: int, degree: int) -> Array2:
 
 def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     check_forgets("channel of a lift", channel)
-    expected = count(channel.inputs + 1, order)
+    expected = count_monomials(channel.inputs + 1, order)
     if np.shape(moments) != (expected,):
         raise fail(f"moments of order {order}", f"shape ({expected},)", f"shape {np.shape(moments)}")
     return moments
@@ -137,6 +137,6 @@ def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -
 def _one_place(variables: int, degree: int) -> np.ndarray:
     """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
     table = product_table(variables, degree, degree).reshape(-1)
-    places = np.zeros(count(variables, 2 * degree), dtype=np.int64)
+    places = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)
     places[table] = np.arange(table.size)
     return places

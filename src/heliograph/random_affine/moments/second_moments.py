@@ -102,8 +102,8 @@ def divide_spread(spread: Tensor) -> tuple[Tensor, Columns]:
     return spread - xp.where(apart, covariance, 0.0)[..., None, None] * corner, padded
 
 
-def undivided(gain: Tensor, noise: Columns) -> Tensor:
-    """Spread of gain and noise together, from what `divide_spread` returns; both may have leading axes."""
+def join_gain_and_noise(gain: Tensor, noise: Columns) -> Tensor:
+    """Join spread of the gain and noise columns to one spread: the inverse of `divide_spread`."""
     xp = library(gain, noise)
     covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
     corner = np.zeros(gain.shape[-2:])
@@ -159,10 +159,10 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """
     check_maps("channel of a filter", [channel])
     check_forgets("channel of a filter", channel)
-    return describe_second_moments(*_bounds(channel), uncertain=count_corners(channel) != 1)
+    return describe_second_moments(*_bound_moments(channel), uncertain=count_corners(channel) != 1)
 
 
-class Bounds(NamedTuple):
+class MomentBounds(NamedTuple):
     """Nominal mean of (G, n), bounds of spread, shift and power, and the nominal spread."""
 
     mean: Matrix
@@ -172,25 +172,27 @@ class Bounds(NamedTuple):
     nominal: QuadraticMap
 
 
-def _bounds(channel: AbstractRandomAffine) -> Bounds:
+def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
+    """Nominal mean of (G, n), and maps W -> matrix that dominate spread, shift and power under every possible law."""
     corners = count_corners(channel)
     listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
+    # A sum of maps: of known laws its spread is the sum of theirs; else bounded part by part.
     if isinstance(channel, Superposed) and corners == 1:
         mean, tensor = _mean_and_spread(channel)
-        own = _certain(tensor)
-        of_mean = _certain(drop_constant(symmetric_product(mean, mean)))
-        return Bounds(mean, own, _scale(own, 0.0), _plus(_signal(own), of_mean), own)
+        own = _map_of_known_law(tensor)
+        of_mean = _map_of_known_law(drop_constant(symmetric_product(mean, mean)))
+        return MomentBounds(mean, own, _scale_map(own, 0.0), _add_maps(_signal(own), of_mean), own)
     if isinstance(channel, Superposed) and not listed:
-        return _bound_sum(channel, [_bounds(affine) for affine in channel.maps])
+        return _bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
     # Known law: the moments themselves.
     if corners == 1:
-        spread, shift, power = (_certain(tensor) for tensor in _tensors(nominal, mean))
-        return Bounds(mean, spread, shift, power, spread)
+        spread, shift, power = (_map_of_known_law(tensor) for tensor in _tensors(nominal, mean))
+        return MomentBounds(mean, spread, shift, power, spread)
     # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
     if isinstance(channel, Stack):
-        parts = _bound_stack(channel)
+        parts = _bound_stacked_maps(channel)
     elif listed:
         laws = (
             Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
@@ -200,17 +202,18 @@ def _bounds(channel: AbstractRandomAffine) -> Bounds:
     else:
         parts = _bound_from_intervals(channel, nominal, mean)
     spread, shift, power = parts
-    return Bounds(mean, spread, shift, power, nominal_spread(channel))
+    return MomentBounds(mean, spread, shift, power, nominal_spread(channel))
 
 
-def _certain(tensor: Tensor) -> QuadraticMap:
+def _map_of_known_law(tensor: Tensor) -> QuadraticMap:
+    """Map W -> T:W of a law that is known, without an uncertain part."""
     return QuadraticMap(tensor, np.zeros(tensor.shape))
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
     """Cov(z | y) under the nominal law."""
     nominal = channel.moments(2)
-    return _certain(_tensors(nominal, nominal.mean[:-1])[0])
+    return _map_of_known_law(_tensors(nominal, nominal.mean[:-1])[0])
 
 
 def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
@@ -250,8 +253,8 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     # Largest noise matrix: N_max - N_v >= 0 for all v, judged of correlations.
     largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
     unit = xp.sqrt(xp.diagonal(largest))
-    unit = _still(xp.where(unit > 0, unit, 1.0))
-    gaps = xp.linalg.eigvalsh(_still(largest - noises) / (unit[:, None] * unit))
+    unit = _stop_gradient(xp.where(unit > 0, unit, 1.0))
+    gaps = xp.linalg.eigvalsh(_stop_gradient(largest - noises) / (unit[:, None] * unit))
     holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * scale)
     holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
     corner = np.zeros((mean.shape[1], mean.shape[1]))
@@ -262,12 +265,12 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
 
 
-def _still(value: Matrix) -> Matrix:
+def _stop_gradient(value: Matrix) -> Matrix:
     """Stop the gradient of a number on which a decision depends."""
     return jax.lax.stop_gradient(value) if is_traced(value) else value
 
 
-def _bound_stack(channel: Stack) -> list[QuadraticMap]:
+def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     """Diagonal blocks from each part; off the diagonal, independent parts meet through their means only.
 
     E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D| at most the reach of each mean.
@@ -308,12 +311,12 @@ def _mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
         return mean, raw - symmetric_product(mean, mean)
     means, spreads = zip(*(_mean_and_spread(affine) for affine in channel.maps), strict=True)
     whole, size = channel.in_places(dict(enumerate(means)), 1), channel.inputs + 1
-    noise = channel.noise.covariance[..., None, None] * _corner(size)
+    noise = channel.noise.covariance[..., None, None] * _constant_power(size)
     spread: Tensor = channel.in_places(dict(enumerate(spreads)), 2) + noise
     return whole + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
 
-def _bound_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
+def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
     """Spreads of independent maps add up, and their means meet in every pair.
 
     With D_i the shift of a mean, (sum D_i) Y (sum D_i)' <= sum_i D_i Y D_i' / w_i for weights w of sum 1, which are as
@@ -322,22 +325,22 @@ def _bound_sum(channel: Superposed, parts: Sequence[Bounds]) -> Bounds:
     every = range(len(parts))
     mean = channel.in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
-    noise = _certain(channel.noise.covariance[..., None, None] * _corner(channel.inputs + 1))
-    of_mean = _certain(drop_constant(symmetric_product(mean, mean)))
-    own = _plus(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
+    noise = _map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
+    of_mean = _map_of_known_law(drop_constant(symmetric_product(mean, mean)))
+    own = _add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
     sizes = [_size(bounds.shift) for bounds in parts]
     total = sum(sizes)
     if is_zero(total):
-        return Bounds(mean, own, _scale(noise, 0.0), _plus(_signal(own), of_mean), own)
+        return MomentBounds(mean, own, _scale_map(noise, 0.0), _add_maps(_signal(own), of_mean), own)
     inverse = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
     shift = _sum_maps(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
     cross = _sum_maps(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
     # Power of the mean, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
     sure = _size(of_mean)
     ratio = total / library(sure).where(sure > 0, sure, 1.0)
-    power = _plus(_signal(own), _scale(of_mean, 1 + ratio), _scale(_signal(shift), 1 + 1 / ratio))
-    nominal = _plus(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
-    return Bounds(mean, _plus(own, cross), shift, power, nominal)
+    power = _add_maps(_signal(own), _scale_map(of_mean, 1 + ratio), _scale_map(_signal(shift), 1 + 1 / ratio))
+    nominal = _add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
+    return MomentBounds(mean, _add_maps(own, cross), shift, power, nominal)
 
 
 def _signal(bound: QuadraticMap) -> QuadraticMap:
@@ -346,27 +349,29 @@ def _signal(bound: QuadraticMap) -> QuadraticMap:
 
 def _size(shift: QuadraticMap) -> Any:
     """Root of the power that the map gives of unit signals; it weighs bounds, and has no derivative."""
-    tensor = _still(shift.center + shift.radius)
+    tensor = _stop_gradient(shift.center + shift.radius)
     return library(tensor).sqrt(library(tensor).einsum("iiaa->", tensor))
 
 
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
     """Weighted sum of the maps of parts, each at the places of what its part takes."""
-    parts = {i: _scale(part, weight) for i, (part, weight) in weighted.items()}
+    parts = {i: _scale_map(part, weight) for i, (part, weight) in weighted.items()}
     center = channel.in_places({i: part.center for i, part in parts.items()}, 2)
     return QuadraticMap(center, channel.in_places({i: part.radius for i, part in parts.items()}, 2))
 
 
-def _plus(*maps: QuadraticMap) -> QuadraticMap:
+def _add_maps(*maps: QuadraticMap) -> QuadraticMap:
+    """Add maps of second moments."""
     return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
 
 
-def _scale(part: QuadraticMap, factor: Any) -> QuadraticMap:
+def _scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
+    """Multiply a map of second moments by a number."""
     return QuadraticMap(factor * part.center, factor * part.radius)
 
 
-def _corner(size: int) -> np.ndarray:
-    """Matrix of zeros, but 1 as its last entry."""
+def _constant_power(size: int) -> np.ndarray:
+    """Matrix of zeros, but 1 as its last entry: W of the constant 1 alone."""
     return np.outer(np.eye(size)[-1], np.eye(size)[-1])
 
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import LinearStep
-from heliograph.fusion.cross_covariance import ErrorSources, Factors, initial_factors
+from heliograph.fusion.cross_covariance import ErrorSources, SourceFactors, initial_factors
 from heliograph.fusion.informed import MatrixWeights
+from heliograph.fusion.joint_covariance_weights import matrix_weights, solve_factored_weights
 from heliograph.fusion.rules import Fusion
-from heliograph.fusion.weights import matrix_weights, solve_factored_weights
 from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
@@ -137,7 +137,7 @@ def cross_covariances(
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _plan_filters(alone, horizon, inputs)
     with jax.enable_x64(True):
-        factors: Factors = to_numpy(_factors(filters, u))
+        factors: SourceFactors = to_numpy(_factors(filters, u))
     parts = factors.mean[0], factors.state, factors.mean[1:], *factors.errors
     return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
 
@@ -175,7 +175,7 @@ def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> t
 
 
 @quickly_compiled
-def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
+def _factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
     (centre,) = filters.informed
 
     separate, _, _, known, *_ = filters.init()

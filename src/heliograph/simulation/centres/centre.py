@@ -13,20 +13,26 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import Linearised, LinearStep, linear_step
-from heliograph.fusion.all_reports import ReportsBelief, begin, estimate_state, propagate_errors, receive_reports
+from heliograph.fusion.all_reports import (
+    ReportsBelief,
+    correct_with_reports,
+    estimate_state,
+    initial_belief,
+    propagate_errors,
+)
 from heliograph.fusion.cross_covariance import (
-    Errors,
+    ErrorMoments,
     ErrorStep,
-    Factors,
     Motion,
     Observation,
-    advance,
-    advance_factors,
+    SourceFactors,
     error_step,
     initial_errors,
+    propagate_errors_jointly,
+    propagate_factors,
     propagate_state,
 )
-from heliograph.fusion.informed import AbstractInformedFusion, Happened
+from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
@@ -114,7 +120,7 @@ class Together(Module):
 class CentreState(NamedTuple):
     """Moments of the errors, and the states of the rules, by name."""
 
-    errors: Errors
+    errors: ErrorMoments
     rules: dict[str, PyTree]
 
 
@@ -141,10 +147,10 @@ class Centre(Module):
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
-    def moved(self, errors: Errors, filters: LinearStep, u: jax.Array, k: jax.Array) -> Happened:
+    def moved(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
         """Propagate the errors of filters with these matrices over step k, in the order of the nodes."""
         step = self.error_step(errors.state_mean, errors.state_covariance, filters, u, k)
-        return Happened(step, advance(errors, step))
+        return CentreStep(step, propagate_errors_jointly(errors, step))
 
     def error_step(
         self, mean: jax.Array, covariance: jax.Array, filters: LinearStep, u: jax.Array, k: jax.Array
@@ -157,25 +163,25 @@ class Centre(Module):
 
     def factors(
         self,
-        start: tuple[PyTree, Factors],
+        start: tuple[PyTree, SourceFactors],
         matrices: Callable[..., LinearStep],
         follow: Callable[..., PyTree],
         u: Array,
-    ) -> Factors:
+    ) -> SourceFactors:
         """Propagate the errors by their sources over all steps, from the filters' states and the factors before them.
 
         `matrices(states, u, k)` and `follow(states, u, k)` are those of the filters' step k, and their next states.
         """
 
         def body(
-            carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]
-        ) -> tuple[tuple[PyTree, Factors], None]:
+            carry: tuple[PyTree, SourceFactors], row: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[PyTree, SourceFactors], None]:
             (states, factors), (k, u_k) = carry, row
             spread = jnp.asarray(factors.state @ factors.state.T)
             step = self.error_step(factors.mean[0], spread, matrices(states, u_k, k), u_k, k)
-            return (follow(states, u_k, k), advance_factors(factors, step, k)), None
+            return (follow(states, u_k, k), propagate_factors(factors, step, k)), None
 
-        factors: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+        factors: SourceFactors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
         return factors
 
     def gathered(self, parts: Sequence[LinearStep]) -> LinearStep:
@@ -191,7 +197,7 @@ class Centre(Module):
         reports = jnp.concatenate(means)[self.order]
         after, results = {}, {}
         for name, rule in self.rules.items():
-            after[name], (mean, covariance) = rule.use(state.rules[name], happened, reports)
+            after[name], (mean, covariance) = rule.fuse_step(state.rules[name], happened, reports)
             results[name] = Estimate(mean, covariance, self.claim)
         return CentreState(happened.errors, after), results
 
@@ -321,7 +327,7 @@ class CentreBelief(NamedTuple):
     """States of the nodes' filters, of which only covariances matter; moments of their errors; the estimate."""
 
     nodes: PyTree
-    errors: Errors
+    errors: ErrorMoments
     known: ReportsBelief
 
 
@@ -345,7 +351,7 @@ class CentreFilter(AbstractSizedFilter):
         """Return the state before any report."""
         states, _, _, known, *_ = self.filters.init()
         errors = known[0].errors
-        return CentreBelief(states, errors, begin(errors, self.ages - 1, self.widest, self.quantized))
+        return CentreBelief(states, errors, initial_belief(errors, self.ages - 1, self.widest, self.quantized))
 
     @predicts
     def predict(self, state: CentreBelief, u: ArrayLike = (), k: Step = 0) -> CentreBelief:
@@ -361,7 +367,7 @@ class CentreFilter(AbstractSizedFilter):
         """Correct with the reports that arrived."""
         nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
         everything = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
-        known, expected = receive_reports(state.known, everything.reshape(self.ages, nodes, self.widest))
+        known, expected = correct_with_reports(state.known, everything.reshape(self.ages, nodes, self.widest))
         mean, covariance = expected.mean[rows], expected.covariance[rows][:, rows]
         return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
 

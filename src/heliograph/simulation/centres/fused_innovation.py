@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, given
+from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.gaussian.adaptive import AdaptiveBelief
 from heliograph.filters.linear.belief import LinearBelief
 from heliograph.filters.plausibility import innovation_distance
@@ -101,7 +101,7 @@ def _gaussian(state: PyTree) -> Gaussian:
 
 def following_prior(estimate: Estimate) -> Gaussian:
     """Return the fused estimate as what the next step is predicted from."""
-    return given(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
+    return from_covariance(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
 
 
 def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
@@ -115,7 +115,7 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
     if network.common is not None or network.relays is not None or network.shared:
         return tests
     places, plant = network.places, at(network.plant, 0)
-    start = in_float64(given)(np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance))
+    start = in_float64(from_covariance)(np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance))
     start = jax.tree.map(np.asarray, start)  # on no device: no program
     claims = network.claims()
     for name, fusion in network.fused.items():

@@ -10,8 +10,15 @@ import numpy as np
 
 from heliograph.filters.linear.plan import Linearised, linearise_step
 from heliograph.fusion.all_reports import AllReports, ReportsBelief
-from heliograph.fusion.cross_covariance import ErrorMap, Errors, ErrorStep, Motion, advance, initial_errors
-from heliograph.fusion.informed import AbstractInformedFusion, Happened
+from heliograph.fusion.cross_covariance import (
+    ErrorMap,
+    ErrorMoments,
+    ErrorStep,
+    Motion,
+    initial_errors,
+    propagate_errors_jointly,
+)
+from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
@@ -23,7 +30,7 @@ from heliograph.simulation.centres.centre import gathered
 class Followed(NamedTuple):
     """State of one fusion: moments of the errors, its last estimate, and its rule's state."""
 
-    errors: Errors
+    errors: ErrorMoments
     known: jax.Array
     rule: PyTree
 
@@ -75,11 +82,11 @@ class LinearisedCentre(Module):
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors; the rule weights the reports by them.
             step = _make_shared_step(motion, keep, linear)
-            errors = _keep_plant_moments(before.errors, advance(before.errors, step))
+            errors = _keep_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
             if isinstance(rule, AllReports):
                 drift = _drift(before.rule, matrix, moved, keep, linear)
                 step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
-            known, (mean, covariance) = rule.use(before.rule, Happened(step, errors), reports)
+            known, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
             following[name], results[name] = Followed(errors, mean, known), Estimate(mean, covariance, self.claim)
         return following, results
 
@@ -97,12 +104,12 @@ def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> Er
     )
 
 
-def _keep_plant_moments(before: Errors, after: Errors) -> Errors:
+def _keep_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
     """Moments of the errors `after` a step and those of the plant `before` it, which nobody knows along estimates."""
     n = before.mean.shape[1]
     of_errors = np.arange(len(before.covariance)) >= n
     covariance = jnp.where(np.outer(of_errors, of_errors), after.covariance, before.covariance)
-    return Errors(jnp.concatenate([before.mean[:1], after.bias]), covariance)
+    return ErrorMoments(jnp.concatenate([before.mean[:1], after.bias]), covariance)
 
 
 def _drift(state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:

@@ -10,11 +10,18 @@ import numpy as np
 
 from heliograph.engine.limits import MESH_NUMBERS, MESH_ROWS
 from heliograph.fusion.cross_covariance import Motion, Observation, propagate_state
-from heliograph.fusion.intersection import inverse
-from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of
+from heliograph.fusion.intersection import invert
+from heliograph.fusion.mesh.gains import (
+    NeighbourEstimates,
+    NeighbourWeights,
+    NodeGains,
+    NodeStep,
+    gains_of,
+    information_of,
+)
 from heliograph.fusion.mesh.graph import graph_of
-from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
-from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
+from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
@@ -71,10 +78,10 @@ class MeshStep(NamedTuple):
 
     motion: Motion
     plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
-    exchanges: tuple[Weights, ...]
+    exchanges: tuple[NeighbourWeights, ...]
     data: Data
     information: Float[jax.Array, "node n n"]
-    gains: Gains
+    gains: NodeGains
 
 
 class Rows(Module):
@@ -183,7 +190,7 @@ class Mesh(Module):
         now = mean[self.senders]
         if state.sent is None or self.alpha is None:
             return now
-        information = jax.vmap(inverse)(state.covariance)[self.senders]
+        information = jax.vmap(invert)(state.covariance)[self.senders]
         moved = test_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 
@@ -245,14 +252,16 @@ class Mesh(Module):
         senders: Array | None = None,
     ) -> PyTree:
         """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
-        information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
+        information, traces = jax.vmap(invert)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
         over_rows = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
         by_bucket = []
         for bucket, bucket_ahead in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
             rows, width = bucket.rows, bucket.width
             theirs = (self.senders if senders is None else senders)[rows, :width]
             block = None if blocks is None else blocks[rows, :width, :, :width]
-            seen = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
+            seen = NeighbourEstimates(
+                covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width]
+            )
             if self.alpha is not None:  # what was sent last errs by more than the estimate
                 wider = jnp.where(np.arange(width) > 0, (1 + jnp.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
                 seen = seen._replace(traces=seen.traces * wider, information=seen.information / wider[:, None, None])
@@ -284,18 +293,22 @@ class Mesh(Module):
     def gains(
         self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array, motion: Motion,
         information: jax.Array, complete: jax.Array, ahead: Ahead = (), senders: Array | None = None,
-    ) -> Gains:  # fmt: skip
+    ) -> NodeGains:  # fmt: skip
         """Gains of all nodes."""
 
         def single(
-            rule: AbstractFusion, belief: Believed, arrived: jax.Array, every: jax.Array, known: Sequence[jax.Array]
-        ) -> Gains:
-            step = Step(motion.matrix, motion.noise, arrived, every)
+            rule: AbstractFusion,
+            belief: NeighbourEstimates,
+            arrived: jax.Array,
+            every: jax.Array,
+            known: Sequence[jax.Array],
+        ) -> NodeGains:
+            step = NodeStep(motion.matrix, motion.noise, arrived, every)
             if known:
-                return gains_of(Weights(jnp.eye(len(motion.shift)), *known), step)
+                return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), *known), step)
             return rule.neighbour_gains(belief, step)
 
-        gains: Gains = self._map_nodes(single, covariance, blocks, present, information, complete,
+        gains: NodeGains = self._map_nodes(single, covariance, blocks, present, information, complete,
                                          ahead=ahead, senders=senders)  # fmt: skip
         return gains
 
@@ -310,9 +323,9 @@ class Mesh(Module):
     ) -> Float[jax.Array, "node n node n"]:
         """Joint covariance after a step."""
         gains, motion, size = parts.gains, parts.motion, joint.shape[0] * joint.shape[1]
-        measured = used(gains.gain, present)
-        m, ws, w = (spread(jnp.asarray(blocks), self.senders, self.edges.present) for blocks in (
-            transitions(gains, motion.matrix), measured @ parts.data.information[self.senders], measured))  # fmt: skip
+        measured = measurement_weights(gains.gain, present)
+        blocks = error_transitions(gains, motion.matrix), measured @ parts.data.information[self.senders], measured
+        m, ws, w = (scatter_blocks(jnp.asarray(each), self.senders, self.edges.present) for each in blocks)
         after = joint_after(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
         return jnp.asarray(after).reshape(joint.shape)
 
@@ -323,7 +336,7 @@ class Mesh(Module):
         )
 
 
-def _weights(rule: AbstractFusion, belief: Believed, *_: PyTree) -> Weights:
+def _weights(rule: AbstractFusion, belief: NeighbourEstimates, *_: PyTree) -> NeighbourWeights:
     """Weights of an exchange that only intersects, with the covariance after it."""
     return rule.neighbour_weights(belief)
 

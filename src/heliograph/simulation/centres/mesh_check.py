@@ -7,11 +7,11 @@ import numpy as np
 import scipy
 
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
-from heliograph.fusion.mesh.joint import spread
-from heliograph.fusion.mesh.rules import DiffusionWeights, FrozenWeights
+from heliograph.fusion.mesh.joint import scatter_blocks
+from heliograph.fusion.mesh.neighbour_rules import DiffusionWeights, FrozenWeights
 from heliograph.fusion.quantizer import UniformQuantizer
 from heliograph.fusion.rules import Fusion
-from heliograph.linear.jump_system import propagate
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
@@ -315,7 +315,7 @@ def _growth(
     # Mean over what gets lost, and its variance.
     mean = arrives[:, :, None, None] * pulled
     mean[:, 0] = alone + (arrives[:, :, None, None] * pushed)[:, 1:].sum(axis=1)
-    m = spread(mean, graph.senders, graph.present)
+    m = scatter_blocks(mean, graph.senders, graph.present)
     variance = (arrives * (1 - arrives))[:, :, None, None]
     # Second moments without noise, in units of their size before a step.
     joint, logarithms, places, senders = np.eye(nodes * n), [], np.arange(nodes), graph.senders
@@ -325,8 +325,8 @@ def _growth(
         cross = blocks[places[:, None], :, senders, :]
         top = np.concatenate([np.broadcast_to(blocks[places, :, places, :][:, None], cross.shape), cross], axis=3)
         below = np.concatenate([cross.swapaxes(2, 3), blocks[senders, :, senders, :]], axis=3)
-        more = propagate(both, np.concatenate([top, below], axis=2), 0.0)
-        joint = np.asarray(propagate(m, joint, 0.0))
+        more = propagate_by_mode(both, np.concatenate([top, below], axis=2), 0.0)
+        joint = np.asarray(propagate_by_mode(m, joint, 0.0))
         joint.reshape(nodes, n, nodes, n)[places, :, places, :] += (variance * more).sum(axis=1)
         # Their size, of which the next step is a multiple.
         logarithms.append(np.log(np.trace(joint)))

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
-from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
+from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
-from heliograph.linear.jump_system import propagate
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, instance, is_whole
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
@@ -164,15 +164,15 @@ def _propagate_joint(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np
     for number, weights in enumerate(parts.exchanges):
         held = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
         held[:, 0] = np.eye(held.shape[-1]) - held[:, 1:].sum(axis=1)
-        joint = np.asarray(propagate(spread(held, senders, present), joint, 0.0))
-    m = spread(transitions(gains, parts.motion.matrix), senders, present)
+        joint = np.asarray(propagate_by_mode(scatter_blocks(held, senders, present), joint, 0.0))
+    m = scatter_blocks(error_transitions(gains, parts.motion.matrix), senders, present)
     # Measurements of neighbours, or of all whose measurement a node has after all rounds.
     there = arrived[:, 0] & present
     if mesh.edges.rounds > 1:
         there = np.asarray(mesh.known(arrived))
         senders = np.broadcast_to(np.arange(len(there)), there.shape)
-    measured = used(gains.gain, there)
-    ws, w = (spread(x, senders, there) for x in (measured @ parts.data.information[senders], measured))
+    measured = measurement_weights(gains.gain, there)
+    ws, w = (scatter_blocks(x, senders, there) for x in (measured @ parts.data.information[senders], measured))
     return np.asarray(joint_after(joint, m, gains.innovation, parts.motion.noise, ws, w))
 
 
@@ -219,7 +219,7 @@ def best_possible(
     covariance = np.array(start.covariance)
     for model, total in zip(steps, reversed(information), strict=True):
         a = np.asarray(model.motion.matrix)
-        covariance = add_information(propagate(a, covariance, model.motion.noise), total)
+        covariance = add_information(propagate_by_mode(a, covariance, model.motion.noise), total)
     return covariance
 
 

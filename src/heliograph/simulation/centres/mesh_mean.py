@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.mesh.gains import Gains
+from heliograph.fusion.mesh.gains import NodeGains
 from heliograph.fusion.mesh.graph import graph_of
-from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
-from heliograph.fusion.mesh.rules import FrozenWeights
-from heliograph.linear.jump_system import propagate
+from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
+from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
+from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.channel import Channel
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
@@ -103,7 +103,7 @@ def mean_mesh_errors(
 
 
 @quickly_compiled
-def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: MeshStep) -> Gains:
+def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: MeshStep) -> NodeGains:
     information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]
     held = jnp.asarray(blocks)[patterns.node]
@@ -112,7 +112,7 @@ def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Pat
 
 
 def _mean(
-    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: Gains, step: MeshStep
+    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: NodeGains, step: MeshStep
 ) -> np.ndarray:
     """Joint covariance (N, N) after a step."""
     count, degree = mesh.senders.shape
@@ -123,17 +123,17 @@ def _mean(
         return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
 
     # Gains of every pattern, M_i with the node itself first.
-    m, f = np.asarray(transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
-    w = np.asarray(used(gains.gain, patterns.present))
+    m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
+    w = np.asarray(measurement_weights(gains.gain, patterns.present))
     # Different receivers: products of means.
     held = mean(w)
-    everywhere = [spread(x, mesh.senders, mesh.edges.present) for x in (mean(m), held @ s[mesh.senders], held)]
+    everywhere = [scatter_blocks(x, mesh.senders, mesh.edges.present) for x in (mean(m), held @ s[mesh.senders], held)]
     after = joint_after(joint, everywhere[0], mean(f), q, *everywhere[1:])
     # One receiver: the mean over its patterns.
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
     noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
-    same = mean(propagate(flat, inside, propagate(f, q, noise)))
+    same = mean(propagate_by_mode(flat, inside, propagate_by_mode(f, q, noise)))
     whole = after.reshape(count, n, count, n)
     items = np.arange(count)
     whole[items, :, items, :] = same

@@ -20,7 +20,7 @@ from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import DOUBLE
 from heliograph.numerics.types import Float
-from heliograph.random_affine.modes import forgetful
+from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
@@ -158,7 +158,7 @@ def _unheard(network: Network) -> Iterator[Doubt]:
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not isinstance(channel := first(node.channel), Superposed):
             continue
-        links = [np.asarray(forgetful(link).moments(1).mean)[:-1, :-1] for link in channel.maps]
+        links = [np.asarray(redraw_modes_each_step(link).moments(1).mean)[:-1, :-1] for link in channel.maps]
         matrix = matrix_of(first(node.sensor)) if not channel.past else None
         sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)
         heard = [mean @ sensed[list(at)] for mean, at in zip(links, channel.places, strict=True)]

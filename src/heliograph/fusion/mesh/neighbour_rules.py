@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.engine.choice import chosen
 from heliograph.fusion.intersection import intersection_weights, trace_shares
-from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, correct
+from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, correct
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
@@ -47,28 +47,31 @@ class TraceIntersection(AbstractIntersection):
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
         """Shares of all of several estimates."""
         traces, all_there = jnp.trace(covariances, axis1=1, axis2=2), jnp.ones(len(covariances), dtype=bool)
-        believed = Believed(covariances[0], traces, information, None, all_there)
+        believed = NeighbourEstimates(covariances[0], traces, information, None, all_there)
         return trace_shares(believed, self.power, self.improvements)[0]
 
-    def neighbour_weights(self, believed: Believed) -> Weights:
+    def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Intersect what arrived."""
         return intersection_weights(believed, trace_shares(believed, self.power, self.improvements))
 
 
-class _OfNeighbours(AbstractFusion):
+class _NeighbourRule(AbstractFusion):
+    """Rule that fuses estimates of neighbours only, not at a fusion centre."""
+
     def claim(self, claims: list[Claim]) -> Claim:
         """Refused: a fusion centre has no neighbours."""
-        raise self._alone()
+        raise self._refuse_without_neighbours()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Refused likewise."""
-        raise self._alone()
+        raise self._refuse_without_neighbours()
 
-    def _alone(self) -> InputError:
+    def _refuse_without_neighbours(self) -> InputError:
+        """Make the ValueError of such a rule at a fusion centre."""
         return fail(f"fusion by {type(self).__name__}", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
 
 
-class DiffusionWeights(_OfNeighbours):
+class DiffusionWeights(_NeighbourRule):
     """Fixed shares c_ij of the neighbours' estimates: diffusion, whose gains do not depend on what arrives.
 
     xhat_i+ = A xhat_i + sum_j c_ij F_i A (xhat_j - xhat_i) + sum_j K_ij (z_j - H_j A xhat_i) over what arrived, with
@@ -117,7 +120,7 @@ class DiffusionWeights(_OfNeighbours):
         )
         return placed
 
-    def neighbour_gains(self, believed: Believed, step: Step) -> Gains:
+    def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
         """Gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
         a = jnp.asarray(step.matrix)
         predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
@@ -126,10 +129,10 @@ class DiffusionWeights(_OfNeighbours):
         shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
         # What arrived alone corrects.
         used = jnp.eye(len(a)) - corrected @ step.arrived
-        return Gains(innovation @ a, shares[:, None] * jnp.ones(len(a)), corrected, used, corrected)
+        return NodeGains(innovation @ a, shares[:, None] * jnp.ones(len(a)), corrected, used, corrected)
 
 
-class FrozenWeights(_OfNeighbours):
+class FrozenWeights(_NeighbourRule):
     """Best weights for joint covariances of each neighbourhood that do not move: means over losses in the steady state.
 
     `freeze` makes it. Weights are solved for what arrived at each step, from these blocks alone.
@@ -153,7 +156,7 @@ class FrozenWeights(_OfNeighbours):
         blocks = np.asarray(self.blocks)[graph.senders[:, 0], :width, :, :width]
         return FrozenWeights(self.rule, np.ascontiguousarray(np.moveaxis(blocks, 0, -1)))
 
-    def neighbour_weights(self, believed: Believed) -> Weights:
+    def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Weights of what arrived, and the covariance that the blocks give them."""
         return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
 
@@ -173,7 +176,7 @@ def _weights_of_row(
 ) -> tuple[jax.Array, jax.Array]:
     """Parts and covariances (step, ...) of one node's weights."""
     degree, n = joint.shape[:2]
-    nothing = Believed(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
+    nothing = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
 
     def body(_: None, present: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
         weights = rule.neighbour_weights(nothing._replace(present=present))

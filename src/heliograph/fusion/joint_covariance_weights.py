@@ -1,4 +1,4 @@
-"""Weights of estimates: best unbiased ones for a joint covariance, of all or of those that arrived; by levels."""
+"""Best unbiased weights of estimates for a joint covariance of their errors, of all or of those that arrived."""
 
 from collections.abc import Callable
 from functools import partial, wraps
@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.fusion.intersection import inverse
-from heliograph.numerics.check import array, fail, probabilities, show_value
+from heliograph.fusion.intersection import invert
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import WRITTEN, psd_solve, rounding, symmetric, symmetrize
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.numerics.types import Array, Bool, Float
 
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
 RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have besides
@@ -133,99 +133,10 @@ def weigh_covariance(
     return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))
 
 
-def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
-    """Weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
-
-    By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
-    linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
-
-    Args:
-        levels: gamma_i of the nodes (N,), positive.
-
-    Raises:
-        ValueError: levels that are not positive.
-
-    Source: H-infinity quantized fusion over amplify-and-forward relays, Theorem 4, in closed form.
-    """
-    gamma = _levels(levels)
-    inverse = (gamma.min() / gamma) ** 2  # relative to the smallest level: at most 1, so that nothing overflows
-    return np.asarray(inverse / inverse.sum())
-
-
-def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"]) -> float:
-    """sum_i c_i gamma_i: the level of a weighted fusion without quantization, for disturbances of equal norm.
-
-    The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
-    the gamma_i, `weights` (N,) the c_i.
-
-    Args:
-        levels: gamma_i of the nodes (N,), positive.
-        weights: c_i (N,), not negative, of sum 1.
-
-    Raises:
-        ValueError: levels that are not positive, weights off the simplex or not as many.
-
-    Source: Minkowski's inequality, in place of H-infinity quantized fusion, equation (34).
-    """
-    gamma, c = _levels_and_weights(levels, weights)
-    return float(c @ gamma)
-
-
-def fused_error_norm(
-    levels: Float[ArrayLike, " N"],
-    weights: Float[ArrayLike, " N"],
-    disturbances: Float[ArrayLike, " N"],
-    matrix: Float[ArrayLike, "outputs n"],
-    errors: Float[ArrayLike, "N time n"],
-) -> float:
-    """Bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
-
-    sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||), since z - zhat = sum c_i (M e_i - M mu_i) and |mu_i| <= D_i by
-    component; ||D_i|| is the root of the sum over steps and components. NaN where a quantizer saturated: its D is NaN,
-    and nothing is guaranteed.
-
-    Args:
-        levels: gamma_i (N,).
-        weights: c_i (N,), on the simplex.
-        disturbances: norms ||w_i|| (N,).
-        matrix: output matrix M (outputs, n).
-        errors: bounds D_i of the quantizers (N, time, n).
-
-    Raises:
-        ValueError: levels that are not positive, weights off the simplex, negative norms or errors, shapes that do not
-            fit.
-
-    Source: Minkowski's inequality, in place of H-infinity quantized fusion, equations (34) to (37).
-    """
-    # Shapes and signs.
-    gamma, c = _levels_and_weights(levels, weights)
-    norms, m = array("disturbances", disturbances, (len(gamma),)), array("output matrix", matrix, (None, None))
-    d = np.asarray(errors, dtype=np.float64)
-    if d.ndim != 3 or (d.shape[0], d.shape[2]) != (len(gamma), m.shape[1]):
-        raise fail("errors", f"shape ({len(gamma)}, any, {m.shape[1]})", f"shape {d.shape}")
-    if np.any(norms < 0) or np.any(d < 0):
-        raise fail("disturbances and errors", "no negative number", float(min(norms.min(), np.nanmin(d))))
-    # ||M|| ||D_i||.
-    quantization = np.linalg.norm(m, 2) * np.sqrt(np.sum(d**2, axis=(1, 2)))
-    return float(c @ (gamma * norms + quantization))
-
-
-def _levels(levels: ArrayLike) -> Float[np.ndarray, "N"]:
-    checked = np.asarray(array("levels", levels, (None,)))
-    if not len(checked) or np.any(checked <= 0):
-        raise fail("levels", "positive numbers", checked.tolist())
-    return checked
-
-
-def _levels_and_weights(levels: ArrayLike, weights: ArrayLike) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    gamma = _levels(levels)
-    return gamma, probabilities("fusion weights", weights, len(gamma))
-
-
-def solve_arrived_weights(
+def solve_regularised_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Weights C (n, degree, n), sum_j C_j = I, of least C P C' for those that are `present`, zero for the others.
+    """Unbiased weights of least C (P + ridge D) C' for the estimates that arrived; the ridge keeps them bounded.
 
     C = (E' U^-1 E)^-1 E' U^-1, E = [I; ...; I], U = P + RIDGE D, D the mean of the variances: the best weights of
     estimates with a little independent error more. Without it weights of nearly equal estimates, such as those of the
@@ -242,18 +153,18 @@ def solve_arrived_weights(
     ones = (there[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
     # U^-1 E, and what makes the weights sum to I.
     solved = psd_solve(total, ones) if degree * n <= WRITTEN else regular_solve(total, ones)
-    weights = (inverse(ones.T @ solved) @ solved.T).reshape(n, degree, n)
+    weights = (invert(ones.T @ solved) @ solved.T).reshape(n, degree, n)
     return unit[:, None, None] * weights / unit
 
 
-def solve_arrived_weights_by_component(
+def solve_regularised_weights_by_component(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """Diagonal weights of those that are present: the best for each component of the state by itself."""
     degree, n = joint.shape[:2]
     if degree <= WRITTEN:
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
-    return _weigh_components(partial(solve_arrived_weights, present=present), joint)
+    return _weigh_components(partial(solve_regularised_weights, present=present), joint)
 
 
 def component_weights(
@@ -267,7 +178,7 @@ def component_weights(
 def _weights_of_component(
     joint: Float[jax.Array, "degree degree"], there: Float[jax.Array, " degree"]
 ) -> Float[jax.Array, " degree"]:
-    """c = U^-1 1 / 1' U^-1 1 over those that are there, by the factor of U, as `solve_arrived_weights`."""
+    """c = U^-1 1 / 1' U^-1 1 over those that are there, by the factor of U, as `solve_regularised_weights`."""
     mean = jnp.sum(there * jnp.diagonal(joint)) / jnp.sum(there)
     # U, with those that are absent apart.
     apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
@@ -283,8 +194,8 @@ def weigh_covariance_by_component(
     return symmetric(jnp.einsum("ia,iab->ab", weights, sums))
 
 
-def solve_arrived_scalar_weights(
+def solve_regularised_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """One number for each of those that are present, of least trace."""
-    return _weigh_by_trace(partial(solve_arrived_weights, present=present), joint)
+    return _weigh_by_trace(partial(solve_regularised_weights, present=present), joint)

@@ -52,7 +52,7 @@ def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
     spreads = [link.spreads() for link in system.channel]
     count = max(len(s) for s in spreads)
     padded = [np.concatenate([s, np.zeros((count - len(s), *s.shape[1:]))]) for s in spreads]
-    return [_take_step(system, k, padded[k], separate) for k in range(system.steps)]
+    return [_matrices_of_step(system, k, padded[k], separate) for k in range(system.steps)]
 
 
 def all_multipliers(
@@ -66,7 +66,9 @@ def all_multipliers(
     return full
 
 
-def _take_step(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool) -> StepMatrices:
+def _matrices_of_step(
+    system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool
+) -> StepMatrices:
     """Matrices of step k."""
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y = system.channel[k], system.states, system.output.shape[1]
@@ -93,11 +95,11 @@ def _take_step(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads
     parts = [[(f, x, system.growth.state[k]), (df, e, system.growth.error[k])]] if w else []
     parts += [[(g, x, system.output_growth.state[k]), (dg, e, system.output_growth.error[k])]] if h else []
     groups = [[term] for pair in parts for term in pair] if separate else parts
-    growth = np.array([_growth(q, group) for group in groups]).reshape(-1, q)
+    growth = np.array([_growth_form(q, group) for group in groups]).reshape(-1, q)
     return StepMatrices(state, error, received, varied, target, energy, growth, np.zeros((n, system.received)))
 
 
-def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
+def _growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
     """sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta."""
     diagonal = np.zeros(q)
     for value, argument, constant in parts:
@@ -140,24 +142,26 @@ class Layout(NamedTuple):
         """Unpack the vector into matrices."""
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
-        p1, p2 = _symmetric(vector[:triangle], n), _symmetric(vector[triangle : 2 * triangle], n)
+        p1, p2 = _from_lower_triangle(vector[:triangle], n), _from_lower_triangle(vector[triangle : 2 * triangle], n)
         if self.gain is not None:
             product = p2 @ self.gain
             return Unknowns(p1, p2, product, self.gain.T @ product, vector[2 * triangle :])
         rest = vector[2 * triangle :]
         product, spread = rest[: n * m].reshape(n, m), rest[n * m : n * m + m * (m + 1) // 2]
-        return Unknowns(p1, p2, product, _symmetric(spread, m), vector[self.size - self.multipliers :])
+        return Unknowns(p1, p2, product, _from_lower_triangle(spread, m), vector[self.size - self.multipliers :])
 
 
-def _symmetric(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
+def _from_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
+    """Symmetric matrix (n, n) of the entries of its lower triangle."""
     matrix = np.zeros((n, n))
-    rows, columns = _triangle(n)
+    rows, columns = _triangle_places(n)
     matrix[rows, columns] = matrix[columns, rows] = entries
     return matrix
 
 
 @cache
-def _triangle(n: int) -> tuple[Int[np.ndarray, "triangle"], Int[np.ndarray, "triangle"]]:
+def _triangle_places(n: int) -> tuple[Int[np.ndarray, "triangle"], Int[np.ndarray, "triangle"]]:
+    """For each entry of an (n, n) matrix its place among those of the lower triangle."""
     return np.tril_indices(n)
 
 
@@ -248,6 +252,7 @@ class Coordinates(NamedTuple):
 
 
 def _symmetrise(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
+    """(A + A') / 2."""
     return np.asarray((a + a.T) / 2)
 
 
@@ -259,55 +264,57 @@ def scale(
     initial = np.diag(1 / np.diagonal(system.initial_weight))
     # covariances of x_0 and e_0 from the initial weight
     x, e = initial[:n, :n], initial[n:, n:]
-    sizes, received, forms, scaled, target = [_sizes(x, e, plain)], [], [], [], 0.0
+    sizes, received, forms, scaled, target = [_scales_of_errors(x, e, plain)], [], [], [], 0.0
     nominal = steps[0].nominal
     # covariances of (x, e) propagated with the nominal gain, and sizes from these
     for k, step in enumerate(steps):
-        spread = _signals(system, k, step, x, e)
+        spread = _signal_covariance(system, k, step, x, e)
         target = max(target, float(np.trace(step.target @ spread)))
         x, e, measured, best = _propagate(step, spread, None if gains is None else gains[k])
         nominal = best if gains is not None or k == 0 else _steady_gain(nominal, best, measured, e)
-        sizes.append(_sizes(x, e, plain))
-        received.append(_nonzero(np.sqrt(np.diagonal(measured))))
-        unit = _coordinates(system, k, step, sizes[k])
+        sizes.append(_scales_of_errors(x, e, plain))
+        received.append(_powers_of_four_near(np.sqrt(np.diagonal(measured))))
+        unit = _eta_scales(system, k, step, sizes[k])
         form = np.max(np.abs(step.growth) * np.diagonal(unit) ** 2, axis=1, initial=0.0)  # with growth, T is diagonal
         forms.append(np.where(form > 0, form, 1.0))
-        scaled.append(_congruent(step, unit, sizes[k + 1], received[k], forms[k], nominal))
+        scaled.append(_rescale_step(step, unit, sizes[k + 1], received[k], forms[k], nominal))
     if target == 0:
         raise fail("wanted matrix", "one that is not zero", "zero at every step")
     # levels in units of the largest E |M e|^2
-    level = float(_power(np.sqrt(target)))
+    level = float(_nearest_power_of_four(np.sqrt(target)))
     scaled = [s._replace(target=s.target / level**2) for s in scaled]
     return scaled, Coordinates(np.array(sizes), np.array(received), np.array(forms), level, plain)
 
 
-def _power(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Nearest power of 4."""
+def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    """Power of 4 nearest to a size, by which numbers are scaled without rounding."""
     return np.asarray(4.0 ** np.round(np.log(size) / np.log(4.0)))
 
 
-def _sizes(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
+def _scales_of_errors(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
     """Scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
     if plain:
-        return np.asarray(block_diag(_factor(x), _factor(e)))
-    return np.diag(np.concatenate([_nonzero(np.full(len(s), np.sqrt(np.trace(s) / len(s)))) for s in (x, e)]))
+        return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
+    return np.diag(
+        np.concatenate([_powers_of_four_near(np.full(len(s), np.sqrt(np.trace(s) / len(s)))) for s in (x, e)])
+    )
 
 
-def _factor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Lower factor of a covariance, of a state that is never disturbed with a little variance added."""
-    unit = _nonzero(np.sqrt(np.diagonal(covariance)))
+    unit = _powers_of_four_near(np.sqrt(np.diagonal(covariance)))
     return np.asarray(
         unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit)))
     )
 
 
-def _nonzero(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Powers of 4 near the sizes, however different; a component of size zero takes the smallest of the others."""
+def _powers_of_four_near(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Powers of 4 near the sizes; a component of size zero takes the smallest of the others."""
     positive = size[size > 0]
-    return _power(np.where(size > 0, size, positive.min() if positive.size else 1.0))
+    return _nearest_power_of_four(np.where(size > 0, size, positive.min() if positive.size else 1.0))
 
 
-def _signals(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray) -> np.ndarray:
+def _signal_covariance(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
     n, y, q = system.states, system.output.shape[1], len(step.energy)
     total, at = np.zeros((q, q)), 2 * n
@@ -344,7 +351,7 @@ def _steady_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after
     return last if np.all(np.diagonal(more) <= CONVERGED * np.diagonal(after)) else best
 
 
-def _coordinates(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
+def _eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
     """Scale T of eta = T times what is of order one."""
     n, y = system.states, system.output.shape[1]
     parts = [sizes]
@@ -355,7 +362,7 @@ def _coordinates(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.nda
     return np.asarray(block_diag(*parts, np.eye(len(step.energy) - sum(map(len, parts)))))
 
 
-def _congruent(
+def _rescale_step(
     step: StepMatrices,
     unit: np.ndarray,
     after: np.ndarray,

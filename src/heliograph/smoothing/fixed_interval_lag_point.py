@@ -1,4 +1,4 @@
-"""Smoothing modes: fixed interval, fixed lag and fixed point."""
+"""What is smoothed: every state given all data (fixed interval), `lag` later steps, or one state (fixed point)."""
 
 import warnings
 from itertools import pairwise
@@ -43,7 +43,7 @@ def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
     return ratio, float(np.sqrt(max(ss - 2 * ratio * sh + ratio**2 * hh, 0.0))) / h
 
 
-def warn_of(name: str, sums: Float[np.ndarray, "5"]) -> None:
+def warn_if_inconsistent(name: str, sums: Float[np.ndarray, "5"]) -> None:
     """Warn if a filter's NIS is significantly larger than its model predicts."""
     ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
@@ -66,8 +66,8 @@ class AbstractSmoothing(Module):
 
         Warns where the NIS of the filter says that it is not consistent: later data then make estimates worse.
         """
-        warn_of("smoothing", np.asarray(nis_sums(steps)))
-        return _swept(self, steps)
+        warn_if_inconsistent("smoothing", np.asarray(nis_sums(steps)))
+        return _sweep_compiled(self, steps)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Compute the estimates of one run, like `estimates`, inside a compiled computation."""
@@ -77,8 +77,8 @@ class AbstractSmoothing(Module):
         """Means alone, where covariances are known from elsewhere."""
         return jnp.asarray(self.sweep(steps).mean)
 
-    def about(self, values: A) -> A:
-        """Select from `values` along time (..., time, n), such as the true state, those that the estimates refer to."""
+    def select_reference(self, values: A) -> A:
+        """Select from `values` along time (..., time, n), such as the truth, those that the estimates refer to."""
         return values
 
     def check(self, horizon: int) -> None:
@@ -86,7 +86,8 @@ class AbstractSmoothing(Module):
 
 
 @compile_on_call
-def _swept(smoothing: AbstractSmoothing, steps: SmootherStep) -> Estimate:
+def _sweep_compiled(smoothing: AbstractSmoothing, steps: SmootherStep) -> Estimate:
+    """Compiled body of `AbstractSmoothing.estimates`."""
     return smoothing.sweep(steps)
 
 
@@ -141,8 +142,8 @@ class FixedPoint(AbstractSmoothing):
         """Estimates (time from that step on, ...)."""
         return carry_ahead(steps, self.step)
 
-    def about(self, values: A) -> A:
-        """Repeat the value of that step, once per estimate of it."""
+    def select_reference(self, values: A) -> A:
+        """Repeat the value at that step, once per estimate of it."""
         repeated: A = values[..., [self.step] * (values.shape[-2] - self.step), :]
         return repeated
 
