@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
-from heliograph.numerics.angle import TURN, angles_named, continue_angles, nearest, wrap_angles
+from heliograph.numerics.angle import angles_named, continue_angles, nearest, wrap_angles
 
+TURN = 2 * np.pi
 ANGLE = st.floats(-1e3, 1e3)
 
 

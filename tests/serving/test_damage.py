@@ -12,7 +12,7 @@ from heliograph.live.stored.carrier import Carrier
 from heliograph.numerics.check import InputError
 from heliograph.serving.running import report_damage
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store import LAYOUT, Store
+from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import Damage, identity
 from tests.serving.worlds import fleet, lines, messages, stepping
 
@@ -200,7 +200,7 @@ def test_a_store_of_an_older_release_is_refused_by_its_layout_and_release(tmp_pa
     with pytest.raises(InputError) as refused:
         Store(str(place), mine, carrier=Carrier(here, mine, said.append) if accepts else None)
     assert str(refused.value) == (
-        f"store {place}: expected layout {LAYOUT}, of heliograph {mine['heliograph']}, got layout 1, of heliograph "
+        f"store {place}: expected layout 4, of heliograph {mine['heliograph']}, got layout 1, of heliograph "
         "0.1.0, whose plants cannot be carried over; to begin anew, name another"
     )
     assert not said

@@ -22,7 +22,7 @@ from heliograph.live.lanes import NetworkProgram
 from heliograph.live.stored.carrier import Carrier
 from heliograph.numerics.check import InputError
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store import LAYOUT, Store
+from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
 
 WRITTEN = Path(__file__).parents[2] / "version_0_2"
@@ -84,7 +84,7 @@ def test_a_store_of_the_version_before_is_named_in_one_line_and_stays_as_it_is(p
     with pytest.raises(InputError) as refused:
         Store(str(place), identity(Fleet(lanes, OPTIONS)))
     assert str(refused.value) == (
-        f"store {place}: expected layout {LAYOUT}, of heliograph {hg.__version__}, got layout 3, of heliograph 0.2.0; "
+        f"store {place}: expected layout 4, of heliograph {hg.__version__}, got layout 3, of heliograph 0.2.0; "
         "to begin anew, name another; --accept-changes goes on with what fits"
     )
     assert content(place) == before
