@@ -39,7 +39,7 @@ FILTER = {
 import jax.numpy as jnp
 
 from heliograph.factors.columns import Columns, columns_of, join_columns
-from heliograph.factors.gaussian import given, move, of_columns
+from heliograph.factors.gaussian import from_columns, from_covariance, predict_affine
 from heliograph.filters.base import AbstractSizedFilter, corrects, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.model.estimate import Estimate
@@ -55,13 +55,13 @@ class FixedGainFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self):
-        return given(self.plant.initial_mean, self.plant.initial_covariance)
+        return from_covariance(self.plant.initial_mean, self.plant.initial_covariance)
 
     @predicts
     def predict(self, state, u=(), k=0):
         u = jnp.asarray(u)
         noise = columns_of(self.plant.noise_covariance(u))
-        return move(state, self.plant.transition_matrix(u), self.plant.shift(u), noise)
+        return predict_affine(state, self.plant.transition_matrix(u), self.plant.shift(u), noise)
 
     @corrects
     def correct(self, state, z, k=0):
@@ -70,7 +70,7 @@ class FixedGainFilter(AbstractSizedFilter):
         mean = state.mean + gain @ jnp.where(jnp.isnan(z), 0.0, z - expected)
         kept = Columns(state.root - gain @ c @ state.root, state.variances)
         total = join_columns(Columns(c @ state.root, state.variances), noise).covariance
-        after = of_columns(mean, join_columns(kept, noise.through(gain)))
+        after = from_columns(mean, join_columns(kept, noise.through(gain)))
         return after, gaussian_innovation(z, expected, total)
 
     def estimate(self, state):
