@@ -84,6 +84,7 @@ def fused_error_norm(
 
 
 def _check_levels(levels: ArrayLike) -> Float[np.ndarray, "N"]:
+    """Return levels gamma_i (N,) as an array; raise ValueError unless all are positive."""
     checked = np.asarray(array("levels", levels, (None,)))
     if not len(checked) or np.any(checked <= 0):
         raise fail("levels", "positive numbers", checked.tolist())
@@ -93,5 +94,6 @@ def _check_levels(levels: ArrayLike) -> Float[np.ndarray, "N"]:
 def _check_levels_and_weights(
     levels: ArrayLike, weights: ArrayLike
 ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """Return levels and weights as arrays of one length; raise ValueError unless they fit."""
     gamma = _check_levels(levels)
     return gamma, probabilities("fusion weights", weights, len(gamma))

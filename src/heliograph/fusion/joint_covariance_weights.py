@@ -27,6 +27,7 @@ def _check_joint(weights: Weights) -> Weights:
 
     @wraps(weights)
     def call(joint: Array, *rest: Array) -> Any:
+        """Check the joint covariance, then compute its weights."""
         shape = np.shape(joint) if isinstance(joint, np.ndarray | jax.Array) else ()
         if len(shape) != 4 or shape[:2] != shape[2:]:
             raise fail("joint covariance", "an array of shape (nodes, n, nodes, n)", shape or show_value(joint))

@@ -132,6 +132,7 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
 def _combine_all(
     rule: AbstractFusion, means: Float[Array, "*batch count n"], covariances: Float[Array, "*batch count n n"]
 ) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n n"]]:
+    """Combine by the rule, vectorised over all leading axes."""
     combine = rule.combine
     for _ in range(means.ndim - 2):
         combine = jax.vmap(combine)
@@ -393,4 +394,5 @@ class Fusion(Module):
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
+        """List the quantizers of all nodes, one for each."""
         return [] if self.quantizer is None else spread_over_names("quantizers", self.quantizer, nodes)

@@ -203,30 +203,30 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 def _lift_steps(
     routes: Sequence[Route], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
-    """Return the system's steps and the rounding of both noises; `varies`: whether plant and measurement do.
+    """Lift each step to monomials; return the system's steps, and the roundings of both noises.
 
     Where nothing varies and the moments of the state are steady, all later steps equal the last, to rounding.
     """
-    parts, lost = [], []
+    parts, roundings = [], []
     steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
     last: Route | None = None
     for k, route in enumerate(routes):
         if steady.is_steady(moments):
             break
         if last is None or not _are_identical(route.plant, last.plant):
-            move = LiftedMap(route.plant, degree, varies[0])
+            plant_lift = LiftedMap(route.plant, degree, varies[0])
         if last is None or not _are_identical(route.measurement, last.measurement):
-            listen = LiftedMap(route.measurement, degree, varies[1])
+            measurement_lift = LiftedMap(route.measurement, degree, varies[1])
         last = route
         # Cov(w) from the moments before the step; then the moments after it, and Cov(v) from those.
-        process, process_lost = move.conditional_spread(moments)
-        moments = move.push(moments)
+        process, rounding_of_process = plant_lift.conditional_spread(moments)
+        moments = plant_lift.push(moments)
         check_moments(moments, k, 2 * degree)
-        noise, noise_lost = listen.conditional_spread(moments)
-        parts.append((*affine(move.matrix), process, *affine(listen.matrix), noise))
-        lost.append((process_lost, noise_lost))
+        noise, rounding_of_noise = measurement_lift.conditional_spread(moments)
+        parts.append((*affine(plant_lift.matrix), process, *affine(measurement_lift.matrix), noise))
+        roundings.append((rounding_of_process, rounding_of_noise))
     steps = Steps(*(repeat_last(values, len(routes)) for values in zip(*parts, strict=True)))
-    process_rounding, received_rounding = (repeat_last(values, len(routes)) for values in zip(*lost, strict=True))
+    process_rounding, received_rounding = (repeat_last(values, len(routes)) for values in zip(*roundings, strict=True))
     return steps, process_rounding, received_rounding
 
 

@@ -81,6 +81,7 @@ def _join_ends(a: Array, b: Array) -> Any:
 
 
 def _gain_atoms(law: AbstractLaw) -> list[tuple[Number, Number]]:
+    """List probability and value of each atom of a gain; refuse a law without atoms."""
     match law:
         case Constant():
             return [(1.0, plain(law.value))]
