@@ -66,7 +66,7 @@ plant = hg.LinearPlant([[np.exp(-1 / 108)]], 1.4**2 * (1 - np.exp(-2 / 108)), [0
 thresholds = {"a schedule": [hg.Periodic(n) for n in (3, 8, 20, 50)]}
 thresholds["on change"] = [hg.SendOnDelta(d) for d in (0.25, 0.5, 0.8, 1.2)]
 for color, (name, triggers) in zip(("0.5", "C0"), thresholds.items(), strict=True):
-    results = [hg.planning.simulated_rate(plant, sensor, hg.perfect(), t, 16, 360, 0) for t in triggers]
+    results = [hg.planning.simulate_rate(plant, sensor, hg.perfect(), t, 16, 360, 0) for t in triggers]
     rates = [60 * result.rate for result in results]
     right.semilogx(rates, [np.sqrt(result.error[0]) for result in results], "o-", color=color, label=name)
 bound = [np.sqrt(hg.planning.least_error(plant, sensor, rate / 60)) for rate in rates]

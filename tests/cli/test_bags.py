@@ -121,7 +121,7 @@ def test_a_bag_of_another_hand(folder, capsys):
     table = hg.files.read_messages(
         "other.mcap", network, {"/point": hg.files.json_field("point.x", "gps", time="header.stamp")}
     )
-    events = list(table.in_order())
+    events = list(table.sort_events())
     np.testing.assert_array_equal([e.values[0] for e in events], [0.1 * k for k in range(20)])
     np.testing.assert_allclose(table.lateness()["gps"], 0.05, rtol=1e-12)
 

@@ -192,7 +192,7 @@ def test_run_uses_what_a_log_says(file, tmp_path, network, form):
     from tests.files.module import load_module
 
     events = hg.files.read_messages(path, network, load_module(str(file))[1]["sources"])
-    assert [event.values[0] for event in events.in_order()] == [20.0, 21.0]
+    assert [event.values[0] for event in events.sort_events()] == [20.0, 21.0]
     assert events.notes == [f"{path}: messages left out, of devices offline: zigbee2mqtt/garden (2)"]
     assert not events.reasons
 

@@ -29,7 +29,7 @@ def test_verdicts_on_all_at_once_are_those_one_after_another(plant):
         values = np.array([float(chance.integers(2))])
         table.add(Reading("", "ab"[chance.integers(2)], int(chance.integers(2)), time, values), float(arrival))
     line = hg.Timeline(one, window, ahead=ahead, capacity=1000)
-    for event in table.in_order():
+    for event in table.sort_events():
         line.push(*event)
     counts, _ = table.judge(window, ahead)
     assert counts == {name: line.counts[name] for name in "ab"}

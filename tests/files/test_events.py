@@ -62,7 +62,7 @@ def dated(seconds):
 def read_events(path, network):
     """The events in order of arrival, and the date of time 0."""
     table = hg.files.read_messages(path, network, strict=True)
-    return list(table.in_order()), table.date if table.dated else None
+    return list(table.sort_events()), table.date if table.dated else None
 
 
 def same(item, other):

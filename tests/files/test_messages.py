@@ -30,7 +30,7 @@ def world(tmp_path_factory):
 def test_header_and_log_times_are_both_there(world):
     network, sources, drive, path = world
     table = hg.files.read_messages(path, network, sources)
-    events = list(table.in_order())
+    events = list(table.sort_events())
     gps = [event for event in events if event.node == "gps"]
     order = np.argsort(drive.logged, kind="stable")
     assert len(table) == len(events) == 220 and table.date == np.datetime64(bags.START, "ns")
@@ -46,7 +46,7 @@ def test_rows_are_what_a_timeline_puts_in_order(world):
     """With a window that nothing misses, the final estimates are those of the rows in the order of measuring."""
     network, sources, _, path = world
     table = hg.files.read_messages(path, network, sources)
-    final = play(network, table.in_order(), 10.0).final
+    final = play(network, table.sort_events(), 10.0).final
     rows = hg.run(network, *table.recording())
     estimate, other = final.estimates["gps"]["filter"], rows.estimates["gps"]["filter"]
     measured = ~np.isnan(table.recording().measurements["gps"][:, 0])
@@ -157,7 +157,7 @@ def test_a_csv_file_is_mapped_by_the_same_object(world, tmp_path):
         '/else,2026-01-01T00:00:01Z,{}\n/acceleration,2026-01-01T00:00:02Z,"{""linear"": {}}"\n'
     )
     table = hg.files.read_messages(tmp_path / "mqtt.csv", network, sources)
-    (event,) = table.in_order()
+    (event,) = table.sort_events()
     assert event.node == "inputs" and event.values.tolist() == [2.0] and "/else (1)" in table.notes[0]
     assert "row 3: expected a field 'linear.x', got no 'x' in an empty message" in table.reasons[0]
 
@@ -240,13 +240,13 @@ def test_dates_become_steps_of_a_network_that_counts_them(tmp_path):
     (tmp_path / "log.csv").write_text(f"at,value,arrival\n{text}")
     sources = {"log.csv": hg.files.json_field("value", "a", time="at", step=0.5)}
     table = hg.files.read_messages(tmp_path / "log.csv", network, sources)
-    assert [(e.time, e.values[0], e.arrival) for e in table.in_order()] == [(0, 1.0, 0), (4, 3.0, 5), (2, 2.0, 6)]
+    assert [(e.time, e.values[0], e.arrival) for e in table.sort_events()] == [(0, 1.0, 0), (4, 3.0, 5), (2, 2.0, 6)]
     rows = table.recording()
     np.testing.assert_array_equal(rows.measurements["a"][:, 0], [1.0, np.nan, 2.0, np.nan, 3.0])
     np.testing.assert_allclose(table.lateness()["a"], [0.1, 1.95, 0.08], rtol=1e-9)
     assert table.date == np.datetime64("2026-11-25T10:00:00.1")
     line = hg.Timeline(network, window=10)
-    assert [line.push(*event) for event in table.in_order()] == ["used"] * 3
+    assert [line.push(*event) for event in table.sort_events()] == ["used"] * 3
     for changed, words in (
         (dict(step=None), r"log.csv', time: expected the seconds of a step \(step=0.1\), or a time field in steps"),
         (dict(step=0.0), "json_field, step: expected"),

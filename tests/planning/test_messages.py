@@ -9,7 +9,7 @@ from heliograph.planning.messages import (
     least_error,
     prediction_error_rate,
     send_on_delta_rate,
-    simulated_rate,
+    simulate_rate,
 )
 
 PLANT, SENSOR = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
@@ -45,7 +45,7 @@ def test_the_same_by_simulation_with_losses_that_are_acknowledged():
 def test_the_least_error_at_a_rate_and_what_send_on_delta_has_above_it():
     assert np.sqrt(least_error(PLANT, SENSOR, 0.1)) == pytest.approx(0.2438, abs=5e-5)
     assert np.sqrt(least_error(PLANT, SENSOR, 0.1, 0.2)) == pytest.approx(0.2800, abs=5e-5)
-    result = simulated_rate(PLANT, SENSOR, hg.perfect(), hg.SendOnDelta(0.6))
+    result = simulate_rate(PLANT, SENSOR, hg.perfect(), hg.SendOnDelta(0.6))
     bound = least_error(PLANT, SENSOR, result.rate)
     assert np.sqrt(result.error[0] / bound) == pytest.approx(1.018, abs=0.02)  # 1.8 % in the table of 10,000 steps
 
@@ -74,7 +74,7 @@ def test_a_rare_message_has_the_rate_of_a_simulation():
 @pytest.mark.slow
 def test_the_delta_for_a_budget():
     delta = delta_for_rate(PLANT, SENSOR, 0.1)
-    result = simulated_rate(PLANT, SENSOR, hg.erasure(hg.perfect(), 0.8), hg.SendOnDelta(delta), runs=256)
+    result = simulate_rate(PLANT, SENSOR, hg.erasure(hg.perfect(), 0.8), hg.SendOnDelta(delta), runs=256)
     assert result.rate == pytest.approx(0.1, abs=0.003)
     assert np.sqrt(result.error[0]) == pytest.approx(0.384, abs=0.02)  # +- .007 in the reference table
 

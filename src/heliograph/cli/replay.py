@@ -86,4 +86,4 @@ def _read_events(path: Path, reference: str, strict: bool) -> "Iterator[tuple[st
         print(f"heliograph: {visible(line)}", file=sys.stderr)
     for name in table.plants:
         events = table.of(name)
-        yield name, list(events.in_order()), None if events.steps or events.numbers else events.date
+        yield name, list(events.sort_events()), None if events.steps or events.numbers else events.date

@@ -189,7 +189,7 @@ def _write_lagged(
     window, ahead = options.limits
     start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
     capacity = max(1000, len(data.events))
-    played = play(network, data.events.in_order(), window, lag, start, ahead, capacity).lagged
+    played = play(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if played is None:
         return []
     path = place.with_suffix(f".lagged{place.suffix}")

@@ -80,7 +80,7 @@ class Columns:
         counts = np.array([count for _, count in self.unread], dtype=np.int64)
         return count_gaps(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
 
-    def without_unset(self, name: str) -> tuple[str, str, int]:
+    def drop_unset(self, name: str) -> tuple[str, str, int]:
         """Leave out stamps that were not set; return what to say of the clock, why some were left out, and how many.
 
         A stamp that is more than a year before its arrival was not set; where most are, they are of another clock, and

@@ -162,7 +162,7 @@ class EventTable:
         """
         for plant in self._plants.values() if self.dated else ():
             for name, columns in plant.items():
-                note, reason, count = columns.without_unset(f"{source}, {name}")
+                note, reason, count = columns.drop_unset(f"{source}, {name}")
                 self.notes += [note] if note else []
                 self.reasons += [reason] if reason else []
                 self.refused += count
@@ -212,7 +212,7 @@ class EventTable:
         """Return the date from which the times of the events count."""
         return np.datetime64(self._first() if self.dated else 0, "ns")
 
-    def in_order(self) -> Iterator[Event]:
+    def sort_events(self) -> Iterator[Event]:
         """Yield the events in order of arrival, with times in seconds from the origin, in steps, or as they are."""
         events, matrices, names = self._sort_by_arrival(), self._matrices(), [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit

@@ -75,7 +75,7 @@ class Topic:
         """Return the path of what is named as a running count is."""
         return next((path for path in self.fields if COUNTS.fullmatch(path.split(".")[-1].lower())), None)
 
-    def measured(self) -> list[str]:
+    def list_measured(self) -> list[str]:
         """Return the fields, those first that look like measurements."""
         return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_unlikely)
 
@@ -201,7 +201,7 @@ def suggestion(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) 
     lines.append("sources = {")
     for name, topic in sorted(topics.items()):
         topic.choose_time()
-        fields = topic.measured()
+        fields = topic.list_measured()
         if not fields:
             continue
         more = ", ".join(fields[1:FEW]) + (", ..." if len(fields) > FEW else "")

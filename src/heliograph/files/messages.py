@@ -138,7 +138,7 @@ def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable
                 sources.stored += 1
                 continue
             events.add(sources.original(reading, came), arrival)
-            sources.senders.note(topic, reading.plant, reading.node, content, sources.asked(topic))
+            sources.senders.note(topic, reading.plant, reading.node, content, sources.list_fields(topic))
     except InputError as error:
         events.refuse(error, strict)
 

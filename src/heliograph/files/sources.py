@@ -144,7 +144,7 @@ class Sources:
         counted = {node for source, places in mapped for node in places if source.sequence is not None}
         return {node for _, places in mapped for node in places} - counted
 
-    def asked(self, topic: str) -> set[str]:
+    def list_fields(self, topic: str) -> set[str]:
         """Return the fields of a topic's messages of which a source says what they mean, by the first of their path."""
         if topic not in self._asked:
             asked = self._asked.setdefault(topic, set())

@@ -11,13 +11,13 @@ import numpy as np
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, moment, numbers
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.judging import FleetAngles, Judges
+from heliograph.live.implausible_events import FleetAngles, Judges
 from heliograph.live.lanes import shared_lanes
 from heliograph.live.plant import LinkCounts
 from heliograph.live.row_origin import estimates_by_name, row_origin
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.senders import SenderStatus
-from heliograph.live.stored.carrier import DESCRIPTION, SAME, Carrier, describe_network
+from heliograph.live.stored.migration import DESCRIPTION, SAME, Carrier, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same, pack, unpack
 from heliograph.model.estimate import Estimate, JudgedEstimate

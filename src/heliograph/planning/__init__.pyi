@@ -17,7 +17,7 @@ from .messages import (
     least_error as least_error,
     prediction_error_rate as prediction_error_rate,
     send_on_delta_rate as send_on_delta_rate,
-    simulated_rate as simulated_rate,
+    simulate_rate as simulate_rate,
 )
 from .paths.networks import (
     paths_of as paths_of,
@@ -29,7 +29,7 @@ from .problem import (
     DesignProblem as DesignProblem,
     PowerDesign as PowerDesign,
 )
-from .realised import (
+from .network_of_design import (
     designed_network as designed_network,
 )
 from .paths.relaxation import (

@@ -22,8 +22,8 @@ from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.types import Float
 from heliograph.planning.budget import PowerLimits, check_budget, power_limits
 from heliograph.planning.moments import check_constant_noise, check_design_plant, measurement_moment, steady_moment
+from heliograph.planning.network_of_design import add_best_filter
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.realised import add_best_filter
 from heliograph.planning.transmitters import amplify_transmitter, compute_sent_powers, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order

@@ -63,7 +63,7 @@ def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: A
     designs = []
     for total in powers:
         advance(f"the best for a power of {total:.4g}")
-        designs.append(design(problem.with_total(float(total))))
+        designs.append(design(problem.replace_total(float(total))))
     errors = np.minimum.accumulate([best.error for best in designs])
     return Front(powers, errors, np.minimum([best.bound for best in designs], errors))
 
@@ -114,7 +114,7 @@ def error_over_sites(
     function("network of a map", build, "x and y")
     columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
     errors = np.zeros((len(rows), len(columns)))
-    problem = best.problem.with_total(best.total)
+    problem = best.problem.replace_total(best.total)
     problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
     for row, north in enumerate(rows):
         advance(f"the map at y = {north:.4g}")

@@ -63,7 +63,7 @@ class _Scalar(NamedTuple):
         return float(prior * r / (prior + r))
 
 
-def simulated_rate(
+def simulate_rate(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,

@@ -12,12 +12,12 @@ from heliograph.planning.added import adds_up, design_added
 from heliograph.planning.budget import check_budget, make_unlimited, power_limits
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, steady_moment
+from heliograph.planning.network_of_design import BEST, COVERED
 from heliograph.planning.numbers.design import design_numbers
 from heliograph.planning.paths.design import design_paths, power_task
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.paths.networks import paths_of
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
-from heliograph.planning.realised import BEST, COVERED
 from heliograph.planning.transmitters import select_transmitters
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic import (

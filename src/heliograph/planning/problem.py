@@ -12,9 +12,9 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, check_budget
 from heliograph.planning.error import Error
+from heliograph.planning.network_of_design import designed_network
 from heliograph.planning.numbers.problem import Build
 from heliograph.planning.paths.model import Paths
-from heliograph.planning.realised import designed_network
 from heliograph.simulation.network import Network
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class DesignProblem:
         """Error, the steady trace unless given."""
         return Error() if self.error is None else self.error
 
-    def with_total(self, total: float) -> "DesignProblem":
+    def replace_total(self, total: float) -> "DesignProblem":
         """Problem of the least error with this total power, other limits of the budget staying.
 
         Args:

@@ -334,7 +334,7 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
         from heliograph.serving.storage.owner import own_store
 
         owning.enter_context(own_store(settings.store, settings.process))
-    from heliograph.live.stored.carrier import Carrier
+    from heliograph.live.stored.migration import Carrier
     from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)

@@ -12,7 +12,7 @@ from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.judging import FleetAngles
+from heliograph.live.implausible_events import FleetAngles
 from heliograph.live.lanes import NetworkProgram as NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.rows import HeldRow
@@ -22,11 +22,11 @@ from heliograph.numerics.collector import no_collector
 from heliograph.serving.ahead import ForecastPublisher, Spans
 from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
+from heliograph.serving.intake import Using, plant_of
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.output import Output
 from heliograph.serving.silence import Silence, dead_by_plant
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
-from heliograph.serving.using import Using, plant_of
 
 LARGE, MILLION = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
 ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store

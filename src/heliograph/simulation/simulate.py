@@ -19,9 +19,9 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.centres.mesh import meshes_of
-from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.reception import medium_of
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES

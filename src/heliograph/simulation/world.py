@@ -10,7 +10,7 @@ from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
-from heliograph.simulation.medium import AbstractMedium
+from heliograph.simulation.reception import AbstractMedium
 from heliograph.simulation.stepping import AllFilters
 from straightline import present
 

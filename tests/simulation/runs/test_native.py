@@ -10,7 +10,7 @@ import pytest
 import heliograph as hg
 from heliograph.numerics.keys import seed_key
 from heliograph.relays.design import local_error_design
-from heliograph.simulation.medium import medium_of
+from heliograph.simulation.reception import medium_of
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
 from heliograph.simulation.runs.native import native
 from heliograph.simulation.stepping import AllFilters

@@ -9,9 +9,9 @@ from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Float
 from heliograph.planning.budget import PowerLimits, check_budget, make_unlimited, power_limits
 from heliograph.planning.descent import ACTIVE, Limits, Problem, Programme, Vector, search
+from heliograph.planning.network_of_design import repeat_network
 from heliograph.planning.numbers.problem import Build, NumberProblem, function_of_numbers
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.realised import repeat_network
 
 
 class Conditions(NamedTuple):
@@ -43,7 +43,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     limits = _limits(_limit_powers(problem, task.budget), target)
     draws = np.random.default_rng(seed)
     begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
-    descent = problem.for_descent()
+    descent = problem.descent_problem()
     best = search(descent, limits, begin)
     if best is None:
         raise _unmet(descent, limits, begin)

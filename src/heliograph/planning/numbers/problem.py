@@ -299,7 +299,7 @@ class NumberProblem:
             return None
         return Evaluation(now.error, now.slopes.error, now.powers.ravel(), now.slopes.powers.reshape(-1, len(x)))
 
-    def for_descent(self) -> Problem:
+    def descent_problem(self) -> Problem:
         """Problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
         low, high = self.numbers.low, self.numbers.high
         unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), 1e-12)

@@ -115,7 +115,7 @@ class PowerTask(NamedTuple):
         """Paths by the power that their free hops send together."""
         return split_paths(self.problem.paths, self.free, self.fixed)
 
-    def relaxed(self) -> PathProblem:
+    def relax(self) -> PathProblem:
         """Problem in the power of whole paths that carry the concave envelope: its error is below any allocation's.
 
         A path may send what its hops may together, and split it at its best.
@@ -204,7 +204,7 @@ def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     value, bound = problem.exact(powers), problem.lower_bound(powers)
     stationarity = max(problem.linear(powers)[1] - bound, 0.0) / value
     if not task.convex:
-        relaxed = task.relaxed()
+        relaxed = task.relax()
         lower = relaxed.solve([task.of_paths(powers)])
         bound = relaxed.lower_bound(task.of_paths(powers) if lower is None else lower)
     return powers, Certificate(task.convex, value, min(bound, value), stationarity, len(starts), "error")
@@ -226,7 +226,7 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     problem, near = free_total.problem, powers
     stationarity = 1 - problem.least_total(near, target) / total if total > 0 else 0.0
     if not task.convex:
-        problem, near = free_total.relaxed(), task.of_paths(powers)
+        problem, near = free_total.relax(), task.of_paths(powers)
         lower = _reach(problem, [near], target)
         near = near if lower is None else lower
     bound = min(problem.least_total(near, target), total)

@@ -120,7 +120,7 @@ class Translator:
                     self._stored += 1
                     continue
                 results.append(self._make_message(topic, reading, arrival, again))
-                self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.asked(topic))
+                self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
                 for said in self.sources.senders.news():
                     LOG.warning("%s", said)
         except InputError as error:

@@ -10,7 +10,7 @@ from sqlalchemy import Column, Connection, Table, delete, func, inspect, select,
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
-from heliograph.live.stored.carrier import DESCRIPTION, LISTED, Carrier, list_changes
+from heliograph.live.stored.migration import DESCRIPTION, LISTED, Carrier, list_changes
 from heliograph.live.stored.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.stored.carrier import DESCRIPTION, describe_network
+from heliograph.live.stored.migration import DESCRIPTION, describe_network
 from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.numerics.check import InputError, instance
 from heliograph.serving.output import Kind, Output

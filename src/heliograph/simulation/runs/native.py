@@ -18,9 +18,9 @@ from heliograph.engine.choice import threads, try_native
 from heliograph.engine.limits import BLOCK
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.reception import medium_of
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import LANES, Progress, batch_counts, in_chunks

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.fleet import Fleet
-from heliograph.live.judging import Candidate, Judges
+from heliograph.live.implausible_events import Candidate, Judges
 from heliograph.live.leap import ARRIVAL, Leap, beginning, find_leap
 from heliograph.live.plant import LinkCounts, PlantState, Withdrawn
 from heliograph.numerics.check import InputError
