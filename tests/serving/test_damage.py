@@ -10,10 +10,9 @@ import pytest
 
 from heliograph.live.stored.migration import Carrier
 from heliograph.numerics.check import InputError
-from heliograph.serving.running import report_damage
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import Damage, identity
+from heliograph.serving.storage.store_protocol import Damage, identity, report_damage
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 SENT = lines(messages(2, 24, seed=11, whole=True))

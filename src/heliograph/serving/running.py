@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequenc
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from shlex import quote
 from typing import Protocol
 
 from heliograph.files.json_field import Source
@@ -21,10 +20,10 @@ from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, encode_name
 from heliograph.serving.brokers.url import Address
-from heliograph.serving.loop import Takes, serve_until, signals
+from heliograph.serving.loop import AbandonedError, Ending, Takes, serve_until, signals
 from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import AwayError, Damage, InMemoryStore, StoreProtocol, identity
+from heliograph.serving.storage.store_protocol import AwayError, InMemoryStore, StoreProtocol, identity, report_damage
 from heliograph.serving.words import LastWordsService
 from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
@@ -134,7 +133,6 @@ async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None
 
 
 NOTHING = "none"  # the store that keeps nothing
-LISTED = 10  # damaged plants in one line
 SHORTEST = 1.0  # seconds without messages after which their silence is used
 
 
@@ -256,7 +254,9 @@ async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     _log_to_stderr()
     async with _watched(settings) as look:
-        lanes = NetworkProgram(settings.network)
+        lanes = await _compile_steps(settings.network)
+        if lanes is None:
+            return
         if lanes.uneven:
             what = f"predictions depend on when others are asked for: {lanes.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
@@ -264,6 +264,17 @@ async def run(settings: ServiceSettings) -> None:
             await _alone(settings, lanes, look)
         else:
             await _shared(settings, lanes, look, settings.parts)
+
+
+async def _compile_steps(network: Network) -> NetworkProgram | None:
+    """Compile the steps of a network in a thread, while the page answers; None if it is said to stop meanwhile."""
+    stop = asyncio.Event()
+    with signals(stop):
+        try:
+            lanes = await Ending(stop).call(NetworkProgram, network)
+        except AbandonedError:
+            return None
+    return None if stop.is_set() else lanes
 
 
 def _log_to_stderr() -> None:
@@ -347,18 +358,6 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
         _say(f"store {store.name}: {report_damage(store.damaged)}")
     _say(f"the state is kept in {store.name}, plants so far: {store.count()} (--store {NOTHING} keeps nothing)")
     return store
-
-
-def report_damage(plants: Mapping[str, Damage]) -> str:
-    """Describe damaged plants to a user: their names, and whether a name itself was lost."""
-    named = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
-    more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
-    new = (
-        ""
-        if all(plant.named for plant in plants.values())
-        else "; one has lost its name, so that no new plant begins before"
-    )
-    return f"damaged plants, whose messages are refused until they begin anew ({named}{more}){new}"
 
 
 def _say(what: str) -> None:

@@ -1,6 +1,7 @@
 """Interface between a service and the store of its state, the network's identity there, and a store in memory."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from shlex import quote
 from typing import NamedTuple, Protocol
 
 from heliograph.live.fleet import Fleet
@@ -8,6 +9,8 @@ from heliograph.live.stored.migration import DESCRIPTION, describe_network
 from heliograph.live.stored.snapshot import Identity, network_identity
 from heliograph.numerics.check import InputError, instance
 from heliograph.serving.output import Kind, Output
+
+LISTED = 10  # damaged plants in one line
 
 
 class StoredPlant(NamedTuple):
@@ -145,3 +148,15 @@ class InMemoryStore:
 
     def close(self) -> None:
         """Do nothing: the store holds no resources."""
+
+
+def report_damage(plants: Mapping[str, Damage]) -> str:
+    """Describe damaged plants to a user: their names, and whether a name itself was lost."""
+    named = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
+    more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
+    new = (
+        ""
+        if all(plant.named for plant in plants.values())
+        else "; one has lost its name, so that no new plant begins before"
+    )
+    return f"damaged plants, whose messages are refused until they begin anew ({named}{more}){new}"
