@@ -39,13 +39,47 @@ def test_forty_rows_without_a_loss_are_enough():
     assert arrivals(np.resize([True, True, True, False], 40)).due_in == "3 of 4 rows"
 
 
-def test_losses_at_random_are_no_pattern():
-    """Independent ones and bursts of any length, in 20 to 1,000 rows: none of 1,500, each with a chance of 1e-4."""
-    for _ in range(750):
-        rows = int(np.exp(RNG.uniform(np.log(20), np.log(1000))))
-        independent = RNG.random(rows) < RNG.uniform(0.02, 0.99)
-        for came in (independent, bursts(rows, *RNG.uniform(0.01, 1, 2), RNG)):
-            assert arrivals(came).pattern is None
+@pytest.mark.parametrize("count", [150, pytest.param(3000, marks=pytest.mark.slow)])
+def test_losses_at_random_are_neither_pattern_nor_rate(count):
+    """Independent ones and bursts of any length, in 20 to 1,000 rows, each with a chance of 1e-4: none of 300; of 6,000
+    at most 4, where Poisson's law of mean .6 has more with a chance of 4e-4."""
+    found, rng = 0, np.random.default_rng(count)
+    for _ in range(count):
+        rows = int(np.exp(rng.uniform(np.log(20), np.log(1000))))
+        independent = rng.random(rows) < rng.uniform(0.02, 0.99)
+        for came in (independent, bursts(rows, *rng.uniform(0.01, 1, 2), rng)):
+            link = arrivals(came)
+            found += link.pattern is not None or link.rate is not None
+    assert found <= (0 if count == 150 else 4)
+
+
+def test_a_long_pattern_is_found_too():
+    """Due in the first fifth of each 100 rows; of 5,000 rows."""
+    due = np.resize(np.arange(100) < 20, 5000)
+    link = arrivals(due & (RNG.random(5000) >= 0.05))
+    assert link.due_in == "1 of 5 rows" or link.due == due.sum()
+
+
+@pytest.mark.parametrize("period", [1.0517, 1.3337, np.e, 3.337, 40.3])
+@pytest.mark.parametrize("lost", [0.0, 0.05])
+def test_a_sender_whose_clock_is_not_that_of_the_rows_loses_what_it_loses(period, lost):
+    """Its messages stand in the row that follows; of 5,000 rows."""
+    due = np.zeros(5000, dtype=bool)
+    due[np.floor(0.3 + period * np.arange(4998 / period)).astype(int)] = True
+    came = due & (RNG.random(5000) >= lost)
+    link = arrivals(came)
+    assert link.rate is not None and link.period == pytest.approx(period, rel=1e-3)
+    assert abs(link.due - due.sum()) <= 2 and link.share == pytest.approx(came.sum() / due.sum(), abs=0.003)
+    assert np.all(np.diff(link.numbers) >= 1)
+
+
+@pytest.mark.parametrize(("period", "rows"), [(1.00705, 3000), (1.0011, 20_000)])
+def test_a_sender_hardly_slower_than_the_rows_loses_nothing(period, rows):
+    """One row in 143 is empty, and one in 910."""
+    came = np.zeros(rows, dtype=bool)
+    came[np.floor(period * np.arange((rows - 1) / period)).astype(int)] = True
+    link = arrivals(came)
+    assert link.period == pytest.approx(period, rel=1e-5) and link.longest_gap == 0
 
 
 def test_a_pattern_is_judged_against_the_stated_share_by_what_was_due():

@@ -10,6 +10,7 @@ from scipy.special import ndtri
 from heliograph.numerics.shares import count_independent
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.report.pattern import Pattern, find_pattern
+from heliograph.report.rate import Rate, find_rate
 
 FEW = 8  # arrivals from which a rate of its own can be told
 NEAR = 0.25  # of a period: how far an interval may be from whole periods
@@ -45,16 +46,27 @@ class Arrivals:
     of_messages: bool = False
 
     @cached_property
+    def rate(self) -> Rate | None:
+        """The rate of a sender whose clock is not that of the rows, where no pattern of few rows tells as much."""
+        if self.declared_period is not None or self.of_messages:
+            return None
+        rate, pattern = find_rate(self.arrived), find_pattern(self.arrived)
+        finer = pattern is None or rate is None or rate.period * pattern.rows.sum() > len(self.arrived) + rate.period
+        return rate if finer else None
+
+    @cached_property
     def period(self) -> float | None:
         """Time between messages of a sender that is slower than the rows, in seconds or the unit of `time`; else None.
 
-        Declared, or found: nearly all intervals between arrivals are whole multiples of their median. Losses of a
-        sender that is due in each row leave intervals of all lengths, and no such period.
+        Declared, or found: it has a rate of its own, or nearly all intervals between arrivals are whole multiples of
+        their median. Losses of a sender that is due in each row leave intervals of all lengths, and no such period.
         """
         clock = _clock(self.time)
         spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
         if self.declared_period is not None:
             return self.declared_period * spacing if self.declared_period > 1 else None
+        if self.rate is not None:
+            return self.rate.period * spacing
         intervals = np.diff(clock[self.arrived])
         if len(intervals) < FEW - 1 or self.arrived.all():
             return None
@@ -77,7 +89,10 @@ class Arrivals:
         if not len(came):
             return np.zeros(max(int((clock[-1] - clock[0]) / self.period), 1), dtype=bool)
         # Whole periods from each to the next; then those that are late by more than is usual.
-        apart = np.maximum(np.round(np.diff(came) / self.period), 1).astype(np.int64)
+        if self.rate is not None:
+            apart = np.diff(self.rate.slots)
+        else:
+            apart = np.maximum(np.round(np.diff(came) / self.period), 1).astype(np.int64)
         since = max(int((clock[-1] - came[-1]) / self.period - NEAR), 0)
         slots = np.zeros(1 + int(apart.sum()) + since, dtype=bool)
         slots[np.concatenate([[0], np.cumsum(apart)])] = True

@@ -1,13 +1,14 @@
 """Rows in which a sender is due, where these return as a pattern: told from losses by how seldom chance makes one."""
 
-from math import comb
+from math import comb, exp, log
 from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.numerics.types import Bool, Float, Int
 
-LONGEST = 32  # rows after which a pattern returns, at most
+SHORT = 32  # rows of a pattern up to which each is looked at
+LONGEST = 256  # rows after which a pattern returns, at most
 CHANCE = 1e-4  # that losses at random are taken for a pattern, at most
 
 
@@ -38,38 +39,82 @@ def _least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray,
     """Return which of the first rows are due, of the pattern that chance makes least; None of what chance may make."""
     came = np.flatnonzero(arrived)
     intervals = np.diff(came)
+    law = LossLaw.of_intervals(intervals)
     least, found = np.log(CHANCE), None
     for length in range(2, min(LONGEST, len(arrived) // 2) + 1 if len(intervals) else 0):
         places = np.bincount(came % length, minlength=length) > 0
         if places.all():
             continue
         # Any set of as many places, and any length, would have been taken: 1 / (length (length - 1)) add up to 1.
-        tried = comb(length, int(places.sum())) * length * (length - 1)
-        chance = _log_chance(places, intervals) + np.log(tried)
+        tried = log(comb(length, int(places.sum()))) + log(length * (length - 1))
+        if length > SHORT and len(came) * log(length / places.sum()) < tried - least:  # independent losses make it
+            continue
+        chance = _log_chance(places, law, len(intervals)) + tried
         if chance < least:
             least, found = chance, places
     return found
 
 
-def _log_chance(places: Bool[np.ndarray, " length"], intervals: Int[np.ndarray, " arrivals"]) -> float:
-    """Bound the probability, by its logarithm, that losses in bursts let nothing arrive outside of these places.
+class LossLaw(NamedTuple):
+    """Law of the intervals between arrivals where losses come in bursts.
 
     Losses in bursts (a Markov chain of two states; those independent of each other are a case of it) make intervals
-    between arrivals independent: 1 with probability a, else k > 1 with (1 - a) r (1 - r)^(k - 2). A place then moves as
-    a Markov chain on the rows of one pattern, and the probability that it has left none after N intervals is at most
-    the largest row sum of M^N, where M are the probabilities between the places.
+    between arrivals independent: 1 with probability `follows`, else k > 1 with (1 - follows) ends (1 - ends)^(k - 2).
+    """
+
+    follows: float
+    ends: float
+
+    @staticmethod
+    def of_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "LossLaw":
+        """Return the most likely law."""
+        gaps = intervals[intervals > 1] - 1
+        return LossLaw(1 - len(gaps) / max(len(intervals), 1), len(gaps) / gaps.sum() if len(gaps) else 1.0)
+
+    def log_chance_within(self, due: Bool[np.ndarray, " rows"], count: int) -> float:
+        """Bound the log probability that `count` arrivals after a first one are all in rows that are due.
+
+        With z > 0 for each arrival, backwards over the rows from the end, where all are 1:
+        stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)), where
+        later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1); for each z the chance is at most
+        stay(first) / z^count (Chernoff). The best z is about the share of the rows that are not due, inverted.
+        """
+        share = max(float(np.mean(due)), 1 / len(due))
+        return min(self._log_moment(due, -exponent * log(share), count) for exponent in (0.0, 0.5, 1.0))
+
+    def _log_moment(self, due: Bool[np.ndarray, " rows"], log_z: float, count: int) -> float:
+        """Return log(stay(first) / z^count)."""
+        z, logarithm, stay, after, later = exp(log_z), 0.0, 1.0, 1.0, 1.0
+        for is_due in due[-2::-1].tolist():
+            # Of the row after this one and of the row after that, where these are due.
+            later = self.ends * after + (1 - self.ends) * later
+            after = stay
+            now = z * (self.follows * after + (1 - self.follows) * later)
+            stay = now if is_due else 0.0
+            scale = max(stay, after, later)
+            if not 1e-100 < scale < 1e100:
+                if scale == 0:
+                    return -np.inf
+                logarithm += log(scale)
+                now, stay, after, later = now / scale, stay / scale, after / scale, later / scale
+        return logarithm + (log(now) if now > 0 else -np.inf) - count * log_z
+
+
+def _log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: int) -> float:
+    """Bound the probability, by its logarithm, that losses in bursts let nothing arrive outside of these places.
+
+    A place moves as a Markov chain on the rows of one pattern, and the probability that it has left none after N
+    intervals is at most the largest row sum of M^N, where M are the probabilities between the places.
     """
     length = len(places)
-    gaps = intervals[intervals > 1] - 1
-    follows = 1 - len(gaps) / len(intervals)
-    ends = len(gaps) / gaps.sum() if len(gaps) else 1.0
     # Probability of each interval modulo the length: a geometric law, all turns of it added up.
     interval = np.arange(2, length + 2)
     step: Float[np.ndarray, " length"] = np.zeros(length)
-    step[interval % length] = (1 - follows) * ends * (1 - ends) ** (interval - 2) / (1 - (1 - ends) ** length)
-    step[1 % length] += follows
+    turns = 1 - (1 - law.ends) ** length
+    step[interval % length] = (1 - law.follows) * law.ends * (1 - law.ends) ** (interval - 2) / turns
+    step[1 % length] += law.follows
     at = np.flatnonzero(places)
-    return _log_sum_of_power(step[(at[None, :] - at[:, None]) % length], len(intervals))
+    return _log_sum_of_power(step[(at[None, :] - at[:, None]) % length], count)
 
 
 def _log_sum_of_power(matrix: Float[np.ndarray, "n n"], exponent: int) -> float:

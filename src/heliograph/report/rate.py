@@ -1,0 +1,115 @@
+"""Senders of a rate of their own among rows of another: told from losses by how seldom chance makes it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.types import Bool, Float, Int
+from heliograph.report.pattern import CHANCE, LossLaw
+
+PEAKS = 8  # of the spectrum of arrivals that are looked at
+FEWEST = 8  # arrivals from which a rate is looked for
+ENOUGH = 20_000  # rows that decide
+ROUNDING = 1e-9  # periods: the arrivals at both ends of a line are in it
+STEPS = 30  # of the search for a rate, each to two thirds
+OFF = 0.25  # periods by which a line at a peak of the spectrum is too wide, at most
+
+
+class Rate(NamedTuple):
+    """A sender that is due once in each `period` rows, a real number; `slots` numbers the arrivals among what was due.
+
+    Shapes: slots (arrivals,).
+    """
+
+    period: float
+    slots: Int[np.ndarray, " arrivals"]
+
+
+class _Line(NamedTuple):
+    """Rows r that come right after a multiple of the period: frac(frequency r - start) at most `width`."""
+
+    frequency: float
+    start: float
+    width: float
+
+    def phases(self, rows: Int[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Return how many periods after the first each row is."""
+        return np.asarray(self.frequency * rows - self.start)
+
+
+def find_rate(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
+    """Return the rate of a sender whose clock is not that of the rows, if losses would hardly leave it; else None.
+
+    A sender that is due each T rows, T no whole number, comes in the rows r where frac(r / T - phase) < 1 / T, and all
+    others are empty for ever. If it is hardly slower than the rows the empty ones are rare, and have a rate themselves:
+    one of each 1 / (1 - 1 / T) rows, none of them lost.
+    """
+    rate = _find_line(arrived)
+    if rate is not None:
+        return rate
+    rows = np.flatnonzero(arrived)
+    empty = _find_line(~arrived[rows[0] : rows[-1]]) if len(rows) else None
+    if empty is None or np.any(np.diff(empty.slots) > 1):
+        return None
+    return Rate(1 / (1 - 1 / empty.period), np.arange(np.count_nonzero(arrived)))
+
+
+def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
+    """Return the slowest rate of which each row with an arrival is, if losses in bursts would hardly leave it."""
+    rows = np.flatnonzero(arrived)
+    if len(rows) < FEWEST or len(rows) == 1 + np.ptp(rows):
+        return None
+    law, found = LossLaw.of_intervals(np.diff(rows)), None
+    decides = rows[0] + np.arange(min(1 + int(np.ptp(rows)), ENOUGH))  # a sender may begin late, and fall silent
+    for frequency in _peaks(arrived):
+        if _find_gap(frequency, rows)[1] < 1 - frequency - OFF:
+            continue
+        line = _narrow(frequency, rows)
+        slots = np.floor(line.phases(rows)).astype(np.int64)
+        if line.width >= 1 or np.any(np.diff(slots) < 1):
+            continue
+        # Any rate, phase, width and count would have been taken: each is told apart by the rows to about 1 / rows.
+        due = np.mod(line.phases(decides) + ROUNDING, 1) <= line.width + 2 * ROUNDING
+        chance = law.log_chance_within(due, int(np.sum(rows <= decides[-1])) - 1) + 5 * np.log(len(arrived))
+        if chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
+            found = Rate(1 / line.frequency, slots - slots[0])  # the slowest, whose multiples pass too
+    return found
+
+
+def _peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
+    """Return frequencies, in periods a row: those of a usual interval, and those of the largest peaks of the spectrum.
+
+    A spectrum does not tell a frequency from its mirror, 1 - f, nor a comb from its harmonics.
+    """
+    intervals = np.diff(np.flatnonzero(arrived))
+    size = 4 * 2 ** int(np.ceil(np.log2(len(arrived))))
+    spectrum = np.abs(np.fft.rfft(arrived - np.mean(arrived), size))
+    inner = (spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])
+    peaks = 1 + np.flatnonzero(inner)
+    largest = peaks[np.argsort(spectrum[peaks])[::-1][:PEAKS]] / size
+    usual = [1 / float(np.median(intervals)), 1 / float(np.mean(intervals))]
+    return [*usual, *(frequency for f in largest.tolist() for frequency in (f, 1 - f))]
+
+
+def _find_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
+    """Return the middle of the largest part without an arrival, on the circle of a period, and its length."""
+    order = np.sort(np.mod(frequency * rows, 1))
+    gaps = np.diff(order, append=order[0] + 1)
+    largest = int(np.argmax(gaps))
+    return float(order[largest] + gaps[largest] / 2), float(gaps[largest])
+
+
+def _narrow(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _Line:
+    """Return the narrowest line through rows near a frequency: with whole periods as they are, its width is convex."""
+    middle, _ = _find_gap(frequency, rows)
+    whole = np.floor(frequency * rows - middle)
+
+    def width(f: float) -> float:
+        return float(np.ptp(f * rows - whole))
+
+    low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)
+    for _ in range(STEPS):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        low, high = (low, right) if width(left) <= width(right) else (left, high)
+    best = (low + high) / 2
+    return _Line(best, float(np.min(best * rows - whole)), width(best))
