@@ -1,8 +1,10 @@
 """Messages of files that cannot be read: refused alone, and none that was lost."""
 
+import csv
 import json
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import heliograph as hg
@@ -40,3 +42,35 @@ def test_a_field_that_cannot_be_read_costs_no_other_node(tmp_path):
     (tmp_path / "log.jsonl").write_text(json.dumps({"topic": "dev/up", "payload": json.dumps(body)}))
     events = hg.files.read_messages(tmp_path / "log.jsonl", network, sources)
     assert events.refused == 1 and events.judge()[0]["b"]["used"] == 1
+
+
+LOGGED = [("2026-09-27T10:00:00Z", 20.0), ("2026-09-27T10:10:00Z", 20.5)]
+
+
+@pytest.mark.parametrize("name", ["arrival", "timestamp", "time", "ts"])
+@pytest.mark.parametrize("seconds", [False, True])
+@pytest.mark.parametrize("kind", ["csv", "jsonl"])
+def test_the_time_of_a_logged_message_is_that_of_its_log(tmp_path, name, seconds, kind):
+    """As a date or in seconds, in a table and in lines, beside a payload that has no time."""
+    path, rows = tmp_path / f"log.{kind}", []
+    for date, value in LOGGED:
+        at = np.datetime64(date[:-1], "s").astype(int).item() if seconds else date
+        rows.append({name: at, "topic": "home/attic", "payload": json.dumps({"t": value})})
+    if kind == "csv":
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    else:
+        path.write_text("\n".join(map(json.dumps, rows)))
+    events = hg.files.read_messages(path, walk("a"), {"home/attic": hg.files.json_field("t", node="a")})
+    assert events.date == np.datetime64("2026-09-27T10:00:00", "ns") and events.refused == 0
+    np.testing.assert_array_equal(events.recording().time, [0.0, 600.0])
+
+
+@pytest.mark.parametrize("said", ["10:00:00", 1790503200123, "noon", 17.5, None])
+def test_a_field_of_a_log_that_is_no_moment_is_none(tmp_path, said):
+    body = {"topic": "home/attic", "time": said, "payload": json.dumps({"t": 20.0, "at": LOGGED[0][0]})}
+    (tmp_path / "log.jsonl").write_text(json.dumps(body))
+    source = {"home/attic": hg.files.json_field("t", node="a", time="at")}
+    assert hg.files.read_messages(tmp_path / "log.jsonl", walk("a"), source).refused == 0

@@ -8,10 +8,13 @@ from typing import Any, NamedTuple
 
 from heliograph.files.fields import decode_json, parse_number
 from heliograph.files.table import check_separators, csv_header, csv_lines, kind_of, open_text
-from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.dates import instant
 
 TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
 ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second
+CLOCKS = ("timestamp", "time", "ts")  # the same, where they are dates with a zone or seconds, beside a payload
+YEARS = 1e9, 1e10  # seconds since 1970 of 2001 to 2286
 ANNOTATIONS = ("#group", "#datatype", "#default", "#constant")  # of Influx's annotated CSV
 LINES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
 # A date or seconds, a topic and a payload, as `mosquitto_sub -F "%I %t %p"` and `mosquitto_sub -v` print them.
@@ -91,12 +94,30 @@ def of_log(content: object) -> tuple[str, str, Any, bool] | None:
     if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
         return None
     inner = content[PAYLOAD]
-    arrival = next((content[name] for name in ARRIVALS if content.get(name) is not None), None)
-    return content[TOPIC], inner if isinstance(inner, str) else json.dumps(inner), arrival, bool(content.get("retain"))
+    text = inner if isinstance(inner, str) else json.dumps(inner)
+    return content[TOPIC], text, find_arrival(content), bool(content.get("retain"))
+
+
+def find_arrival(logged: Mapping[str, Any]) -> Any:
+    """Return when a message with a payload was logged, as the log says it; None if it does not."""
+    said = next((logged[name] for name in ARRIVALS if logged.get(name) is not None), None)
+    return said if said is not None else next((logged[name] for name in CLOCKS if _is_moment(logged.get(name))), None)
+
+
+def _is_moment(value: object) -> bool:
+    """Return whether a value is a date with a zone, or seconds since 1970 of our centuries."""
+    number = parse_number(value) if isinstance(value, str) else value
+    if isinstance(number, str):
+        try:
+            instant(number)
+        except ValueError:
+            return False
+        return True
+    return isinstance(number, int | float) and YEARS[0] <= number < YEARS[1]
 
 
 def _convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
-    arrival = row.get("arrival")
+    arrival = find_arrival(row) if PAYLOAD in row else row.get("arrival")
     if TOPIC not in row:
         return FileMessage(where, None, row, arrival)
     payload = row.get(PAYLOAD) if PAYLOAD in row else row
@@ -202,11 +223,8 @@ def payload_of(message: FileMessage) -> object:
     """Decode the payload of a message of a log.
 
     Raises:
-        ValueError: no JSON; one line.
+        ValueError: no JSON, or a field that is there twice; one line.
     """
     if not isinstance(message.content, str):
         return message.content
-    try:
-        return decode_json(message.content, f"{message.where}, {PAYLOAD}")
-    except InputError:
-        raise fail(f"{message.where}, {PAYLOAD!r}", "JSON", show_value(message.content)) from None
+    return decode_json(message.content, f"{message.where}, {PAYLOAD!r}")

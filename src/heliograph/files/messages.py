@@ -36,8 +36,8 @@ def read_messages(
     message and its columns are the fields; Influx's annotated CSV; or lines of JSON (.jsonl, .ndjson, .json, .log,
     .txt), also those that MQTT clients print; CSV and lines may be packed (.gz). A message has the topic in its field
     `topic`, with JSON in `payload` if there is such a field, else that named as the file. It arrives at the time in
-    `arrival` or `tst`, else at its own. Messages in our own form, with node, sequence, time and values, need no
-    sources.
+    `arrival` or `tst`, beside a payload also in `timestamp`, `time` or `ts` (a date with a zone, or seconds), else at
+    its own. Messages in our own form, with node, sequence, time and values, need no sources.
 
     A message that cannot be read is refused alone: `refused` of the result counts them, `reasons` has the first.
     Where a bag is damaged what came before stays, and `broken` says where.
