@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.roots import roots_of, square
+from heliograph.factors.roots import covariance_of_root, roots_of
 from heliograph.linear.recursion import RecursionStep, covariance_step, take_noise_roots
 from heliograph.linear.system import Steps
 from heliograph.random_affine.moments.monomials import position
@@ -91,7 +91,7 @@ def row(dimension: int) -> Row:
     full, start, copy = duplicated(system, dimension)
     half, whole = prepared(system.step(1), system.covariance), prepared(full, start)
     fast, slow = seconds(half, dimension), seconds(whole, dimension)
-    a, b = square(half().root), square(whole().root)
+    a, b = covariance_of_root(half().root), covariance_of_root(whole().root)
     gap = float(np.abs(copy @ a @ copy.T - b).max() / np.abs(b).max())
     return Row(len(system.covariance), len(start), fast, slow, gap)
 

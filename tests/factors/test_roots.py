@@ -6,7 +6,7 @@ import pytest
 
 from heliograph.factors.columns import columns_of
 from heliograph.factors.gaussian import condition_on_observation, from_covariance
-from heliograph.factors.roots import observe_root, roots_of, square
+from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
 from heliograph.numerics.lapack import add_information
 from tests.factors.exact import after, congruence, exactly
 
@@ -77,10 +77,12 @@ def test_it_is_the_update_of_the_filters():
 
 def test_roots_are_those_of_the_nearest_covariance():
     p = problem(3, 1)[0] * np.outer([1e-8, 1.0, 1e8], [1e-8, 1.0, 1e8])
-    np.testing.assert_allclose(square(roots_of(p)), p, rtol=1e-12)
+    np.testing.assert_allclose(covariance_of_root(roots_of(p)), p, rtol=1e-12)
     below = np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]])
-    np.testing.assert_allclose(square(roots_of(below)), below, atol=2e-9)
-    np.testing.assert_allclose(square(roots_of(np.diag([-1e-20, 0.0, 2.0]))), np.diag([0.0, 0.0, 2.0]), rtol=1e-15)
+    np.testing.assert_allclose(covariance_of_root(roots_of(below)), below, atol=2e-9)
+    np.testing.assert_allclose(
+        covariance_of_root(roots_of(np.diag([-1e-20, 0.0, 2.0]))), np.diag([0.0, 0.0, 2.0]), rtol=1e-15
+    )
 
 
 def test_information_adds_to_that_of_the_prior_which_may_be_singular():

@@ -17,10 +17,10 @@ class Observed(NamedTuple):
     @property
     def covariance(self) -> Float[np.ndarray, "*items n n"]:
         """W+ W+'."""
-        return square(self.root)
+        return covariance_of_root(self.root)
 
 
-def square(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarray, "*items n n"]:
+def covariance_of_root(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarray, "*items n n"]:
     """W W', symmetric to the last digit."""
     product = root @ root.swapaxes(-1, -2)
     return np.asarray(product + product.swapaxes(-1, -2)) / 2

@@ -69,7 +69,7 @@ class AbstractInformedFusion(AbstractFusion):
         return fail(f"fusion by {type(self).__name__}", what, "estimates with a covariance each")
 
 
-class AbstractWeights(AbstractInformedFusion):
+class AbstractJointWeights(AbstractInformedFusion):
     """x = sum_i W_i x_i with sum_i W_i = I, best for the joint covariance P of the errors, which is then W P W'.
 
     Known means of the errors are subtracted. `with_mean`: the plant's mean before any data is one estimate more; it
@@ -120,7 +120,7 @@ class AbstractWeights(AbstractInformedFusion):
         return state, (mean, weigh_covariance(chosen, joint))
 
 
-class MatrixWeights(AbstractWeights):
+class MatrixWeights(AbstractJointWeights):
     """Best linear unbiased fusion: a matrix weight for each node.
 
     Args:
@@ -144,7 +144,7 @@ class MatrixWeights(AbstractWeights):
         return solve_regularised_weights(joint, present)
 
 
-class DiagonalWeights(AbstractWeights):
+class DiagonalWeights(AbstractJointWeights):
     """Best unbiased fusion component by component: cheaper than `MatrixWeights`, and never better.
 
     Args:
@@ -174,7 +174,7 @@ class DiagonalWeights(AbstractWeights):
         return NeighbourWeights(identity, chosen, weigh_covariance_by_component(chosen, believed.joint))
 
 
-class ScalarWeights(AbstractWeights):
+class ScalarWeights(AbstractJointWeights):
     """Best unbiased fusion with one number per node, for the trace.
 
     The trace depends on units; poor where nodes see different states.

@@ -20,12 +20,12 @@ from heliograph.h_infinity.solver import (
     run_solver,
 )
 from heliograph.h_infinity.step_inequality import (
-    Layout,
     StepMatrices,
     Unknowns,
+    UnknownsLayout,
     all_multipliers,
     next_energy,
-    scale,
+    scale_steps,
     step_matrices,
 )
 from heliograph.h_infinity.system import LARGEST, GrowthSystem, symmetric_weight
@@ -153,9 +153,9 @@ def horizon_design(
     n, m = system.states, system.received
     given_gains = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
     # coordinates of order one, and the unknowns of every step
-    steps, coordinates = scale(system, step_matrices(system, flag("separate", separate)), given_gains)
+    steps, coordinates = scale_steps(system, step_matrices(system, flag("separate", separate)), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
-    layouts = [Layout(n, m, len(s.growth), given_correction) for s in steps]
+    layouts = [UnknownsLayout(n, m, len(s.growth), given_correction) for s in steps]
     start = None if initial is None else coordinates.initial_weight(_checked_weight(initial, n))
     allowed = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
     # one convex problem in all weights, gains, multipliers and the level squared
@@ -200,8 +200,8 @@ class _Recursion:
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
-        self.steps, self.coordinates = scale(system, step_matrices(system, separate))
-        self.layout = Layout(system.states, system.received, len(self.steps[0].growth))
+        self.steps, self.coordinates = scale_steps(system, step_matrices(system, separate))
+        self.layout = UnknownsLayout(system.states, system.received, len(self.steps[0].growth))
         self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:

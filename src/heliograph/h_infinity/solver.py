@@ -10,10 +10,10 @@ from scipy.sparse import csr_array
 from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.step_inequality import (
-    Layout,
     LinearForms,
     StepMatrices,
     Unknowns,
+    UnknownsLayout,
     independent_parts,
     linear_forms,
 )
@@ -87,7 +87,7 @@ class StepProblem:
     def __init__(
         self,
         step: StepMatrices,
-        layout: Layout,
+        layout: UnknownsLayout,
         objective: Objective,
         solver: Solver,
         sizes: tuple[float, float] = (1.0, 1.0),
@@ -170,7 +170,7 @@ class HorizonProblem:
     def __init__(
         self,
         steps: list[StepMatrices],
-        layouts: list[Layout],
+        layouts: list[UnknownsLayout],
         weight: Float[np.ndarray, "w w"],
         initial: Float[np.ndarray, "w w"] | None = None,
     ):

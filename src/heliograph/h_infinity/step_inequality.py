@@ -120,7 +120,7 @@ def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q 
     return np.asarray(form + np.diag(multipliers @ step.growth))
 
 
-class Layout(NamedTuple):
+class UnknownsLayout(NamedTuple):
     """Layout of one step's unknowns in a vector: lower triangles of P1, P2 and Z, then Y and the multipliers.
 
     With `gain` given, Y = P2 K and Z = K'P2 K are no unknowns.
@@ -176,7 +176,7 @@ class LinearForms(NamedTuple):
     weight: Float[np.ndarray, "ww size"]
 
 
-def linear_forms(step: StepMatrices, layout: Layout) -> LinearForms:
+def linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
     """Evaluate every form at the unit vectors."""
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     forward = np.array([next_energy(step, u).ravel() for u in units]).T
@@ -188,7 +188,7 @@ def linear_forms(step: StepMatrices, layout: Layout) -> LinearForms:
     return LinearForms(forward, tuple(positive), weight_form(layout))
 
 
-def weight_form(layout: Layout) -> Float[np.ndarray, "ww size"]:
+def weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
     """Linear map from the vector of unknowns to diag(P1, P2), written row by row."""
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     upper, lower = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
@@ -256,7 +256,7 @@ def _symmetrise(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
     return np.asarray((a + a.T) / 2)
 
 
-def scale(
+def scale_steps(
     system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
 ) -> tuple[list[StepMatrices], Coordinates]:
     """Transform the steps to coordinates of order one, near the best predictor's gains or the given `gains`."""

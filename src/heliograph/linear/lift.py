@@ -36,7 +36,7 @@ EPS = float(np.finfo(np.float64).eps)
 Moments = Float[np.ndarray, " monomials"]  # of (x, 1), all of one order
 
 
-def check_moments(moments: Moments, k: int, order: int) -> None:
+def check_finite_moments(moments: Moments, k: int, order: int) -> None:
     """Raise ValueError where moments of the state after step k are no finite numbers."""
     if not np.all(np.isfinite(moments)):
         got = f"ones beyond doubles at step {k + 1}: use a shorter horizon, or units in which the state is smaller"
@@ -103,7 +103,7 @@ def lift_modes(
         moved, means = of_plant[id(plant)], of_modes[id(measurement)]
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             moments = np.asarray(push_moments(plant, 2 * degree, moments))
-        check_moments(moments, k, 2 * degree)
+        check_finite_moments(moments, k, 2 * degree)
         # Process noise: what the mode's draw adds, and the plant's.
         after, carried = products_of_monomials(moments, n + 1, degree), moved @ before @ moved.T
         chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
@@ -179,7 +179,10 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     start = first(plant)
     n, m = len(start.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
-    routes, moments = model_routes(plant, sensor, channel, 2 * degree, horizon), initial_moments(start, 2 * degree)
+    routes, moments = (
+        model_routes(plant, sensor, channel, 2 * degree, horizon),
+        initial_monomial_moments(start, 2 * degree),
+    )
     # Memory: monomials times the indicator of each joint mode.
     if first(channel).remembers:
         projection = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))
@@ -221,7 +224,7 @@ def _lift_steps(
         # Cov(w) from the moments before the step; then the moments after it, and Cov(v) from those.
         process, rounding_of_process = plant_lift.conditional_spread(moments)
         moments = plant_lift.push(moments)
-        check_moments(moments, k, 2 * degree)
+        check_finite_moments(moments, k, 2 * degree)
         noise, rounding_of_noise = measurement_lift.conditional_spread(moments)
         parts.append((*affine(plant_lift.matrix), process, *affine(measurement_lift.matrix), noise))
         roundings.append((rounding_of_process, rounding_of_noise))
@@ -307,7 +310,7 @@ def linear_rows(variables: int, degree: int, expected: int | None = None) -> Flo
     return rows
 
 
-def initial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
+def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
     """E[mono_order(x_0)]."""
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     shift = np.eye(len(plant.states) + 1)

@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.linear.lift import (
     affine,
     check_model,
-    initial_moments,
+    initial_monomial_moments,
     lifted_system,
     linear_rows,
     mean_and_spread,
@@ -51,7 +51,7 @@ def quadratic_system_with_linear_estimate(
     refuse_lift(2, total, m + n, horizon)
     # (x_0, q_0, 0) is an affine function of x_0.
     beginning = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
-    moments = push_known(beginning, 4, initial_moments(start, 4))
+    moments = push_known(beginning, 4, initial_monomial_moments(start, 4))
     before = products_of_monomials(moments, total + 1, 2)
     mean, spread = mean_and_spread(before)
     received, parts, rounding, stored = _make_received_products(n, m), [], [], _MomentCache()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.factors.columns import rounding_of
-from heliograph.factors.roots import observe_root, roots_of, square
+from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last
 from heliograph.model.estimate import Claim, weakest
@@ -82,9 +82,9 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     last: tuple[np.ndarray, np.ndarray] | None = None
     for k in range(system.horizon):
         if k > steady and (k - steady) % SPAN == 0:
-            if last is not None and _has_converged((square(root), rounding), last, transition):
+            if last is not None and _has_converged((covariance_of_root(root), rounding), last, transition):
                 break  # what follows is the same, to rounding
-            last = square(root), rounding
+            last = covariance_of_root(root), rounding
         s = system.step(k)
         noises = take_noise_roots(s, size) if 0 < k <= steady else noises
         gain, predicted, root = covariance_step(root, s, noises)
@@ -92,10 +92,19 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
         expected = s.output @ s.transition, s.output @ s.drift + s.offset
         estimate = projection @ transition, projection @ gain, projection @ offset
-        claimed = square(projection @ root)
-        innovation = square(s.output @ predicted) + s.noise
+        claimed = covariance_of_root(projection @ root)
+        innovation = covariance_of_root(s.output @ predicted) + s.noise
         parts.append(
-            (transition, gain, offset, *estimate, *expected, claimed, square(projection @ predicted), innovation)
+            (
+                transition,
+                gain,
+                offset,
+                *estimate,
+                *expected,
+                claimed,
+                covariance_of_root(projection @ predicted),
+                innovation,
+            )
         )
         # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
         rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T

@@ -21,8 +21,8 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import (
     Propagated,
-    correct,
-    initial_moments,
+    correct_moments,
+    initial_error_moments,
     linear_maps,
     propagate_slots,
     step_moments,
@@ -80,7 +80,7 @@ _propagate = compile_in_float64(propagate_slots)
 
 def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
     """Covariance of (x_0, e_1 .. e_F)."""
-    return initial_moments(network.initial()[1], len(network.filters))
+    return initial_error_moments(network.initial()[1], len(network.filters))
 
 
 def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
@@ -318,6 +318,6 @@ def _relay_sides(steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Arr
 
     def single(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, RelaySide]:
         p, gain = row
-        return correct(step_moments(p, moments)[0], gain * p.receives_in_slot), relay_side(p, moments, gain)
+        return correct_moments(step_moments(p, moments)[0], gain * p.receives_in_slot), relay_side(p, moments, gain)
 
     return jax.lax.scan(single, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

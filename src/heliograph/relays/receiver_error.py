@@ -23,7 +23,7 @@ from heliograph.relays.design import (
 )
 from heliograph.relays.second_moments import (
     best_gain,
-    correct,
+    correct_moments,
     gain_hessian,
     gain_mask,
     moment_adjoint,
@@ -257,7 +257,7 @@ def _backward_sweep(
     def ahead_of(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain = row
         z, _ = step_moments(p, moments)
-        return correct(z, gain), z
+        return correct_moments(z, gain), z
 
     def back(ahead: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain, z_k, cost_k = row
@@ -278,13 +278,13 @@ def _forward_sweep(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax
         p, gain, ahead_k = row
         z, _ = step_moments(p, moments)
         gain = best_gain(z, ahead_k, gain, p)
-        after = correct(z, gain)
+        after = correct_moments(z, gain)
         return after, (gain, after)
 
     return jax.lax.scan(single, jnp.asarray(start), (steps, gains, ahead))[1]
 
 
-class Search(NamedTuple):
+class SweepSearch(NamedTuple):
     """Gains of the sweep, and the best gains with their cost: rounding may raise it at the end."""
 
     gains: Float[jax.Array, "time Fn R"]
@@ -302,14 +302,14 @@ def _alternate_sweeps(
 ) -> Float[Array, "time Fn R"]:
     """Alternate backward and forward sweeps from the local gains, and keep the best gains."""
 
-    def sweep(search: Search, _: jax.Array) -> tuple[Search, None]:
+    def sweep(search: SweepSearch, _: jax.Array) -> tuple[SweepSearch, None]:
         gains, moments = _forward_sweep(steps, start, search.gains, _backward_sweep(steps, start, cost, search.gains))
         value = jnp.sum(cost * moments)
         better = value < search.cost
         best = jnp.where(better, gains, search.best)
-        return Search(gains, best, jnp.where(better, value, search.cost)), None
+        return SweepSearch(gains, best, jnp.where(better, value, search.cost)), None
 
     first = jnp.asarray(local_gains)
     value = jnp.sum(cost * propagate_slots(steps, start, first).moments[1:])
-    search, _ = jax.lax.scan(sweep, Search(first, first, value), jnp.asarray(count))
+    search, _ = jax.lax.scan(sweep, SweepSearch(first, first, value), jnp.asarray(count))
     return search.best

@@ -33,7 +33,7 @@ class LinearMaps(NamedTuple):
     sent: Float[jax.Array, "T sources"]
 
 
-def initial_moments(covariance: Float[np.ndarray, "n n"], filters: int) -> Float[np.ndarray, "d d"]:
+def initial_error_moments(covariance: Float[np.ndarray, "n n"], filters: int) -> Float[np.ndarray, "d d"]:
     """Covariance of (x, e_1 .. e_F) where every filter starts at the mean: each e_f is x - E x."""
     return np.asarray(np.kron(np.ones((1 + filters, 1 + filters)), covariance))
 
@@ -83,7 +83,7 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
     return z, Sent(second, power)
 
 
-def correct(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
+def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
     """Covariance of eta+ = eta+ before corrections - (0; K) innovations."""
     rows, received = gain.shape
     d = z.shape[0] - received
@@ -156,7 +156,7 @@ def propagate_slots(
         p, gain = row
         z, sent = step_moments(p, moments)
         used = local_gain(z, p) if gain is None else gain * p.receives_in_slot
-        after = correct(z, used)
+        after = correct_moments(z, used)
         return after, (used if gain is None else gain, after, sent.power)
 
     start = jnp.asarray(start)
@@ -203,5 +203,5 @@ def best_gain(
 
 def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:
     """Gradient of <Lam, moments after the step> by the moments before it, the adjoint of the propagation."""
-    _, pull = jax.vjp(lambda m: correct(step_moments(step, m)[0], gain), jnp.zeros_like(ahead))
+    _, pull = jax.vjp(lambda m: correct_moments(step_moments(step, m)[0], gain), jnp.zeros_like(ahead))
     return symmetrize(pull(ahead)[0])

@@ -18,7 +18,7 @@ from heliograph.filters.linear.polynomial import MeanBeforeData, PolynomialFilte
 from heliograph.filters.linear.scheduled import LinearSystemFilter
 from heliograph.filters.modes.additive import AdditiveModalFilter
 from heliograph.filters.modes.mixture import AtomCombinations, MixtureFilter
-from heliograph.filters.modes.modal import ModalFilter, ObservationModel
+from heliograph.filters.modes.modal import ChannelByMode, ModalFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.patterns import SideInformation
 from heliograph.filters.modes.side_information import SideInformationFilter
@@ -35,7 +35,7 @@ from heliograph.random_affine.moments.monomials import exponents
 from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, describe_second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 
-Modes = TypeVar("Modes", SideInformation, ObservationModel)  # a channel at one step, mode by mode
+Modes = TypeVar("Modes", SideInformation, ChannelByMode)  # a channel at one step, mode by mode
 
 
 class InUnits(Module):

@@ -17,7 +17,7 @@ from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
 from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, condition_on_received
-from heliograph.filters.gaussian.transform import evaluate_at_points
+from heliograph.filters.gaussian.transform import evaluate_beside_mean
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
@@ -129,7 +129,7 @@ class MixedCross(AbstractFilter):
     def predict(self, state: Propagated, u: ArrayLike = (), k: Step = 0) -> Propagated:
         """Move the points, and keep them."""
         plant, x = at(self.base.plant, k), state.belief
-        moved = evaluate_at_points(
+        moved = evaluate_beside_mean(
             lambda x: plant.transition(x, jnp.asarray(u)), x, square_root(len(x.mean) * x.variances)
         )
         return Propagated(*self.base.predict(x, u, k), *moved)
@@ -138,7 +138,7 @@ class MixedCross(AbstractFilter):
     def correct(self, state: Propagated, z: ArrayLike, k: Step = 0) -> tuple[Propagated, Innovation]:
         """Redraw for y only, correct."""
         sensor, channel, x = at(self.base.sensor, k), at(self.base.channel, k), state.belief
-        ahead, behind = evaluate_at_points(sensor.measure, x, square_root(len(x.mean) * x.variances))
+        ahead, behind = evaluate_beside_mean(sensor.measure, x, square_root(len(x.mean) * x.variances))
         y = jnp.concatenate([ahead, behind], axis=1)
         points = jnp.concatenate([state.ahead, state.behind], axis=1)
         mean, count = jnp.mean(y, axis=1), y.shape[1]

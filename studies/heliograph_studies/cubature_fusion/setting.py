@@ -10,7 +10,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.gaussian.bounds import as_array, as_scalars, observe_by_young
+from heliograph.filters.gaussian.bounds import as_scalars, observe_by_young, scalars_as_array
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal
 from heliograph.filters.gaussian.transform import AbstractTransform
@@ -32,7 +32,7 @@ class LooseInterval(AbstractUpdate):
     scalars: np.ndarray
 
     def __init__(self, scalars: hg.filters.Scalars | None = None):
-        self.scalars = as_array(scalars)
+        self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: hg.random_affine.AbstractRandomAffine) -> SecondOrder:
         """Worst cases from intervals.

@@ -46,7 +46,7 @@ class Scalars(Module):
             raise fail("scalars of the bound", "two positive numbers", (first, second))
 
 
-def as_array(scalars: Scalars | None) -> np.ndarray:
+def scalars_as_array(scalars: Scalars | None) -> np.ndarray:
     """Scalars as two numbers, NaN where the trace is to be minimised over them."""
     if scalars is None:
         return np.full(2, np.nan)
@@ -54,7 +54,7 @@ def as_array(scalars: Scalars | None) -> np.ndarray:
 
 
 def as_scalars(values: np.ndarray) -> Scalars | None:
-    """Scalars from two numbers, None for NaN: the inverse of `as_array`."""
+    """Scalars from two numbers, None for NaN: the inverse of `scalars_as_array`."""
     return None if np.isnan(values).any() else Scalars(*values)
 
 

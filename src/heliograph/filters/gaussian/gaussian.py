@@ -129,7 +129,7 @@ def correct_signal(
     return rule.condition(unknown, channel, received, nominal), innovation
 
 
-def describe_channel(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
+def describe_channel_moments(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
     """Describe the channel's second moments in the form of the update, for each step where it varies."""
     described: SecondOrder | OverTime = at_each_step(update.describe, channel)
     return described
@@ -162,7 +162,7 @@ def _make_gaussian_filter(
     premise = Premise(plant, sensor, channel)
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
-    described = describe_channel(channel, update)
+    described = describe_channel_moments(channel, update)
     pairs = zip(unstack(channel), unstack(described), strict=True)
     # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular

@@ -71,7 +71,7 @@ class Cubature(AbstractTransform):
         """Propagate the points and take their sample moments."""
         n = len(x.mean)
         steps = square_root(n * x.variances)
-        ahead, behind = evaluate_at_points(function, x, steps)
+        ahead, behind = evaluate_beside_mean(function, x, steps)
         even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
         weights = np.full(n, 1 / (4 * n))  # of what is twice as large
@@ -79,7 +79,7 @@ class Cubature(AbstractTransform):
         return Image(middle / 2, Columns(ahead - behind, weights), 2 * steps, curvature)
 
 
-def evaluate_at_points(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
+def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
     """f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each."""
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)

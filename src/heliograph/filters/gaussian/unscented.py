@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from heliograph.factors.columns import Columns, square_root
 from heliograph.factors.gaussian import Gaussian, Image
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
-from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_at_points
+from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_beside_mean
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
@@ -75,7 +75,7 @@ class Unscented(AbstractTransform):
         alpha, beta, kappa = (jnp.asarray(number) for number in (self.alpha, self.beta, self.kappa))
         scale = alpha**2 * (n + kappa)
         steps, here = square_root(scale * x.variances), function(x.mean)
-        ahead, behind = (values - here[:, None] for values in evaluate_at_points(function, x, steps))
+        ahead, behind = (values - here[:, None] for values in evaluate_beside_mean(function, x, steps))
         even = ahead + behind
         middle = jnp.sum(even, axis=1) * (1 / n)
         shift = middle * (n / (2 * scale))

@@ -14,11 +14,11 @@ import numpy as np
 from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.gaussian.bounds import (
     Scalars,
-    as_array,
     as_scalars,
     keep_where_unchanged,
     observe_by_young,
     observe_by_zero_mean,
+    scalars_as_array,
 )
 from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, condition_on_received
 from heliograph.model.estimate import Claim
@@ -120,7 +120,7 @@ class Polytope(AbstractUpdate):
     scalars: np.ndarray
 
     def __init__(self, scalars: Scalars | None = None):
-        self.scalars = as_array(scalars)
+        self.scalars = scalars_as_array(scalars)
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
@@ -180,7 +180,7 @@ class Interval(AbstractUpdate):
     scalars: np.ndarray
 
     def __init__(self, scalars: Scalars | None = None):
-        self.scalars = as_array(scalars)
+        self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
         """Worst cases from intervals.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.gaussian import correct_signal, describe_channel
+from heliograph.filters.gaussian.gaussian import correct_signal, describe_channel_moments
 from heliograph.filters.gaussian.signal import Signal, signal_size_at_start
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
@@ -177,7 +177,7 @@ def linear_filter(
         return modal_filter(plant, sensor, channel)
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
-    described = describe_channel(channel, rule)
+    described = describe_channel_moments(channel, rule)
     whole = described.values if isinstance(described, OverTime) else described
     start = first(plant)
     return LinearFilter(

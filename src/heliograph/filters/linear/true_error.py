@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import LinearStep, PlannedFilter
-from heliograph.filters.modes.modal import ObservationModel, observation_models
+from heliograph.filters.modes.modal import ChannelByMode, channels_by_mode
 from heliograph.linear.jump_system import mix_modes, propagate_by_mode
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.enlarged import with_past
@@ -86,7 +86,7 @@ def true_error(
     if first(channel).past:
         plant, sensor, channel = with_past(plant, sensor, channel)
     begin, total = first(plant), len(first(plant).states)
-    initial, world = observation_models(channel)
+    initial, world = channels_by_mode(channel)
     projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
     # N_j at the start, with r = (x, 1, s).
     mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
@@ -117,9 +117,7 @@ def _propagate_moments(
     return np.asarray(propagate_by_mode(move, before, before[:, n, n, None, None] * noise))
 
 
-def _correct_moments(
-    moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, step: LinearStep
-) -> np.ndarray:
+def _correct_moments(moments: np.ndarray, sensor: LinearSensor, world: ChannelByMode, step: LinearStep) -> np.ndarray:
     """Propagate moments through s = s- + K (z - C s- - c), z = (G, n) of the mode times y~ = C~ x~ + v."""
     p, n = sensor.matrix.shape
     gain, mean, law = np.asarray(step.gain), np.asarray(world.mean), moments[:, n, n, None, None]

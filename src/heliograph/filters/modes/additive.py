@@ -24,15 +24,15 @@ from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.modal import (
     AbstractModalFilter,
+    ChannelByMode,
     MeasurementModel,
-    ObservationModel,
     centred_measurement,
     centred_transition,
+    channels_by_mode,
     claim_of_modes,
     concatenate_modes,
     covariance_of_mode,
     kron,
-    observation_models,
     observe_modes,
     pad_with_zeros,
     predict_by_mode,
@@ -48,7 +48,7 @@ from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.superposed import terms_without_common_memory
 
-Terms = tuple[ObservationModel | OverTime, ...]  # of a sum, each with modes of its own
+Terms = tuple[ChannelByMode | OverTime, ...]  # of a sum, each with modes of its own
 Laws = tuple[jax.Array, ...]  # of the modes of each term
 
 
@@ -180,7 +180,7 @@ class AdditiveModalFilter(AbstractModalFilter):
 
     def _measurement_model(self, state: AdditiveBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, H from Hbar and the D_a, and columns of Cov v."""
-        terms: tuple[ObservationModel, ...] = at(self.terms, k)
+        terms: tuple[ChannelByMode, ...] = at(self.terms, k)
         sensor = at(self.sensor, k)
         # H: the gain of each function, times C~ of the centred state.
         measure, noise = centred_measurement(sensor, state.centre)
@@ -208,7 +208,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         return MeasurementModel(concatenate_modes(matrix.at[0, :, -1].set(0.0)), common, noise_columns)
 
 
-def _gains_by_function(terms: Sequence[ObservationModel], laws: Laws) -> jax.Array:
+def _gains_by_function(terms: Sequence[ChannelByMode], laws: Laws) -> jax.Array:
     """Return Hbar and all D_a, stacked: (1 + functions, m, p + 1)."""
     means = [jnp.asarray(term.mean) for term in terms]
     whole = sum(jnp.einsum("j,jmp->mp", law, mean) for law, mean in zip(laws, means, strict=True))
@@ -249,7 +249,7 @@ def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -
 
 def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
     """Best linear filter behind the sum of these terms, each with all outputs and inputs, which share no memory."""
-    laws, models = zip(*(observation_models(term) for term in terms), strict=True)
+    laws, models = zip(*(channels_by_mode(term) for term in terms), strict=True)
     claim: Claim = "exact" if all(claim_of_modes(term) == "exact" for term in terms) else "nominal"
     sizes = make_sizes(claim, first(plant), first(terms[0]).outputs)
     return AdditiveModalFilter(plant=plant, sensor=sensor, terms=models, initial=laws, **sizes)

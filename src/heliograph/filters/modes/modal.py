@@ -44,7 +44,7 @@ from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import divide_spread, join_gain_and_noise, nominal_spread
 
 
-class ObservationModel(Module):
+class ChannelByMode(Module):
     """A channel at one step, mode by mode: E[(G, n) | mode], and what (G, n) varies by about it.
 
     transition: of the modes from the step before to this one; radius: bound on the error of each of its entries;
@@ -138,7 +138,7 @@ class AbstractModalFilter(AbstractSizedFilter):
 class AbstractJointModalFilter(AbstractModalFilter):
     """Linear filter of the state jointly with the mode of all links together."""
 
-    channel: ObservationModel | OverTime
+    channel: ChannelByMode | OverTime
     initial: Float[Array, " M"]
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
@@ -264,7 +264,7 @@ def separate_modes(among: jax.Array) -> Columns:
     return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
 
 
-def known_noise(channel: ObservationModel, sent: Columns, law: jax.Array) -> Columns:
+def known_noise(channel: ChannelByMode, sent: Columns, law: jax.Array) -> Columns:
     """Columns (m, M columns) of sum_j P(j) (Hbar_j Cov(v) Hbar_j' + Cov n_j), which no signal scales."""
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     through = Columns(gains @ sent.matrix, jnp.broadcast_to(sent.weights, (len(law), len(sent.weights))))
@@ -372,7 +372,7 @@ def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalF
 
 def build_from_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> M:
     """Build a filter of this kind with the channel's observation models."""
-    start, (initial, described) = first(plant), observation_models(channel)
+    start, (initial, described) = first(plant), channels_by_mode(channel)
     return kind(
         plant=plant,
         sensor=sensor,
@@ -382,22 +382,22 @@ def build_from_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel:
     )
 
 
-def observation_models(channel: Channel) -> tuple[Float[Array, " M"], ObservationModel | OverTime]:
+def channels_by_mode(channel: Channel) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
     """Law of the modes at the first step, and the observation model of each; links without memory have one mode."""
     if not isinstance(channel, OverTime):
         modes = joint_modes(channel)
-        return modes.initial, observation_model(modes, modes)
+        return modes.initial, channel_by_mode(modes, modes)
     steps = [joint_modes(c) for c in unstack(channel)]
-    models = [observation_model(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    models = [channel_by_mode(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
     return steps[0].initial, over_time(models)
 
 
-def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
+def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
     """Moments of the channel by mode at one step, and the transition from the step before."""
     mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
     gains, noises = zip(*(divide_spread(nominal_spread(m).center) for m in now.maps), strict=True)
     noise = Columns(*(stack_parts(part) for part in zip(*noises, strict=True)))
-    return ObservationModel(before.transition, before.radius, mean, stack_parts(gains), noise)
+    return ChannelByMode(before.transition, before.radius, mean, stack_parts(gains), noise)
 
 
 def claim_of_modes(channel: Channel) -> Claim:
