@@ -36,7 +36,7 @@ def test_the_map_names_no_file_that_is_gone():
 @pytest.mark.parametrize(
     ("above", "below", "most"),
     [
-        (("design", "application"), "estimation", 44),
+        (("design", "application"), "estimation", 42),
         (("application",), "estimation", 28),
     ],
 )
