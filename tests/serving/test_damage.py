@@ -199,7 +199,7 @@ def test_a_store_of_an_older_release_is_refused_by_its_layout_and_release(tmp_pa
     with pytest.raises(InputError) as refused:
         Store(str(place), mine, carrier=Carrier(here, mine, said.append) if accepts else None)
     assert str(refused.value) == (
-        f"store {place}: expected layout 4, of heliograph {mine['heliograph']}, got layout 1, of heliograph "
+        f"store {place}: expected layout 5, of heliograph {mine['heliograph']}, got layout 1, of heliograph "
         "0.1.0, whose plants cannot be carried over; to begin anew, name another"
     )
     assert not said

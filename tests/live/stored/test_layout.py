@@ -37,6 +37,21 @@ def test_an_older_layout_is_that_of_now_with_covariances():
         assert not can_read(other, NEW)
 
 
+def test_a_gaussian_that_is_a_part_of_its_own_stood_beside_the_others():
+    """Its parts are found under their old paths, as factors and as a covariance; one that was nested stays."""
+    new = {".gaussian" + path: shape for path, shape in NEW.items() if path[1:] in ("mean", "lower", "variances")}
+    new |= {".law": [4], ".errors.gaussian.mean": [2]}
+    flat = {path.replace(".gaussian", ""): shape for path, shape in new.items()}
+    old = {".mean": [2, 3], ".covariance": [2, 3, 3], ".law": [4], ".errors.mean": [2]}
+    assert describe_old_layout(new) == old
+    assert can_read(flat, new) and can_read(old, new) and can_read(new, new) and not can_read(new, flat)
+    parts = {path: np.full(shape, float(i)) for i, (path, shape) in enumerate(flat.items())}
+    assert [part.flat[0] for part in relocate_parts(parts, new).values()] == [0, 1, 2, 3, 4]
+    assert can_read(
+        {path: shape for path, shape in old.items() if path != ".errors.mean"} | {".errors.gaussian.mean": [2]}, new
+    )
+
+
 def test_a_sum_of_an_event_filter_has_its_parts_in_the_order_that_they_had_with_covariances():
     """Snapshots without names of parts are read by this order."""
     sensor = hg.LinearSensor([[1.0]], 0.1)

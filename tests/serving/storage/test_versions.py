@@ -84,7 +84,7 @@ def test_a_store_of_the_version_before_is_named_in_one_line_and_stays_as_it_is(p
     with pytest.raises(InputError) as refused:
         Store(str(place), identity(Fleet(lanes, OPTIONS)))
     assert str(refused.value) == (
-        f"store {place}: expected layout 4, of heliograph {hg.__version__}, got layout 3, of heliograph 0.2.0; "
+        f"store {place}: expected layout 5, of heliograph {hg.__version__}, got layout 3, of heliograph 0.2.0; "
         "to begin anew, name another; --accept-changes goes on with what fits"
     )
     assert content(place) == before

@@ -1,7 +1,7 @@
-"""Layouts of stored states: shapes by the path of each part, and covariances of older ones as the factors of now.
+"""Layouts of stored states: shapes by the path of each part, and the parts of older ones as those of now.
 
 Until version 0.3.0 a filter's state held a covariance, `.covariance` (..., n, n), where it holds `.lower` and
-`.variances` now. Nothing else has moved.
+`.variances` now. States of more than a Gaussian held its parts themselves, which are those of `.gaussian` now.
 """
 
 import sys
@@ -13,7 +13,8 @@ import numpy as np
 
 from heliograph.numerics.types import PyTree
 
-COVARIANCE, LOWER, VARIANCES = ".covariance", ".lower", ".variances"
+MEAN, COVARIANCE, LOWER, VARIANCES = ".mean", ".covariance", ".lower", ".variances"
+NESTED = ".gaussian"
 
 Shapes = Mapping[str, Sequence[int]]  # of a state's parts, by their paths
 Columns = Mapping[str, Mapping[str, Sequence[Any]]]  # by filter and path a part's shape, and its columns' begin and end
@@ -28,30 +29,31 @@ def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
 
 def can_read(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`: all shapes are there, or covariances."""
-    shapes = {path: list(shape) for path, shape in old.items()}
-    for stem in _find_factored(old, new):
+    shapes, places = {path: list(shape) for path, shape in old.items()}, _trace_paths(old, new)
+    for stem in _find_factored(old, places.values()):
         *lead, n, _ = shapes.pop(stem + COVARIANCE)
         shapes |= {stem + LOWER: [*lead, n * (n - 1) // 2], stem + VARIANCES: [*lead, n]}
-    return shapes == {path: list(shape) for path, shape in new.items()}
+    return shapes == {places[path]: list(shape) for path, shape in new.items()}
 
 
 def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
     """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
-    results, new = dict(parts), list(new)
-    for stem in _find_factored(parts, new):
+    results, places = dict(parts), _trace_paths(parts, new)
+    for stem in _find_factored(parts, places.values()):
         results[stem + LOWER], results[stem + VARIANCES] = factorise(results.pop(stem + COVARIANCE))
-    return {path: results[path] for path in new}
+    return {path: results[place] for path, place in places.items()}
 
 
 def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
     """Return the layout that a state of the layout `new` had until version 0.3.0, in its order."""
     results: dict[str, list[int]] = {}
     for path, shape in new.items():
-        stem = path.removesuffix(VARIANCES)
-        if path.endswith(VARIANCES) and results.pop(stem + LOWER, None) is not None:
+        place = _flatten_path(path)
+        stem = place.removesuffix(VARIANCES)
+        if place.endswith(VARIANCES) and results.pop(stem + LOWER, None) is not None:
             results[stem + COVARIANCE] = [*shape, shape[-1]]
         else:
-            results[path] = list(shape)
+            results[place] = list(shape)
     return results
 
 
@@ -103,6 +105,18 @@ def factorise(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         lower[..., j + 1 :, j] = share
         rest[..., j + 1 :, j + 1 :] -= share[..., :, None] * below[..., None, :]
     return lower[..., *np.tril_indices(n, -1)], variances
+
+
+def _trace_paths(old: Iterable[str], new: Iterable[str]) -> dict[str, str]:
+    """Return where each part of now stood in an older state: under its path, or beside the Gaussian that has it now."""
+    there = set(old)
+    return {path: path if path in there else _flatten_path(path) for path in new}
+
+
+def _flatten_path(path: str) -> str:
+    """Return the path that a part of a nested Gaussian had before."""
+    stem, dot, name = path.rpartition(".")
+    return stem.removesuffix(NESTED) + dot + name if dot + name in (MEAN, LOWER, VARIANCES) else path
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:

@@ -6,8 +6,9 @@ from zlib import crc32
 
 from sqlalchemy import BigInteger, Column, LargeBinary, MetaData, String, Table, Text
 
-# Of these tables: those of layout 1 had no checksums, of 2 no description of the network, of 3 covariances in states.
-LAYOUT, CARRIED = "4", ("3", "4")  # that of now, and those whose plants can be carried over
+# Of these tables: those of layout 1 had no checksums, of 2 no description of the network, of 3 covariances in states,
+# of 4 the parts of a state's Gaussian beside its others.
+LAYOUT, CARRIED = "5", ("3", "4", "5")  # that of now, and those whose plants can be carried over
 LAYOUT_KEY = "layout of the store"
 TABLES = MetaData()
 PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
