@@ -36,7 +36,7 @@ def looked(
 ) -> Watch:
     """Look at a page of a service that has taken so many rows."""
     watch = Watch(["<i>x</i>", "v"]) if watch is None else watch
-    watch.over(service).take([str(i).encode() for i in range(rows)])
+    watch.wrap(service).take([str(i).encode() for i in range(rows)])
 
     async def work() -> None:
         async with shown(watch, PageAddress("127.0.0.1", 0, token)) as port:
@@ -196,7 +196,7 @@ def test_what_is_lost_of_messages_without_a_count_is_not_counted():
 
 def test_many_nodes_have_one_warning_of_a_kind():
     watch, service = Watch(["x", "v"]), Scripted(nodes=5)
-    watch.over(service).take([b"0"])
+    watch.wrap(service).take([b"0"])
     for i, link in enumerate(service.plants["mower"].links.values()):
         link.late, link.future = i, int(i == 3)
     late, clock = watch.view(None)["warnings"]
@@ -224,7 +224,7 @@ def test_a_fusion_of_estimates_is_judged_by_what_it_fuses_and_a_dead_sender_is_a
     for scale, doubted in ((1.0, False), (3.0, True)):
         watch = Watch(["x", "v"], "tank", "steps", {"both": ("upper", parts)})
         assert watch.view(None)["tests"] == []  # nothing to judge by yet
-        watch.over(Scripted(scale, nodes=2, senders=SENDERS)).take([str(i).encode() for i in range(300)])
+        watch.wrap(Scripted(scale, nodes=2, senders=SENDERS)).take([str(i).encode() for i in range(300)])
         view = watch.view(None)
         fused = view["tests"][-1]
         assert (fused["node"], fused["filter"], fused["claim"], fused["doubt"]) == ("fused", "both", "upper", doubted)

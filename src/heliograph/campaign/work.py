@@ -27,7 +27,6 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import split_by_name, split_measurements
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep
 from heliograph.simulation.simulate import monte_carlo
 
@@ -184,7 +183,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """Arrange the collected errors by node and filter."""
         results = {
-            field: split_by_name(network, collected, itemgetter(field), axis)
+            field: self.split_by_name(network, collected, itemgetter(field), axis)
             for field, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))
         }
         estimates = {
@@ -193,7 +192,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
         }
         if not self.world:
             return {"estimates": estimates}
-        measurements = split_measurements(network, collected["measurements"])
+        measurements = self.split_measurements(network, collected["measurements"])
         return {"estimates": estimates, "truth": collected["truth"], "measurements": measurements}
 
 

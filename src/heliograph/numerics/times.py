@@ -109,7 +109,7 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
     labels = getattr(rows, "index", None)
     if hasattr(rows, "dims") and hasattr(rows, "coords"):
         dims: Any = rows.dims
-        labels = rows.coords.get(dims[0]) if dims else None
+        labels = rows.coords.get(next(iter(dims))) if dims else None
     if labels is None or callable(labels):  # a list has a function of that name
         return None
     shown = np.asarray(labels)

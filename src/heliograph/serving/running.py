@@ -14,7 +14,7 @@ from heliograph.files.json_field import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import NetworkProgram
-from heliograph.numerics.check import TINY, check_count, fail, scalar
+from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.serving.ahead import Spans
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
@@ -40,8 +40,12 @@ def make_transport(address: Address, part: Part = WHOLE, translator: Translator 
         translator: what reads the topics of others; None reads those of the service alone.
 
     Raises:
-        ValueError: an OPC UA server without sources.
+        ValueError: no address, part or translator; an OPC UA server without sources.
     """
+    instance("address", address, Address, "an Address")
+    instance("part", part, Part, "a Part")
+    if translator is not None:
+        instance("translator", translator, Translator, "a Translator, or None")
     if address.kind == "opc.tcp":
         if translator is None:
             raise fail(f"{address}", "sources in the network's file, by identifiers of variables", "none")

@@ -75,10 +75,6 @@ from .results.sums import (
 from .results.statistics_by_name import (
     StatisticsByName as StatisticsByName,
 )
-from .results.by_name import (
-    split_by_name as split_by_name,
-    split_measurements as split_measurements,
-)
 from .results.consistency import (
     Consistency as Consistency,
 )

@@ -18,7 +18,7 @@ from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.premise import believing
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
@@ -184,13 +184,14 @@ def node_network(network: Network, node: str) -> Network:
         node: name of the node.
 
     Raises:
-        ValueError: not one fusion between neighbours, no node of it, one that cannot run by itself.
+        ValueError: no network, not one fusion between neighbours, no node of it, one that cannot run by itself.
     """
+    instance("network", network, Network, "a Network")
     if len(network.meshes) != 1:
         raise fail("a node by itself", "a network with one fusion between neighbours", list(network.meshes) or "none")
     (name,) = network.meshes
     nodes = network.mesh_nodes(name)
-    if node not in nodes:
+    if text("node", node) not in nodes:
         raise fail("node", f"one of fusion {name!r}: {', '.join(nodes)}", repr(node))
     senders = (network.meshes[name].neighbours or {})[node]
     received = {j: _numbers(len(network.states), network.nodes[j].received) for j in senders}

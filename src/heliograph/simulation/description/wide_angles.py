@@ -11,6 +11,8 @@ from heliograph.filters.gaussian.unscented import Unscented
 from heliograph.model.over_time import first
 from heliograph.model.sensor import is_linear
 from heliograph.numerics.angle import TURN
+from heliograph.numerics.check import instance
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.record import Record
@@ -61,13 +63,21 @@ def wide_in_rows(network: Network, record: Record) -> Iterator[str]:
                 yield f"{node}/{label}: {known} {rows}; {REMEDY}"
 
 
+@readable
 class WideAngles:
     """Watch the variances of a filter's states, in rows of an array, for an angle known less well than it can use.
 
     Each angle is said once. `states` are the names of those that are watched, by their places.
+
+    Args:
+        filter: the filter.
+
+    Raises:
+        ValueError: no filter.
     """
 
     def __init__(self, filter: AbstractFilter):
+        instance("filter", filter, AbstractFilter, "a filter")
         used = None if filter.claim == "none" else filter.angles_used()
         self.states = {} if used is None else {i: filter.states[i] for i in used.states}
         self._most = largest_deviation(filter) if self.states else np.inf

@@ -1,9 +1,9 @@
 """Reducers of simulated runs: sums and collected results, step by step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
-from typing import Generic, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +71,28 @@ class AbstractReducer(Module, Generic[Result]):
     def joined(self, results: Sequence[Result], network: Network) -> Result:
         """Join the results of parts of a network, each of some of its nodes with the same plant and runs."""
         raise unwritten(self, "joined")
+
+    def split_by_name(
+        self, network: Network, collected: PyTree, read: Callable[[PyTree], Any], axis: int
+    ) -> dict[str, dict[str, np.ndarray]]:
+        """Split what was collected of estimates by node and filter, for `finish`.
+
+        Args:
+            network: the network.
+            collected: "estimates" and "fused", as `of_step` had them in a step.
+            read: gives the array of an entry.
+            axis: of the filters in that array; the nodes' follows it.
+        """
+        return split_by_name(network, collected, read, axis)
+
+    def split_measurements(self, network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        """Split measurements of the groups of nodes (..., node, received) by node, for `finish`.
+
+        Args:
+            network: the network.
+            groups: measurements of each group, as `of_step` had them in a step.
+        """
+        return split_measurements(network, groups)
 
     def others(self, filtered: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
         """Return the result with that of smoothed estimates, whose claims these are, as its `smoothed`.

@@ -134,10 +134,7 @@ def whitened_innovations(
     Raises:
         ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
     """
-    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    if filter.claim == "none":
-        raise fail("filter", "one that claims a covariance", "one that claims none")
-    return np.asarray(score_innovations(filter, *check_data(filter, data, inputs))[1])
+    return np.asarray(score_innovations(filter, data, inputs)[1])
 
 
 def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
@@ -147,19 +144,27 @@ def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray
 
 
 def score_innovations(
-    filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+    filter: AbstractFilter,
+    data: Float[ArrayLike, "steps m"],
+    inputs: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
 
     NaN where it did not arrive, counted less than half, or the components before it determine it. The same as
-    `whitened_innovations`, unchecked, in one pass with the likelihoods.
+    `whitened_innovations`, in one pass with the likelihoods.
 
     Args:
         filter: a filter that claims a covariance.
-        z: its measurements (steps, m).
-        u: its inputs (steps, inputs).
+        data: its measurements (steps, m), NaN where a component did not arrive.
+        inputs: its inputs (steps, inputs); by default a filter without any is assumed.
+
+    Raises:
+        ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
     """
-    likelihoods, white = compute_once(_innovations, _by_xla, (filter, z, u))
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    if filter.claim == "none":
+        raise fail("filter", "one that claims a covariance", "one that claims none")
+    likelihoods, white = compute_once(_innovations, _by_xla, (filter, *check_data(filter, data, inputs)))
     return likelihoods, white
 
 

@@ -15,7 +15,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate, lower_unsound_claim
-from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.check import InputError, fail, instance, is_whole, show_value
 from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.static import Static, cast
@@ -193,10 +193,13 @@ class RowSmoother:
         dt: place of the time step among the inputs; None where time counts steps.
 
     Raises:
-        ValueError: no filter that can be smoothed.
+        ValueError: no network, no place of an input, no filter that can be smoothed.
     """
 
     def __init__(self, network: Network, dt: int | None):
+        instance("network", network, Network, "a Network")
+        if dt is not None and not (is_whole(dt) and 0 <= dt < len(network.inputs)):
+            raise fail("dt", f"the place of one of {len(network.inputs)} inputs, or None", show_value(dt))
         self.network = network
         kinds = tuple(
             k for k, kind in enumerate(network.kinds) if _can_smooth(_get_filter(network, k, kind.filters[0]))
