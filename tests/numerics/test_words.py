@@ -189,6 +189,7 @@ def test_any_object_of_ours_answers_a_wrong_attribute_with_near_ones_or_the_func
         (b"no json", "b'no json', which is no JSON from byte 1 on"),
         (b"[1]", "[1], which is no object"),
         (b'{"node": "a"', "which is no JSON from byte 13 on"),
+        (b"time,a", "no JSON from byte 1 on; `heliograph replay` sends the rows of a table as messages"),
         (b"\xff", "which is no JSON"),
     ],
 )

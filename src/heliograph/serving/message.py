@@ -158,7 +158,9 @@ def _describe_payload(payload: bytes) -> str:
         return "brackets nested too deeply"
     except ValueError as error:
         where = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
-        return f"{show_value(payload)}, which is no JSON{where}"
+        row = b"," in payload and b"{" not in payload
+        table = "; `heliograph replay` sends the rows of a table as messages" if row else ""
+        return f"{show_value(payload)}, which is no JSON{where}{table}"
 
 
 def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
