@@ -30,7 +30,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
     """
     clock = read_dates(name, value)
     if clock is None:
-        if not is_traced(value) and isinstance(value, np.ndarray | list | tuple) and _holds_words(value):
+        if not is_traced(value) and _holds_words(value):
             raise fail(name, "numbers, or dates (datetime64, datetimes, texts of ISO 8601)", show_value(value))
         clock = array(name, value, (count,))
         whole = np.asarray(value)
@@ -46,7 +46,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 
 def _holds_words(value: object) -> bool:
-    """Test whether an array or a list is of texts or spans of time; a list of unequal lists is not."""
+    """Test whether a value is of texts or spans of time; a list of unequal lists is not."""
     try:
         return np.asarray(value).dtype.kind in "mSU"
     except ValueError:
