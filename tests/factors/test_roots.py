@@ -62,6 +62,23 @@ def test_an_output_that_repeats_another_says_nothing_and_takes_nothing_away(nois
     np.testing.assert_allclose(result.gain @ repeat, plain.gain, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (2, 0, 1)])
+@pytest.mark.parametrize("rounding", [0.0, 1e-15, 1e-14])
+def test_what_rounding_left_of_a_repeated_output_takes_nothing_from_the_others(order, rounding):
+    """z_3 = 0.85 z_1 with a noise known to 1e-14: of z_2, which comes after it, nothing may be lost.
+
+    The covariance is that of the outputs without the repeated one, to what a noise wrong by 1e-14 of itself changes.
+    """
+    p, h, r = problem(4, 2)
+    repeat = np.array([[1.0, 0.0], [0.85, 0.0], [0.0, 1.0]])[list(order)]
+    sent = repeat @ r @ repeat.T
+    sent = sent * (1 + rounding * np.random.default_rng(1).normal(size=sent.shape))
+    plain = observe_root(roots_of(p), h, roots_of(r))
+    result = observe_root(roots_of(p), repeat @ h, roots_of((sent + sent.T) / 2))
+    np.testing.assert_allclose(result.covariance, plain.covariance, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(result.gain @ repeat, plain.gain, rtol=1e-9, atol=1e-9)
+
+
 def test_it_is_the_update_of_the_filters():
     """The same numbers as those of `condition_on_observation`, which takes components one after another."""
     p, h, r = problem(4, 3)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.factors.columns import RANK
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Bool, Float
 
 
 class Observed(NamedTuple):
@@ -48,27 +48,42 @@ def observe_root(
 
     [[N, C W], [0, W]] = [[V, 0], [K V, W+]] U with an orthogonal U and V V' = C P C' + N N': sums of squares alone,
     each row known to eps of its length. A component of which those before it leave less than RANK of its variance has
-    the gain zero, since a covariance that is given is not known to more, and its column stays in W+.
+    the gain zero, since a covariance that is given is not known to more. It comes last, so that the direction which
+    rounding left of it takes nothing from the others, and its column stays in W+.
 
     Source: Morf and Kailath, Square-root algorithms for least-squares estimation (1975).
     """
     (m, n), through = output.shape[-2:], output @ root
     noise, root = (np.broadcast_to(part, (*through.shape[:-2], *part.shape[-2:])) for part in (noise, root))
+    measured = np.concatenate([noise, through], axis=-1)
+    says = _find_rows_that_add(measured)
+    order = np.argsort(~says, axis=-1, kind="stable")
+    says, measured = np.take_along_axis(says, order, axis=-1), np.take_along_axis(measured, order[..., None], axis=-2)
     nothing = np.zeros((*through.shape[:-2], n, noise.shape[-1]))
-    rows = np.concatenate(
-        [np.concatenate([noise, through], axis=-1), np.concatenate([nothing, root], axis=-1)], axis=-2
-    )
+    rows = np.concatenate([measured, np.concatenate([nothing, root], axis=-1)], axis=-2)
     # At least as many columns as rows, so that the triangle is whole.
     short = max(m + n - rows.shape[-1], 0)
     rows = np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, short)])
     lower = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r")).swapaxes(-1, -2)
     # K from K V, the last column first.
     total, moved = lower[..., :m, :m], lower[..., m:, :m]
-    pivot = np.diagonal(total, axis1=-2, axis2=-1)
-    says = pivot**2 > RANK * np.sum(total**2, axis=-1)
-    inverse, gain = np.where(says, 1 / np.where(says, pivot, 1.0), 0.0), np.zeros_like(moved)
+    inverse = np.where(says, 1 / np.where(says, np.diagonal(total, axis1=-2, axis2=-1), 1.0), 0.0)
+    gain = np.zeros_like(moved)
     for j in reversed(range(m)):
         rest = moved[..., j] - (gain[..., j + 1 :] @ total[..., j + 1 :, j, None])[..., 0]
         gain[..., j] = rest * inverse[..., j, None]
     unused = np.where(says[..., None, :], 0.0, moved)
+    gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)
     return Observed(gain, np.concatenate([lower[..., m:, m:], unused], axis=-1))
+
+
+def _find_rows_that_add(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.ndarray, "*items m"]:
+    """Find which rows have more than RANK of their square left beside those before them that have, by Gram-Schmidt."""
+    rest, adds = rows, np.zeros(rows.shape[:-1], bool)
+    for j in range(rows.shape[-2]):
+        square = np.sum(rest[..., j, :] ** 2, axis=-1)
+        adds[..., j] = square > RANK * np.sum(rows[..., j, :] ** 2, axis=-1)
+        length = np.where(adds[..., j], np.sqrt(square), np.inf)
+        unit = rest[..., j, :] / length[..., None]
+        rest = rest - (rest @ unit[..., None]) @ unit[..., None, :]
+    return adds
