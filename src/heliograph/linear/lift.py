@@ -19,6 +19,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Series
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.moments.known_gain import find_outputs_of_known_gain
 from heliograph.random_affine.moments.monomials import (
     MEMORY_LIMIT_ENTRIES,
     count_monomials,
@@ -27,7 +28,6 @@ from heliograph.random_affine.moments.monomials import (
     position,
 )
 from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
-from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
 from heliograph.random_affine.superposed import sensed_by_link
 
@@ -90,17 +90,18 @@ def lift_modes(
     mean = np.kron(law, before[:, -1])
     start = np.kron(np.diag(law), before) - np.outer(mean, mean)
     # Matrices of each distinct measurement and plant once.
-    step_matrices, rounding, earlier = [], [], law
+    step_matrices, roundings, earlier = [], [], law
     distinct = {id(measurement): measurement for measurement in measurements}
-    of_modes = {identity: measurement.moments(degree) for identity, measurement in distinct.items()}
+    varies = len(distinct) > 1
+    of_modes = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
     of_plant = {identity: np.asarray(p.moments(degree).matrix) for identity, p in {id(p): p for p in plants}.items()}
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
-    steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
+    steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies or len(of_plant) > 1)
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
         if steady.is_steady(moments) and np.array_equal(law, earlier) and k > 1:
             break
         earlier = law
-        moved, means = of_plant[id(plant)], of_modes[id(measurement)]
+        moved, lifts = of_plant[id(plant)], of_modes[id(measurement)]
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             moments = np.asarray(push_moments(plant, 2 * degree, moments))
         check_finite_moments(moments, k, 2 * degree)
@@ -109,29 +110,23 @@ def lift_modes(
         chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
         law = _keep_if_unchanged(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
-        noise = _mean_noise(law, means, measurement.maps, degree, moments)
-        output = np.concatenate(list(means), axis=1)[:-1]
+        noise, rounding_of_noise = _mean_noise(law, lifts, moments)
+        output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
         zero = np.zeros(len(mean)), np.zeros(len(output))
-        step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
-        rounding.append(EPS * np.kron(law, np.diag(after)))
+        step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise))
+        roundings.append((EPS * np.kron(law, np.diag(after)), rounding_of_noise))
         before, rows = after, np.asarray(measurement.transition)
     steps = Steps(*(repeat_last(values, len(plants)) for values in zip(*step_matrices, strict=True)))
-    return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), repeat_last(rounding, len(plants)))
+    lost = (repeat_last(values, len(plants)) for values in zip(*roundings, strict=True))
+    return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), *lost)
 
 
 def _mean_noise(
-    law: Float[np.ndarray, " modes"],
-    means: Float[Array, "modes z Y"],
-    routes: Sequence[AbstractRandomAffine],
-    degree: int,
-    moments: Moments,
-) -> Float[np.ndarray, "N N"]:
-    """Measurement noise in the mean over the modes, sum_j p_j (E[Z Z' | j] - K_j E[Y Y'] K_j')."""
-    signal, noise = products_of_monomials(moments, routes[0].inputs + 1, degree), np.zeros((1, 1))
-    for p, matrix, route in zip(law, means, routes, strict=True):
-        arrives = products_of_monomials(push_moments(route, 2 * degree, moments), route.outputs + 1, degree)
-        noise = noise + p * (np.asarray(arrives) - matrix @ signal @ matrix.T)
-    return noise
+    law: Float[np.ndarray, " modes"], lifts: "Sequence[LiftedMap]", moments: Moments
+) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
+    """Measurement noise in the mean over the modes, sum_j p_j E[Cov(Z | y, j)], and the rounding of its diagonal."""
+    spreads, losses = zip(*(lift.conditional_spread(moments) for lift in lifts), strict=True)
+    return np.tensordot(law, spreads, axes=1), np.abs(law) @ np.array(losses)
 
 
 def _keep_if_unchanged(
@@ -251,10 +246,12 @@ class LiftedMap:
         small = not varies and rows * columns <= STORED_ENTRIES
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
-        produced = degrees(route.outputs, degree)
-        self.highest = produced[:, None] + produced
-        if not has_known_gain(route):
-            self.highest = np.full_like(self.highest, 2 * degree + 2)
+        # Monomials of z that hold no output of a random gain, and the highest moments of y in Cov(Z_i, Z_j | y).
+        random = ~find_outputs_of_known_gain(route)
+        known = ~np.any(np.array(exponents(route.outputs + 1, degree))[:, :-1][:, random], axis=1)
+        lowered = degrees(route.outputs, degree) - known
+        self.highest = lowered[:, None] + lowered
+        self.highest[~known[:, None] & ~known] = 2 * degree
 
     def push(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
         """E[mono(z)] from E[mono(y)], both of twice the degree."""
@@ -266,17 +263,18 @@ class LiftedMap:
     def conditional_spread(self, moments: Float[Array, "M"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
         """E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
 
-        With a known G the part of Cov(Z_i, Z_j | y) that has no n in both is none: it is a polynomial of y of degree
-        deg Z_i + deg Z_j - 2. So moments of y of a higher degree, which would only cancel, are left out for that entry:
-        what y is worth, far from zero or growing, costs no digits of the noise.
+        Where the outputs in Z_i have a known gain, every term of Z_i - E[Z_i | y] has an n: it is a polynomial of y of
+        degree deg Z_i - 1, and lowers that of Cov(Z_i, Z_j | y) by one, as Z_j does. Moments of y of a higher degree,
+        which would only cancel, are left out for that entry: what y is worth, far from zero or growing, costs no digits
+        of the noise.
         """
         n, m = self.route.inputs + 1, self.route.outputs + 1
         spread, lost = np.zeros(self.highest.shape), np.zeros(len(self.highest))
-        for highest in range(2, int(self.highest.max()) + 1):
+        for highest in range(int(self.highest.max()) + 1):
             here = self.highest == highest
-            if not here.any():
+            if not here[:-1, :-1].any():
                 continue
-            low = np.where(self.given <= highest - 2, np.asarray(moments), 0.0)
+            low = np.where(self.given <= highest, np.asarray(moments), 0.0)
             after = np.asarray(products_of_monomials(self.push(low), m, self.degree))
             left = after - self.matrix @ np.asarray(products_of_monomials(low, n, self.degree)) @ self.matrix.T
             spread = np.where(here, left, spread)

@@ -4,7 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
+from heliograph.random_affine import Independent, Series, Stack, Superposed, known
 from heliograph.random_affine.moments.intervals import moment_interval
+from heliograph.random_affine.moments.known_gain import find_outputs_of_known_gain, has_known_gain
 from tests.as_code import printing
 from tests.random_affine.conditional import conditional_moments
 
@@ -162,3 +164,24 @@ def test_moments_at_corners_are_those_of_the_extremes(channel):
         assert len(result) == channel.corner_count()
         np.testing.assert_allclose(result, expected, rtol=1e-13, atol=1e-15)
         np.testing.assert_allclose(channel.moments(2).lower(order), channel.moments(order).matrix, rtol=1e-13)
+
+
+def test_outputs_of_known_gain_are_those_that_take_nothing_through_a_random_one():
+    """One output each of: a known gain, a random one, and what sums both, or takes the first alone."""
+    pair = Stack([Series([known(np.eye(2)[[i]]), hg.hop(g, 1e-3)]) for i, g in enumerate([0.5, GAMMA])])
+    mixed = Series([pair, known(np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 0.0]]))])
+    swapped = Series([pair, known(np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 0.0]]))])
+    first, hop = known(np.eye(3)[[0]]), hg.hop(1.0, 1e-3)
+    cases = {
+        (True, False): pair,
+        (True, False, True): mixed,
+        (True, False, False): Series(
+            [mixed, Stack([first, Series([known(np.eye(3)[1:]), hg.hop(XI, 0.0, dimension=2)])])]
+        ),
+        (False, False): hg.erasure(pair, 0.5),
+        (False, False, True): Superposed([mixed, swapped], Independent([hop.noise] * 3), [(0, 1), (2, 1)], 3),
+    }
+    for expected, channel in cases.items():
+        np.testing.assert_array_equal(find_outputs_of_known_gain(channel), expected)
+        assert not has_known_gain(channel)
+    assert has_known_gain(Series([pair, known(np.eye(2)[[0]])]))

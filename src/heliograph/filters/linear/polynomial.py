@@ -29,9 +29,9 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.moments.known_gain import has_known_gain
 from heliograph.random_affine.moments.moment_noise import about_mean
 from heliograph.random_affine.moments.monomials import count_monomials, monomials, position
-from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 from heliograph.random_affine.outliers import has_bounded_noise
 

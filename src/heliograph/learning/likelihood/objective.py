@@ -30,7 +30,8 @@ from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.module import same
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.erasure import condition_on_arrival
-from heliograph.random_affine.moments.second_moments import has_known_gain, has_random_gain, second_order
+from heliograph.random_affine.moments.known_gain import has_known_gain
+from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

@@ -15,10 +15,10 @@ from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, is_zero, library, stack_parts
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, fold
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.moments.intervals import CORNERS, count_corners, moment_interval
+from heliograph.random_affine.moments.known_gain import has_known_gain
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments
 from heliograph.random_affine.moments.tensors import (
     Matrix,
@@ -131,16 +131,6 @@ def has_known_mean(described: SecondOrder) -> bool:
     size = np.max(np.abs(described.mean_gain), initial=0.0) ** 2 + np.max(np.abs(described.offset), initial=0.0) ** 2
     largest = max(np.max(np.abs(bound), initial=0.0) for bound in (described.shift.center, described.shift.radius))
     return bool(largest <= PROPORTIONAL_TOLERANCE**2 * size)
-
-
-def has_known_gain(channel: AbstractRandomAffine) -> bool:
-    """Return whether z = G y + n with a constant G."""
-    holds: bool = fold(channel, {
-        GainAndNoise: lambda hop, _: isinstance(hop.law, Constant),
-        Series | Stack | Superposed: lambda _, parts: all(parts),
-        AbstractRandomAffine: lambda *_: False,
-    })  # fmt: skip
-    return holds
 
 
 @cache_by_object
