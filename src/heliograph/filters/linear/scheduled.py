@@ -198,21 +198,26 @@ class SystemNoises(NamedTuple):
 
 @in_float64
 def _factor_noises(system: LinearSystem) -> SystemNoises:
-    """Factors of both noises at each step, with the rounding of numbers as large as the system makes them."""
+    """Factors of both noises at each step, with the rounding of numbers as large as the system makes them.
+
+    A combination of measurements that is free of noise is so to the rounding of Cov(v) itself, which is joined too:
+    else one that repeats another would measure, without noise, the state times what rounding left of their difference.
+    """
     s = system.steps
     moved, sent = _second_moments_of_steps(system)
 
-    def columns(covariances: np.ndarray, seconds: np.ndarray) -> Columns:
+    def columns(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> Columns:
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
 
-        def of_step(own: Columns, seconds: jax.Array) -> Columns:
-            return triangularise(join_columns(own, rounding_of(seconds)))
+        def of_step(own: Columns, seconds: jax.Array, lost: jax.Array) -> Columns:
+            return triangularise(join_columns(own, rounding_of(seconds), Columns(np.eye(len(lost)), lost)))
 
         each: Callable[..., Columns] = jax.vmap(of_step)
-        factors = each(columns_of_each(covariances), rounding)
+        factors = each(columns_of_each(covariances), rounding, lost)
         return Columns(np.asarray(factors.matrix), np.asarray(factors.weights))
 
-    return SystemNoises(columns(np.asarray(s.process), moved), columns(np.asarray(s.noise), sent))
+    process = columns(np.asarray(s.process), moved, np.zeros(moved.shape))
+    return SystemNoises(process, columns(np.asarray(s.noise), sent, system.received_rounding))
 
 
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
