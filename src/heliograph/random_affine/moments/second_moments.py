@@ -18,7 +18,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.moments.intervals import CORNERS, count_corners, moment_interval
-from heliograph.random_affine.moments.known_gain import has_known_gain
+from heliograph.random_affine.moments.known_gain import find_outputs_of_known_gain, has_known_gain
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments
 from heliograph.random_affine.moments.tensors import (
     Matrix,
@@ -179,6 +179,7 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     # Known law: the moments themselves.
     if corners == 1:
         spread, shift, power = (_map_of_known_law(tensor) for tensor in _tensors(nominal, mean))
+        spread = _map_of_known_law(_drop_known_gain(channel, spread.center))
         return MomentBounds(mean, spread, shift, power, spread)
     # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
     if isinstance(channel, Stack):
@@ -203,7 +204,15 @@ def _map_of_known_law(tensor: Tensor) -> QuadraticMap:
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
     """Cov(z | y) under the nominal law."""
     nominal = channel.moments(2)
-    return _map_of_known_law(_tensors(nominal, nominal.mean[:-1])[0])
+    return _map_of_known_law(_drop_known_gain(channel, _tensors(nominal, nominal.mean[:-1])[0]))
+
+
+def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
+    """Set the spread of a known gain to the zero that it is, of which a difference of moments leaves rounding."""
+    random = ~find_outputs_of_known_gain(channel)
+    varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
+    own: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
+    return own
 
 
 def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
