@@ -113,3 +113,12 @@ def test_rounding_is_noise_of_four_units():
 def test_a_lower_matrix_is_made_of_its_entries():
     np.testing.assert_array_equal(unit_lower(np.array([2.0, 3.0, 4.0])), [[1, 0, 0], [2, 1, 0], [3, 4, 1]])
     assert unit_lower(np.zeros((5, 0))).shape == (5, 1, 1)
+
+
+@pytest.mark.parametrize("n", [2, 30])
+def test_a_variance_below_zero_by_rounding_leaves_no_pivot_below_zero(n):
+    """Of a difference of moments: eps of them on either side of zero."""
+    with jax.enable_x64(True):
+        for least in (0.0, 2e-14):
+            weights = eliminate(jnp.diag(jnp.where(np.arange(n) % 2, 1.0, -1e-16)), least).weights
+            assert np.all(np.asarray(weights) >= 0)

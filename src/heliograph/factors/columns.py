@@ -148,15 +148,15 @@ def triangularise(columns: Columns) -> Columns:
 def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
     """Factor P = L diag(d) L' by elimination: n^3 / 6 products, n reciprocals.
 
-    A pivot is known to eps of its own variance, of which rounding may leave less than nothing: it is at least `least`
-    times it.
+    A pivot is known to eps of its own variance, of which rounding may leave less than nothing, as it may of a variance
+    of zero: it is at least `least` times the variance's size.
     """
     if len(covariance) > WRITTEN:
         return _eliminate_in_loop(covariance, least)
     n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
-        variances.append(_bound_below(column[j], least * covariance[j, j]))
+        variances.append(_bound_below(column[j], least * jnp.abs(covariance[j, j])))
         share = _column_below_diagonal(j, outer(column, lax.reshape(reciprocal_or_zero(variances[j]), (1,))))
         rest = symmetric(rest - outer(share, column))
         lower.append(share)
@@ -291,7 +291,7 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
 
 def _eliminate_in_loop(covariance: jax.Array, least: float) -> Columns:
     """Compute `eliminate` as a loop over the columns."""
-    n, whole = len(covariance), jnp.diagonal(covariance)
+    n, whole = len(covariance), jnp.abs(jnp.diagonal(covariance))
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rest, lower, variances = carry
