@@ -5,7 +5,6 @@ measurement H x they are H L. Sums of independent terms are columns side by side
 difference of two variances, and none has a branch: a component of variance zero has a reciprocal of zero.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +19,6 @@ from heliograph.factors.columns import (
     decorrelate,
     eliminate,
     factor_constant,
-    is_positive,
     join_columns,
     reciprocal_or_one,
     reciprocal_or_zero,
@@ -29,7 +27,8 @@ from heliograph.factors.columns import (
     unit_of,
     zero_covariance,
 )
-from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, WRITTEN, rounding, symmetric
+from heliograph.factors.scalar_update import measure_parts, measure_product, measure_scalar, revise_columns
+from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 
@@ -212,7 +211,7 @@ def condition_on_observation(
     root, d = jnp.concatenate([x.root, rows[:, :n]]), x.variances
     news, values, totals = jnp.concatenate([x.mean, -rows[:, n]]), [], []
     for i in range(m):
-        root, d, gain, total = _measure_scalar(root, d, root[n + i], variance[i])
+        root, d, gain, total = measure_scalar(root, d, root[n + i], variance[i])
         values.append(-news[n + i])
         totals.append(total)
         news = news + gain * values[i]
@@ -230,56 +229,11 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
     weights = jnp.asarray(noise.weights)
 
     def measure_part(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return _measure_scalar(root, d, root[n + i], weights[i])[:3]
+        return measure_scalar(root, d, root[n + i], weights[i])[:3]
 
-    *_, gains = _measure_parts(measure_part, len(rows), jnp.concatenate([x.root, rows]), x.variances)
+    *_, gains = measure_parts(measure_part, len(rows), jnp.concatenate([x.root, rows]), x.variances)
     entering = unit_lower(below_diagonal(gains[n:]))
     return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
-
-
-def _measure_scalar(
-    root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Update the rows V of a root and its variances d by one scalar measurement f' xi + v; return V, d, gain K and s.
-
-    With Var v = r, s = f' diag(d) f + r is the variance of the innovation, and K = V diag(d) f / s.
-
-    With s_j = r + sum_{k >= j} f_k^2 d_k and w_j = sum_{k >= j} d_k f_k V_k, columns V_j of V:
-    d_j+ = d_j s_{j+1} / s_j and V_j+ = V_j - (f_j / s_{j+1}) w_{j+1}. Ratios of sums of positive terms.
-
-    Source: Bierman, Factorization methods for discrete sequential estimation (1977), Section V.3, its order reversed
-    since L is lower.
-    """
-    product = d * f
-    return _measure_product(root, d, f, (product, f * product), noise)
-
-
-def _measure_product(
-    root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v as `_measure_scalar`, given diag(d) f and f_j^2 d_j: both are zero of what says nothing."""
-    product, power = products
-    s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], 0)), (0,))
-    after, kept, w = _revise_columns(root, d, product, f, s)
-    return after, kept, w * reciprocal_or_one(s[0]), s[0]
-
-
-def _revise_columns(
-    root: jax.Array, d: jax.Array, product: jax.Array, f: jax.Array, s: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
-    n, lower = len(d), np.tril(np.ones(root.shape, bool))
-    w = lax.cumsum(lax.select(lower, root * product, jnp.zeros_like(root)), axis=1, reverse=True)
-    over = reciprocal_or_one(s)  # where s is 0, so is what it divides
-    # s_j and s_{j+1}, and one over each.
-    s_here, s_next = lax.slice_in_dim(s, 0, n), lax.slice_in_dim(s, 1, n + 1)
-    over_here, over_next = lax.slice_in_dim(over, 0, n), lax.slice_in_dim(over, 1, n + 1)
-    # w_{j+1} in the place of w_j, of the rows below: what is above the diagonal of L stays zero.
-    later = lax.pad(lax.slice_in_dim(w, 1, n, axis=1), jnp.zeros((), w.dtype), [(0, 0, 0), (0, 1, 0)])
-    strictly = np.concatenate([lower[:, 1:], np.zeros((len(root), 1), bool)], axis=1)
-    after = root - lax.select(strictly, later * (f * over_next), jnp.zeros_like(root))
-    kept = lax.select(is_positive(s_here), d * (s_next * over_here), d)
-    return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False)
 
 
 def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
@@ -300,7 +254,7 @@ def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array,
     power = row * product
     before = jnp.append(0.0, lax.cumsum(power))
     s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
-    root, variances, w = _revise_columns(x.root, x.variances, product, (1 - ratio) * row, s)
+    root, variances, w = revise_columns(x.root, x.variances, product, (1 - ratio) * row, s)
     return Gaussian(x.mean + w * (reciprocal_or_one(s[0]) * shift), below_diagonal(root), variances)
 
 
@@ -368,32 +322,12 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         says = jnp.sum(power) > rounding[i]
         products = jnp.append(jnp.where(says, product, 0.0), r), jnp.append(jnp.where(says, power, 0.0), r)
         rows = jnp.concatenate([root, own[:, None]], axis=1)
-        rows, d, gain, _ = _measure_product(rows, jnp.append(d, r), jnp.append(f, 1.0), products, jnp.zeros_like(r))
+        rows, d, gain, _ = measure_product(rows, jnp.append(d, r), jnp.append(f, 1.0), products, jnp.zeros_like(r))
         return rows[:, :n], d[:n], gain
 
-    root, d, gains = _measure_parts(measure_part, n, root, x.variances)
+    root, d, gains = measure_parts(measure_part, n, root, x.variances)
     left = Gaussian(x.mean, below_diagonal(root[:n]), d)
     return BackwardGain(left, gains[:n], ahead, below_diagonal(gains[n:]))
-
-
-def _measure_parts(
-    measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]], n: int, root: jax.Array, d: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Measure n parts one by one, many of them in a loop: rows, variances d and gains (rows, n) after them."""
-    gains = list[jax.Array]()
-    if n > WRITTEN:
-
-        def body(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            root, d, gain = measure_part(i, *carry[:2])
-            return root, d, jnp.where(np.arange(n) == i, gain[:, None], carry[2])
-
-        start = root, d, jnp.zeros((len(root), n), root.dtype)
-        looped: tuple[jax.Array, jax.Array, jax.Array] = lax.fori_loop(0, n, body, start)
-        return looped
-    for i in range(n):
-        root, d, gain = measure_part(i, root, d)
-        gains.append(lax.expand_dims(gain, (1,)))
-    return root, d, lax.concatenate(gains, 1)
 
 
 def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:

@@ -186,7 +186,7 @@ class ServiceSettings:
 
     def __post_init__(self) -> None:
         if self.hosts and self.page is None:
-            raise fail("--host", "a page that is asked for by this name (--page PORT)", "none")
+            raise fail("--host", "a page for this host name (--page PORT)", "none")
         if self.every is not None:
             scalar("--every", self.every, TINY)
         if self.snapshot is not None:
