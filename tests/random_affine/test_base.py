@@ -5,7 +5,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, replace_inner_maps
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack, maps_in_series
+from heliograph.random_affine.combine import Series, Stack, maps_in_series
+from heliograph.random_affine.hop import GainAndNoise
 
 HOP = hg.hop(hg.Rayleigh(0.8), 0.1)
 RELAYED = hg.amplify_and_forward([HOP, hg.erasure(hg.hop(1.0, 0.2), 0.9)])

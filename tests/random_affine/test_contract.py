@@ -6,7 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import AbstractLaw
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.testing import check_random_affine

@@ -15,7 +15,8 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.outliers import (

@@ -12,7 +12,9 @@ from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fa
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps, fold
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.superposed import Superposed
 
 LARGEST = 1e100  # of levels, gains and weights: products of three of them are numbers

@@ -16,7 +16,8 @@ from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Series
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.known_gain import find_outputs_of_known_gain

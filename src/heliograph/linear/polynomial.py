@@ -27,7 +27,8 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack, known
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.monomials import exponents, symmetric_power
 from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments

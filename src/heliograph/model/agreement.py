@@ -21,11 +21,14 @@ from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.module import same
 from heliograph.numerics.traced import is_traced
-from heliograph.random_affine.base import AbstractRandomAffine, drop_names
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known, maps_in_series
+from heliograph.random_affine.combine import Series, Stack, maps_in_series
 from heliograph.random_affine.erasure import condition_on_arrival, outcomes, second_moments
+from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.outliers import has_bounded_noise

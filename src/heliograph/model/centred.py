@@ -16,7 +16,7 @@ from heliograph.numerics.check import array, check_horizon, fail, rank
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps
-from heliograph.random_affine.combine import known
+from heliograph.random_affine.hop import known
 
 
 @overload

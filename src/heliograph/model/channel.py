@@ -13,15 +13,8 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import (
-    AbstractRandomAffine,
-    all_inner_maps,
-    check_forgets,
-    check_maps,
-    inner_maps,
-    separate_memories,
-)
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
+from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps, inner_maps
+from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.delay import (
     Delay,
     Delayed,
@@ -32,7 +25,10 @@ from heliograph.random_affine.delay import (
     signal_size,
 )
 from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
+from heliograph.random_affine.memory import separate_memories
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
 from heliograph.random_affine.superposed import Superposed

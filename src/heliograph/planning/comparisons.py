@@ -15,7 +15,7 @@ from heliograph.planning.network_design import design
 from heliograph.planning.problem import DesignProblem, PowerDesign
 from heliograph.planning.transmitters import Signal, transmitter_names, visit_hops
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import AbstractHop, GainAndNoise
+from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.law import GivenMoments
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

@@ -19,10 +19,12 @@ from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, replace_inner_maps
 from heliograph.random_affine.chain import stationary
-from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
 from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
 from heliograph.random_affine.moments.tensors import second_moment_tensor
 from heliograph.random_affine.rotation import Rotation

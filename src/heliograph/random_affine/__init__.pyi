@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .combine import (
+from .hop import (
     GainAndNoise as GainAndNoise,
     known as known,
 )
@@ -8,8 +8,10 @@ from .chain import (
     MarkovChain as MarkovChain,
     Autoregression as Autoregression,
 )
-from .combine import (
+from .mixture import (
     Mixture as Mixture,
+)
+from .combine import (
     Series as Series,
     Stack as Stack,
 )

@@ -11,8 +11,10 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.traced import block_diagonal, library, plain
 from heliograph.numerics.types import Array
 from heliograph.random_affine.base import AbstractRandomAffine, fold
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Independent, Shaped
 from heliograph.random_affine.noise import Gaussian as GaussianNoise
 from heliograph.random_affine.superposed import Superposed

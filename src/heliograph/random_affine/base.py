@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
-from itertools import product
-from math import prod
 from types import UnionType
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -153,71 +151,6 @@ def _check_sizes(written: Callable[[Any, int], object]) -> Callable[[Any, int], 
     return moments
 
 
-class AbstractComposite(AbstractRandomAffine):
-    """Random affine map made of independent others, whose moments are linear in the law of each."""
-
-    @property
-    def parts(self) -> Sequence[AbstractRandomAffine]:
-        """The maps that this one is made of: those among its fields."""
-        return inner_maps(self)
-
-    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the same map made of others."""
-        return replace_inner_maps(self, parts)
-
-    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return the same map made of each combination of the parts' extremes."""
-        return tuple(self.rebuilt(*parts) for parts in product(*(affine.extremes() for affine in self.parts)))
-
-    def corner_count(self) -> int:
-        """Product of the parts' counts."""
-        return prod(affine.corner_count() for affine in self.parts)
-
-    def mean_gain(self) -> AbstractRandomAffine:
-        """Return the same map made of its parts with their mean gains."""
-        return self.rebuilt(*(affine.mean_gain() for affine in self.parts))
-
-
-class AbstractWrapper(AbstractComposite):
-    """Random affine map made of one other, with its shapes and state unless it says otherwise."""
-
-    @property
-    def outputs(self) -> int:
-        """Outputs of the part."""
-        return self.parts[0].outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of the part."""
-        return self.parts[0].inputs
-
-    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the part."""
-        return self.parts[0].init(key)
-
-
-class AbstractUniform(AbstractRandomAffine):
-    """Random affine map that is at each step one of several maps of one shape."""
-
-    maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
-
-    @property
-    def outputs(self) -> int:
-        """Outputs of each map."""
-        return self.maps[0].outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of each map."""
-        return self.maps[0].inputs
-
-    def check_shapes(self, name: str) -> None:
-        """Raise ValueError where the maps have several shapes."""
-        shapes = [(m.outputs, m.inputs) for m in self.maps]
-        if len(set(shapes)) != 1:
-            raise fail(name, "maps of one shape", shapes)
-
-
 def inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the maps among a map's fields, at any depth of containers and modules, but not those inside other maps."""
     return [leaf for leaf in _fields(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
@@ -304,8 +237,8 @@ def draw_with_shared_memories(
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
     """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
-    parts = jax.tree.leaves(channel, is_leaf=_is_modal)
-    return unique_memories(leaf.memory for leaf in parts if _is_modal(leaf))
+    parts = jax.tree.leaves(channel, is_leaf=is_modal)
+    return unique_memories(leaf.memory for leaf in parts if is_modal(leaf))
 
 
 def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
@@ -324,54 +257,13 @@ def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array |
     by_identity = dict(zip(memories(channel), states, strict=True))
 
     def chosen(leaf: PyTree) -> PyTree:
-        return leaf.given(by_identity[leaf.memory.identity]) if _is_modal(leaf) else leaf
+        return leaf.given(by_identity[leaf.memory.identity]) if is_modal(leaf) else leaf
 
-    memoryless: T = jax.tree.map(chosen, channel, is_leaf=_is_modal)
+    memoryless: T = jax.tree.map(chosen, channel, is_leaf=is_modal)
     return memoryless
 
 
-def drop_names(channel: T) -> T:
-    """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
-    held = memories(channel)
-    return replace_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
-
-
-def separate_memories(maps: Sequence[T]) -> list[T]:
-    """Return maps that share no unnamed memory: one that stands in several of them becomes one of each."""
-    apart, taken = [], set[str]()
-    for index, affine in enumerate(maps):
-        held = memories(affine)
-        again = {key: m.labelled(f"{key} of {index}") for key, m in held.items() if m.name is None and key in taken}
-        apart.append(replace_memories(affine, again))
-        taken |= set(held)
-    return apart
-
-
-def align_memories_over_time(maps: Sequence[T]) -> list[T]:
-    """Return the maps of later steps with the unnamed memories of the first step, in order of appearance."""
-    by_map = [memories(affine) for affine in maps]
-    if not by_map[0] or len({len(held) for held in by_map}) > 1:
-        return list(maps)
-    labels = [
-        {key: m.labelled(label) for (key, m), label in zip(held.items(), by_map[0], strict=True) if m.name is None}
-        for held in by_map
-    ]
-    return [replace_memories(affine, twins) for affine, twins in zip(maps, labels, strict=True)]
-
-
-def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
-    """The map with other memories in place of those of these identities."""
-
-    def replaced(leaf: PyTree) -> PyTree:
-        if not _is_modal(leaf) or leaf.memory.identity not in twins:
-            return leaf
-        return eqx.tree_at(lambda m: m.memory, leaf, twins[leaf.memory.identity])
-
-    exchanged: T = jax.tree.map(replaced, channel, is_leaf=_is_modal) if twins else channel
-    return exchanged
-
-
-def _is_modal(leaf: object) -> bool:
+def is_modal(leaf: object) -> bool:
     """True for a map whose law depends on the state of a memory."""
     return isinstance(leaf, AbstractModal)
 

@@ -12,10 +12,13 @@ from typing_extensions import TypeAliasType
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.composite import AbstractWrapper
+from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Discrete
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.monomials import Moments
 

@@ -11,8 +11,10 @@ import numpy as np
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.traced import is_traced, plain
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_forgets, check_maps
-from heliograph.random_affine.combine import Series, Stack, known
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.composite import AbstractWrapper
+from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.moments.tensors import second_moment_tensor
 

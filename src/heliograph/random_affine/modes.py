@@ -17,8 +17,6 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import (
     AbstractModal,
     AbstractRandomAffine,
-    AbstractUniform,
-    AbstractWrapper,
     check_forgets,
     check_maps,
     condition_on_memories,
@@ -26,8 +24,11 @@ from heliograph.random_affine.base import (
     memories,
 )
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
-from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Stack, known
+from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.composite import AbstractUniform, AbstractWrapper
+from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.lift import Lift
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise

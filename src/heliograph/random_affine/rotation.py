@@ -9,7 +9,7 @@ from heliograph.numerics.check import scalar
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import known
+from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments, exponents, symmetric_power
 
 # (a, b, 1) to (w, its conjugate, 1) with w = a + i b.

@@ -13,15 +13,8 @@ from heliograph.numerics.check import check_count, fail, instance, items, show_v
 from heliograph.numerics.traced import library, scatter
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, memories
-from heliograph.random_affine.combine import (
-    AbstractCombination,
-    Corners,
-    GainAndNoise,
-    Series,
-    Stack,
-    known,
-    maps_in_series,
-)
+from heliograph.random_affine.combine import AbstractCombination, Corners, Series, Stack, maps_in_series
+from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.monomials import (
     Moments,

@@ -22,7 +22,7 @@ from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import drop_names
+from heliograph.random_affine.memory import drop_names
 from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node

@@ -16,12 +16,12 @@ from heliograph.random_affine.base import (
     AbstractRandomAffine,
     apply,
     draw_with_shared_memories,
-    drop_names,
     init_with_shared_memories,
     memories,
     unique_memories,
 )
 from heliograph.random_affine.delay import signal_size
+from heliograph.random_affine.memory import drop_names
 from heliograph.simulation.draws import (
     CHANNEL,
     CHANNEL_START,

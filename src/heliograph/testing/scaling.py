@@ -16,8 +16,9 @@ from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.combine import Series, known
+from heliograph.random_affine.combine import Series
 from heliograph.random_affine.erasure import outcomes
+from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

@@ -17,7 +17,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.random_affine.combine import known
+from heliograph.random_affine.hop import known
 from heliograph.simulation import ErrorStatistics
 from heliograph_studies import Inline, Stages, Unlisted
 from heliograph_studies.quadratic_bias.bounds import Boundedness, boundedness

@@ -21,7 +21,7 @@ from heliograph.numerics.check import check_count, fail, items, repeat_per_step,
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.combine import GainAndNoise
+from heliograph.random_affine.hop import GainAndNoise
 
 CONVERGED = 1e-12  # relative change of a round at which the error is steady: rounding of the linear equation
 STEPS, ROUNDS = 20, 2000  # of the filter in a round; rounds

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.moments import second_moments, tensors
 from heliograph.random_affine.moments.intervals import moment_interval
 from heliograph.random_affine.moments.monomials import monomials

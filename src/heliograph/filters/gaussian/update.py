@@ -25,7 +25,8 @@ from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, maps_in_series
+from heliograph.random_affine.combine import maps_in_series
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,

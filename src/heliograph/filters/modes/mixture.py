@@ -42,7 +42,8 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.atoms import COMPONENT_LIMIT, list_atoms
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import Autoregression
-from heliograph.random_affine.combine import GainAndNoise, Series
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
 

@@ -27,7 +27,7 @@ from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, condition_on_memories, memories
-from heliograph.random_affine.combine import Mixture
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import degree_in
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,

@@ -37,8 +37,9 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.combine import Series, known
+from heliograph.random_affine.combine import Series
 from heliograph.random_affine.delay import Delayed, Relayed, place_on_delay_line, signal_size
+from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 

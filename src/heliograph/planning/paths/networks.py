@@ -14,7 +14,9 @@ from heliograph.planning.moments import check_design_plant, measurement_moment, 
 from heliograph.planning.paths.model import Paths, Plants
 from heliograph.planning.transmitters import compute_sent_powers, transmits
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Stack, maps_in_series
+from heliograph.random_affine.combine import Stack, maps_in_series
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.mixture import Mixture
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

@@ -8,7 +8,8 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack, stack_rows
+from heliograph.random_affine.combine import Series, Stack, stack_rows
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.monomials import count_monomials, product_table
 from heliograph.random_affine.superposed import Superposed

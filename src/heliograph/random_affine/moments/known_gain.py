@@ -7,7 +7,8 @@ import numpy as np
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Bool
 from heliograph.random_affine.base import AbstractRandomAffine, fold
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.superposed import Superposed
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, AbstractWrapper, check_forgets, check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.composite import AbstractWrapper
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count_monomials,

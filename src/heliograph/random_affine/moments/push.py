@@ -16,7 +16,9 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, plain, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, affine_matrix, gain_moments
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.hop import GainAndNoise, affine_matrix, gain_moments
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import (
     Exponents,
     count_monomials,

@@ -14,10 +14,12 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
 from heliograph.numerics.traced import describe_rounded, is_traced
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, fold, memories
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.delay import Delayed, DelayLine
 from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Faded, Modes
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.claims import beliefs

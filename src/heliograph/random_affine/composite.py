@@ -1,0 +1,77 @@
+"""What maps made of maps have in common: laws of one map each that are independent of each other."""
+
+from collections.abc import Sequence
+from itertools import product
+from math import prod
+
+import equinox as eqx
+import jax
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import PyTree
+from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
+
+
+class AbstractComposite(AbstractRandomAffine):
+    """Random affine map made of independent others, whose moments are linear in the law of each."""
+
+    @property
+    def parts(self) -> Sequence[AbstractRandomAffine]:
+        """The maps that this one is made of: those among its fields."""
+        return inner_maps(self)
+
+    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map made of others."""
+        return replace_inner_maps(self, parts)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Return the same map made of each combination of the parts' extremes."""
+        return tuple(self.rebuilt(*parts) for parts in product(*(affine.extremes() for affine in self.parts)))
+
+    def corner_count(self) -> int:
+        """Product of the parts' counts."""
+        return prod(affine.corner_count() for affine in self.parts)
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Return the same map made of its parts with their mean gains."""
+        return self.rebuilt(*(affine.mean_gain() for affine in self.parts))
+
+
+class AbstractWrapper(AbstractComposite):
+    """Random affine map made of one other, with its shapes and state unless it says otherwise."""
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the part."""
+        return self.parts[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the part."""
+        return self.parts[0].inputs
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the part."""
+        return self.parts[0].init(key)
+
+
+class AbstractUniform(AbstractRandomAffine):
+    """Random affine map that is at each step one of several maps of one shape."""
+
+    maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of each map."""
+        return self.maps[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of each map."""
+        return self.maps[0].inputs
+
+    def check_shapes(self, name: str) -> None:
+        """Raise ValueError where the maps have several shapes."""
+        shapes = [(m.outputs, m.inputs) for m in self.maps]
+        if len(set(shapes)) != 1:
+            raise fail(name, "maps of one shape", shapes)

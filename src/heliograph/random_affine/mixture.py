@@ -1,0 +1,90 @@
+"""One of several maps, drawn anew at each step."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.caching import cache_by_object
+from heliograph.numerics.traced import library, stack_parts
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.combine import AbstractCombination, Corners
+from heliograph.random_affine.composite import AbstractUniform
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.moments.monomials import Moments, product_table
+from heliograph.random_affine.noise import Gaussian, Matrix
+
+
+class Mixture(AbstractUniform, AbstractCombination):
+    """Mixture of maps, one of them drawn at each step; moments are linear in the (possibly uncertain) weights.
+
+    Args:
+        maps: maps of one shape.
+        weights: their probabilities (maps,).
+        radius: how far each probability may be off; one number or (maps,), 0 unless given.
+    """
+
+    maps: tuple[AbstractRandomAffine, ...]
+    choice: Discrete
+
+    def __init__(
+        self,
+        maps: Sequence[AbstractRandomAffine],
+        weights: "Float[ArrayLike, ' maps']",
+        radius: "Float[ArrayLike, '*maps']" = 0.0,
+    ):
+        self.maps = check_maps("mixture", maps)
+        self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
+        self.check_shapes("mixture")
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw which map, and every map."""
+        choice_key, *keys = jax.random.split(key, len(self.maps) + 1)
+        state, drawn = self._draw_each(state, keys)
+        return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
+
+    @cache_by_object
+    def moments(self, order: int) -> Moments:
+        """sum_i p_i E[Sym^k(H_i)]."""
+        check_forgets("moments of a map", self)
+        parts = [m.moments(order).matrix for m in self.maps]
+        matrix = library(parts, self.choice.probabilities).tensordot(
+            self.choice.probabilities, stack_parts(parts), axes=1
+        )
+        return Moments(matrix, self.outputs, self.inputs, order)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Extreme weights combined with the extremes of each map."""
+        corners = [law for law in self.choice.extremes() if isinstance(law, Discrete)]
+        return tuple(
+            Mixture(parts, law.probabilities)
+            for law in corners
+            for parts in product(*(m.extremes() for m in self.maps))
+        )
+
+    @cache_by_object
+    def corner_moments(self, order: int) -> Corners:
+        """The corners of the weights, with every combination of the maps' corners."""
+        parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
+        chosen = np.array(list(product(*(range(len(corners)) for corners in parts)))).T
+        combined = stack_parts([corners[which] for corners, which in zip(parts, chosen, strict=True)])
+        items = library(weights, combined).tensordot(weights, combined, axes=1)
+        flat: Matrix = items.reshape(-1, *items.shape[2:])
+        return flat
+
+    def corner_count(self) -> int:
+        """Extreme weights times the product of the maps' counts."""
+        return len(self.choice.corners()) * super().corner_count()
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
+        moments = self.moments(2)
+        mean = moments.mean
+        second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1
+        offset = mean[:-1, -1]
+        noise = Gaussian(second - offset[:, None] * offset, offset)
+        return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)
