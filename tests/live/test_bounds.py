@@ -97,7 +97,6 @@ def test_what_is_no_event_is_said_in_one_line_and_changes_nothing(network, monke
     for other, what in (
         (hg.Network(network.plant, {"b": node}), r"nodes: b .*nodes: a "),
         (hg.Network(network.plant, {"a": quieter}), "numbers of node 'a'"),
-        (network.in_single_precision(), "precision: single.*precision: double"),
     ):
         with pytest.raises(ValueError, match=f"snapshot: expected the state of what is here .*{what}"):
             hg.Timeline.restore(other, before)

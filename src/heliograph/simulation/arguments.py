@@ -1,14 +1,19 @@
-"""Arguments of a run, checked: its key, its inputs, and the measurements."""
+"""Arguments of a run, checked: its key, its inputs, its precision, and the measurements."""
+
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, check_seed, fail, rank
+from heliograph.numerics.check import array, check_seed, fail, rank, show_value
 from heliograph.numerics.keys import seed_key
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
+
+Precision = TypeAliasType("Precision", Literal["float64", "float32"])  # of the numbers that a run computes
 
 
 def key_of(key: object) -> jax.Array:
@@ -28,6 +33,13 @@ def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.nd
     u: np.ndarray = np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
     check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
     return u
+
+
+def check_precision(precision: object) -> None:
+    """Refuse what is no precision of a run."""
+    known = get_args(Precision.__value__)
+    if not isinstance(precision, str) or precision not in known:
+        raise fail("precision", f"one of {', '.join(known)}", show_value(precision))
 
 
 def measurement_of(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:

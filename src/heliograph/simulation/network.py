@@ -97,7 +97,7 @@ class Network(Module):
     mesh_kinds: tuple[Kind, ...] = eqx.field(static=True)  # of fusions between neighbours, sorted as in compiled code
     places: FrozenMapping[tuple[str, str], Place] = eqx.field(static=True)  # by node and filter
     rows: FrozenMapping[str, range] = eqx.field(static=True)  # among all measurements, joined in the order of the nodes
-    single: bool = eqx.field(static=True)
+    claimed: FrozenMapping[tuple[str, str], Claim] = eqx.field(static=True)  # by node and filter, fused ones last
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class Network(Module):
         relays: "RelayNetwork | None" = None,
         common: "Common | None" = None,
     ):
-        self.plant, self.relays, self.common, self.single = plant, relays, common, False
+        self.plant, self.relays, self.common = plant, relays, common
         self.nodes = {
             name: SENSORLESS if node is None else node for name, node in table("nodes", nodes, "nodes").items()
         }
@@ -146,6 +146,7 @@ class Network(Module):
         self.fused = judge_fused_standing(self)
         for name, mesh in self.meshes.items():
             check_mesh(name, mesh, self)
+        self.claimed = FrozenMapping(self._find_claims())
 
     def _check_nodes(self) -> None:
         """Check that nodes and filters fit the plant, and that names have distinct checksums, as draws need them."""
@@ -172,7 +173,6 @@ class Network(Module):
         for name, fusion in self.fused.items():
             if isinstance(fusion, Fusion):
                 fusion.check(self.nodes_with(fusion.filter), len(self.states))
-                self._claim_of_fusion(fusion)
             else:
                 check_type(f"fused {name!r}", fusion, AbstractFilter)
                 check_received(f"fused {name!r}", fusion, sum(node.received for node in self.nodes.values()))
@@ -321,28 +321,30 @@ class Network(Module):
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
-        claims = {name: {f: filter.claim for f, filter in node.filters.items()} for name, node in self.nodes.items()}
+        claims: Claims = {name: {} for name in (*self.names, *([FUSED] if self.fused else []))}
+        for (node, name), claim in self.claimed.items():
+            claims[node][name] = claim
+        return claims
+
+    def _find_claims(self) -> dict[tuple[str, str], Claim]:
+        claims = {(name, f): filter.claim for name, node in self.nodes.items() for f, filter in node.filters.items()}
         for name, mesh in self.meshes.items():
-            claim = lower_claim(mesh_claim(name, mesh, self)) if self.single else mesh_claim(name, mesh, self)
-            for node in self.mesh_nodes(name):
-                claims[node][name] = claim
-        if self.fused:
-            by_data = any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values())
-            claims[FUSED] = {
-                name: lower_claim(claim) if isinstance(fusion, Fusion) and (by_data or self.single) else claim
-                for name, fusion in self.fused.items()
-                for claim in (self._claim_of_fusion(fusion),)
-            }
+            claims |= dict.fromkeys(((node, name) for node in self.mesh_nodes(name)), mesh_claim(name, mesh, self))
+        by_data = any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values())
+        for name, fusion in self.fused.items():
+            claim = self._claim_of_fusion(fusion)
+            claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim
         return claims
 
     def beliefs(self) -> tuple[Belief, ...]:
         """Filters that believe another world than that in which they stand, node after node, fused ones last."""
         return tuple(beliefs(self))
 
-    def in_single_precision(self) -> "Network":
-        """Return the network for single precision: the lost digits are not bounded, so that all claims are lowered."""
+    def with_nominal_claims(self) -> "Network":
+        """Return the network that claims "nominal" at most, as where digits are lost that nothing bounds."""
         lowered = copy(self)
-        for field, value in (("nodes", nominal_nodes(self)), ("fused", nominal_fused(self)), ("single", True)):
+        claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
+        for field, value in (("nodes", nominal_nodes(self)), ("fused", nominal_fused(self)), ("claimed", claimed)):
             object.__setattr__(lowered, field, value)
         return lowered
 

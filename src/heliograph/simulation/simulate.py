@@ -4,7 +4,7 @@ import os
 import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -13,11 +13,11 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.limits import BLOCK
-from heliograph.numerics.check import check_count, check_progress, fail, instance, show_value
+from heliograph.numerics.check import check_count, check_progress, fail, instance
 from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.arguments import inputs_of, key_of
+from heliograph.simulation.arguments import Precision, check_precision, inputs_of, key_of
 from heliograph.simulation.centres.mesh import meshes_of
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -46,7 +46,6 @@ from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 Progress = TypeAliasType("Progress", Callable[[int, int], None])
 Seed = TypeAliasType("Seed", int | jax.Array)  # or a JAX key
 Reducer = TypeAliasType("Reducer", AbstractReducer[Result], type_params=(Result,))
-Precision = TypeAliasType("Precision", Literal["float64", "float32"])
 
 
 def monte_carlo(
@@ -100,19 +99,22 @@ def monte_carlo(
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
     u = inputs_of(network, inputs, horizon)
     base = key_of(key)
-    single = _is_single(precision, network)
-    network = network.in_single_precision() if single else network
+    check_precision(precision)
+    if precision == "float32":
+        _warn_if_lost(network)
+        network = network.with_nominal_claims()
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
         with out_of_memory(runs, horizon):
-            by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing, single)
+            by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing, precision)
         if by_native_code is not None:
             return _warn_of_nan(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
-    job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), reducer, single)
+    later, stop = smoothing and smoothing.smoother(filters), np.asarray(first_run + runs)
+    job = _Job(world, later, u, base, stop, reducer, precision)
     if one_processor():
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with out_of_memory(runs, horizon):
@@ -135,24 +137,17 @@ def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
         raise fail("first_run", f"a multiple of {BLOCK}", first_run)
 
 
-def _is_single(precision: Precision, network: Network) -> bool:
-    if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
-        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", show_value(precision))
-    if precision == "float32" and _is_lost(network):
-        said = "single precision: numbers of plant or sensors below 1.2e-38 count as 0; choose larger units, or float64"
-        warnings.warn(said, stacklevel=3)
-    return precision == "float32"
-
-
-def _is_lost(network: Network) -> bool:
-    """True if some covariance or matrix of plant and sensors is nothing but 0 in single precision."""
+def _warn_if_lost(network: Network) -> None:
+    """Warn if some covariance or matrix of plant and sensors is nothing but 0 in single precision."""
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
-    return any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves)
+    if any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves):
+        said = "single precision: numbers of plant or sensors below 1.2e-38 count as 0; choose larger units, or float64"
+        warnings.warn(said, stacklevel=3)
 
 
 class _Job(Module):
-    """World, smoother, inputs and key of a simulation, its last run, its reducer, and whether in single precision."""
+    """World, smoother, inputs and key of a simulation, its last run, its reducer and its precision."""
 
     world: World
     later: Smoother | None
@@ -160,7 +155,7 @@ class _Job(Module):
     key: jax.Array
     stop: np.ndarray
     reducer: AbstractReducer[PyTree]
-    single: bool = eqx.field(static=True)
+    precision: Precision = eqx.field(static=True)
 
 
 def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
@@ -230,7 +225,7 @@ def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
 
 def _outputs(job: _Job, runs: jax.Array) -> PyTree:
     """Trajectories of one block of runs, (run, time, ...), in double precision whatever they were simulated in."""
-    if not job.single:
+    if job.precision == "float64":
         return _trajectories(job.world, job.inputs, job.key, runs)
     with jax.enable_x64(False):
         world, inputs = jax.tree.map(_single, (job.world, job.inputs))

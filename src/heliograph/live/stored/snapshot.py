@@ -30,7 +30,7 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
     filters = [f"{node}/{name}" for node, claims in network.claims().items() for name in claims]
     return {
         **versions(),
-        "precision": "single" if network.single else "double",
+        "precision": "double",
         "states": ", ".join(network.states),
         "inputs": ", ".join(network.inputs),
         "nodes": ", ".join(f"{name} ({node.received} received)" for name, node in network.nodes.items()),

@@ -18,6 +18,7 @@ from heliograph.engine.choice import threads, try_native
 from heliograph.engine.limits import BLOCK
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.reception import medium_of
@@ -56,13 +57,12 @@ def native(
     runs: int,
     later: Smoother | None = None,
     parts: int = 1,
-    single: bool = False,
+    precision: Precision = "float64",
 ) -> Native:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
     `runs`: how many will follow. With `later`, the results are a pair: of filtered and of smoothed estimates; and sums
-    of the NIS. `parts`: of a network, of which this is one, whose results are held together. `single`: whether runs are
-    computed in single precision.
+    of the NIS. `parts`: of a network, of which this is one, whose results are held together.
 
     Raises:
         Unsupported: a program that native code does not support.
@@ -78,7 +78,7 @@ def native(
     # One program for networks of one structure.
     try:
         made = _find_program(
-            tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value), single
+            tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value), precision
         )
     except TypeError as error:
         if "unhashable" not in str(error):
@@ -89,7 +89,7 @@ def native(
     program, form = made
     lanes = min(LANES, -(-runs // BLOCK))
     collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
-    collected *= 2 if single else 1  # results are handed back in double precision
+    collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
     check_memory(Needed(parts * collected, sums, variables), runs, len(inputs))
     return Native(program.begin([key, *arrays], runs), form)
 
@@ -134,21 +134,26 @@ def _is_given(array: np.ndarray) -> bool:
 
 @lru_cache(PROGRAMS)
 def _find_program(
-    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool, single: bool
+    tree: Any,
+    held: tuple[bool, ...],
+    fixed: tuple[Any, ...],
+    known: tuple[_Known, ...],
+    counting: bool,
+    precision: Precision,
 ) -> tuple[Any, Any] | Unsupported:
     """Cached `_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
     try:
-        return _program(tree, held, fixed, known, single)
+        return _program(tree, held, fixed, known, precision)
     except Unsupported as error:
         return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
 def _program(
-    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], single: bool
+    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], precision: Precision
 ) -> tuple[Any, Any]:
     """Compile the code of networks of one structure; also return the structure of what is collected of a run.
 
-    `held` and `fixed`: the leaves that are no arrays, such as a user's functions. `single`: in single precision.
+    `held` and `fixed`: the leaves that are no arrays, such as a user's functions.
     """
     form: list[Any] = []
 
@@ -169,6 +174,7 @@ def _program(
     # Sums over runs by batch; the rest is collected.
     key = jax.eval_shape(lambda: jax.random.key(0))
     masks = {n: k.mask for n, k in enumerate(known, start=1) if k.mask.any()}
+    single = precision == "float32"
     program = accumulate(run, key, *(k.example for k in known), batches=BATCHES, known=masks, single=single)
     return program, form[0]
 
@@ -212,9 +218,9 @@ def natively(
     chunk: int,
     progress: Progress | None,
     smoothing: SmoothedPart | None = None,
-    single: bool = False,
+    precision: Precision = "float64",
 ) -> Result | None:
-    """Simulate a network by native code and reduce its runs; a part of it is smoothed; in single precision if `single`.
+    """Simulate a network by native code and reduce its runs; a part of it is smoothed.
 
     Returns None where native code does not support the network or the reducer. Draws depend on names alone, and so do
     nodes that share nothing but the plant: they are simulated a few at a time.
@@ -222,7 +228,7 @@ def natively(
     # Smoothing, few nodes, or nodes that share something: one program.
     whole = smoothing is not None or len(network.names) <= NODES or not _is_apart(network)
     if whole or type(reducer).joined is AbstractReducer.joined:
-        code = try_native(lambda: _code(network, inputs, key, reducer, runs, smoothing, single=single))
+        code = try_native(lambda: _code(network, inputs, key, reducer, runs, smoothing, precision=precision))
         return (
             None
             if code is None
@@ -231,7 +237,7 @@ def natively(
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
     for number, some in enumerate(parts):
-        code = try_native(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts), single=single))  # noqa: B023
+        code = try_native(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts), precision=precision))  # noqa: B023
         if code is None:
             return None
 
@@ -265,11 +271,11 @@ def _code(
     runs: int,
     smoothing: SmoothedPart | None = None,
     parts: int = 1,
-    single: bool = False,
+    precision: Precision = "float64",
 ) -> Native:
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), filters)
-    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, single)
+    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, precision)
 
 
 def _run_chunks(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
