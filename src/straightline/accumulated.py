@@ -1,7 +1,6 @@
 """Compiled programs over consecutive runs: some results summed over them, others returned run by run."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from types import MappingProxyType
 from typing import Any
 
@@ -104,10 +103,22 @@ class Begun:
                 self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
         self._machine = None if all(program.common) else program.blocks.machine(-(-runs // program.width))
 
-    def zeros(self) -> list[np.ndarray]:
-        """Return sums over no runs, of each summed result, as `add` and `total` take them."""
+    def zeros(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
+        """Return sums over no runs, of each summed result, as `add` and `total` take them.
+
+        `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
+        """
         length = row_length(self.program.width, self.program.summed.batches)
-        return [np.zeros((*b.shape, length)) for b, s in self._outputs() if s]
+        shapes = [(*b.shape, length) for b, s in self._outputs() if s]
+        try:  # threads may take from it at once
+            taken = [] if memory is None else memory.pop()
+        except IndexError:
+            taken = []
+        if [x.shape for x in taken] != shapes:
+            return [np.zeros(shape) for shape in shapes]
+        for x in taken:
+            x.fill(0.0)
+        return taken
 
     def add(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
         """Add runs to the sums; return the other results, (run, ...), None for those that are shared or summed.
@@ -136,7 +147,7 @@ class Begun:
 
     def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Return the sums (..., batch) of several sums, of each summed result."""
-        return [folded(reduce(np.add, sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
+        return [folded(_total(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
 
     def _outputs(self) -> list[tuple[Any, bool]]:
         return list(zip(self.program.code.outputs, self.program.summed.outputs, strict=True))
@@ -185,6 +196,15 @@ def accumulate(
     count = pair[0].num_leaves
     summed = tuple(n < count for n in range(len(program.outputs)))
     return Accumulated(program, Summed(summed, batches, len(leaves)))
+
+
+def _total(sums: Sequence[np.ndarray]) -> np.ndarray:
+    """Add arrays in order, all in the memory of one: to allocate more would take longer than to add."""
+    first, *others = sums
+    total = first.copy()
+    for other in others:
+        total += other
+    return total
 
 
 def _counts(first: int, runs: int, batches: int) -> np.ndarray:

@@ -5,16 +5,16 @@ Their zeros and ones are known when the program is made, to save operations.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import threads, try_native
+from heliograph.engine.choice import try_native
 from heliograph.engine.limits import BLOCK
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
@@ -24,8 +24,9 @@ from heliograph.simulation.node import Node
 from heliograph.simulation.reception import medium_of
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.lanes import LANES, Progress, batch_counts, in_chunks
+from heliograph.simulation.runs.lanes import LANES, Progress, in_chunks
 from heliograph.simulation.runs.memory import Needed, check_memory
+from heliograph.simulation.runs.native_lanes import Native, NativeLanes
 from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
@@ -35,18 +36,6 @@ PROGRAMS = 64  # whose code is held at once
 PLAIN = (0.0, 1.0, -1.0)  # numbers that are known in a program,
 FEW = 64  # of arrays of so many numbers at most
 NODES = 4  # simulated by one program: the plant is simulated again for each so many nodes, which costs a tenth
-
-
-class Native(NamedTuple):
-    """A program begun with a network's numbers; `tree` is the structure of what is collected of a run."""
-
-    begun: Any
-    tree: Any
-
-
-def to_double(array: np.ndarray) -> np.ndarray:
-    """Return results in double precision, whatever they were computed in; whole numbers and flags as they are."""
-    return array.astype(float) if array.dtype == np.float32 else array
 
 
 def native(
@@ -110,7 +99,7 @@ class _Known:
     @classmethod
     def of(cls, array: np.ndarray) -> "_Known":
         """Describe an array."""
-        known = np.isin(array, PLAIN) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
+        known = _is_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
         if array.size > FEW and _is_given(array):
             known[...] = False
         values = np.where(known, array, 0).astype(array.dtype)
@@ -125,6 +114,12 @@ class _Known:
     def example(self) -> np.ndarray:
         """Return an array of the shape and type, with what is known of it, and zeros in place of the other entries."""
         return np.frombuffer(self.values, dtype=self.kind).reshape(self.shape)
+
+
+def _is_plain(array: np.ndarray) -> np.ndarray:
+    """Return which entries are PLAIN."""
+    plain: np.ndarray = np.logical_or.reduce([array == number for number in PLAIN])
+    return plain
 
 
 def _is_given(array: np.ndarray) -> bool:
@@ -235,7 +230,7 @@ def natively(
             else finish(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
         )
     # Many independent nodes: one program for a few of them, with other numbers.
-    results, parts = [], list(_parts(network))
+    results, parts, memory = [], list(_parts(network)), list[list[np.ndarray]]()
     for number, some in enumerate(parts):
         code = try_native(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts), precision=precision))  # noqa: B023
         if code is None:
@@ -245,7 +240,7 @@ def natively(
             if progress is not None:
                 progress((number * total + done) // len(parts), total)  # noqa: B023
 
-        results.append(finish(reducer, _run_chunks(code, first_run, runs, chunk, shown), some, None))
+        results.append(finish(reducer, _run_chunks(code, first_run, runs, chunk, shown, memory), some, None))
     return reducer.joined(results, network)
 
 
@@ -278,61 +273,15 @@ def _code(
     return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, precision)
 
 
-def _run_chunks(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
-    """Sums over all runs, and what is collected of them, chunk by chunk."""
-    lanes = NativeLanes(code, first_run, first_run + runs)
+def _run_chunks(
+    code: Native,
+    first_run: int,
+    runs: int,
+    chunk: int,
+    progress: Progress | None,
+    memory: list[list[np.ndarray]] | None = None,
+) -> Recorded:
+    """Sums over all runs, and what is collected of them, chunk by chunk; `memory` as that of `NativeLanes`."""
+    lanes = NativeLanes(code, first_run, first_run + runs, [] if memory is None else memory)
     parts = in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)
     return lanes.total()._replace(collected=lanes.joined(parts))
-
-
-class NativeLanes:
-    """Blocks of runs dealt to lanes with separate sums, computed by native code."""
-
-    def __init__(self, code: Native, first_run: int, stop: int):
-        self.code, self.first_run, self.stop = code, first_run, stop
-        self.sums: list[list[np.ndarray] | None] = [None] * LANES
-
-    def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
-        """Simulate `blocks` blocks from number `start` on; return the collected results of their runs in order."""
-        numbers = np.arange(start, start + blocks)
-        dealt = {lane: self._runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
-        used = [lane for lane, runs in dealt.items() if len(runs)]
-
-        def go(lane: int) -> list[np.ndarray | None]:
-            sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros()
-            some: list[np.ndarray | None] = self.code.begun.add(dealt[lane], sums)
-            return some
-
-        collected = list(threads().map(go, used))
-        order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
-        together = (
-            None if blocks[0] is None else np.concatenate(blocks)[order] for blocks in zip(*collected, strict=True)
-        )
-        return [None if one is None else to_double(one) for one in together]
-
-    def _runs(self, blocks: np.ndarray) -> np.ndarray:
-        runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
-        return runs[runs < self.stop]
-
-    def total(self) -> Recorded:
-        """Sums over all runs, by batch."""
-        code = self.code.begun
-        totals = iter(code.total([sums for sums in self.sums if sums is not None]))
-        leaves, common = [], []
-        # Results that all runs share stand as of one run.
-        for fixed, is_summed in zip(code.shared, code.summed, strict=True):
-            value = next(totals) if is_summed else None
-            leaves.append(value if fixed is None else to_double(fixed))
-            common.append(fixed is not None)
-        sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
-
-    def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """Collected results of all runs, (run, ...); a view of one where they share it."""
-        leaves: list[Any] = []
-        for fixed, *single in zip(self.code.begun.shared, *parts, strict=True):
-            if fixed is not None:
-                leaves.append(np.broadcast_to(to_double(fixed), (self.stop - self.first_run, *fixed.shape)))
-            else:
-                leaves.append(None if single[0] is None else np.concatenate(single) if len(single) > 1 else single[0])
-        return jax.tree.unflatten(self.code.tree, leaves).collected

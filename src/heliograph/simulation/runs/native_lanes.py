@@ -1,0 +1,84 @@
+"""Runs of a native program, dealt to lanes whose sums are apart: a lane's runs are computed by one thread at a time."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from heliograph.engine.choice import threads
+from heliograph.engine.limits import BLOCK
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.runs.lanes import LANES, batch_counts
+from heliograph.simulation.smoothed import Recorded
+
+
+class Native(NamedTuple):
+    """A program begun with a network's numbers; `tree` is the structure of what is collected of a run."""
+
+    begun: Any
+    tree: Any
+
+
+class NativeLanes:
+    """Blocks of runs dealt to lanes with separate sums, computed by native code.
+
+    `memory`: sums of an earlier simulation that nobody needs, taken for those of this one, and given back. To allocate
+    those of a few nodes and runs would take as long as to compute them.
+    """
+
+    def __init__(self, code: Native, first_run: int, stop: int, memory: list[list[np.ndarray]]):
+        self.code, self.first_run, self.stop, self.memory = code, first_run, stop, memory
+        self.sums: list[list[np.ndarray] | None] = [None] * LANES
+
+    def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
+        """Simulate `blocks` blocks from number `start` on; return the collected results of their runs in order."""
+        numbers = np.arange(start, start + blocks)
+        dealt = {lane: self._runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
+        used = [lane for lane, runs in dealt.items() if len(runs)]
+
+        def go(lane: int) -> list[np.ndarray | None]:
+            sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros(self.memory)
+            some: list[np.ndarray | None] = self.code.begun.add(dealt[lane], sums)
+            return some
+
+        collected = list(threads().map(go, used))
+        order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
+        together = (
+            None if blocks[0] is None else np.concatenate(blocks)[order] for blocks in zip(*collected, strict=True)
+        )
+        return [None if one is None else to_double(one) for one in together]
+
+    def _runs(self, blocks: np.ndarray) -> np.ndarray:
+        runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
+        return runs[runs < self.stop]
+
+    def total(self) -> Recorded:
+        """Sums over all runs, by batch."""
+        code = self.code.begun
+        used = [sums for sums in self.sums if sums is not None]
+        totals = iter(code.total(used))
+        self.memory += used
+        leaves, common = [], []
+        # Results that all runs share stand as of one run.
+        for fixed, is_summed in zip(code.shared, code.summed, strict=True):
+            value = next(totals) if is_summed else None
+            leaves.append(value if fixed is None else to_double(fixed))
+            common.append(fixed is not None)
+        sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
+        return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
+
+    def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
+        """Collected results of all runs, (run, ...); a view of one where they share it."""
+        leaves: list[Any] = []
+        for fixed, *single in zip(self.code.begun.shared, *parts, strict=True):
+            if fixed is not None:
+                leaves.append(np.broadcast_to(to_double(fixed), (self.stop - self.first_run, *fixed.shape)))
+            else:
+                leaves.append(None if single[0] is None else np.concatenate(single) if len(single) > 1 else single[0])
+        return jax.tree.unflatten(self.code.tree, leaves).collected
+
+
+def to_double(array: np.ndarray) -> np.ndarray:
+    """Return results in double precision, whatever they were computed in; whole numbers and flags as they are."""
+    return array.astype(float) if array.dtype == np.float32 else array
