@@ -92,7 +92,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import known
+from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
@@ -122,16 +122,14 @@ class Turned(AbstractRandomAffine):
 
     def mean_gain(self):
         return known(np.sinc(self.widest / np.pi) * np.eye(2))
+
+    def visit_hops(self, visit, position):
+        return self, position  # nothing transmits
+
+    def in_words(self):
+        return "turned"
 '''),
     "random_affine/__init__.pyi": ("", "\nfrom .NAME import Turned as Turned\n"),
-    "planning/transmitters.py": (
-        "        case ModeOutput() | Rotation():\n            return channel, position\n",
-        "        case _ if type(channel).__name__ == 'Turned':\n            return channel, position\n",
-    ),
-    "simulation/description/diagram.py": (
-        "        # One case for each way of making a channel.\n",
-        "        __import__('heliograph.random_affine').random_affine.Turned: lambda *_: 'turned',\n",
-    ),
 }  # fmt: skip
 
 RULE = {

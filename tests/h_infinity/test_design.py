@@ -225,7 +225,7 @@ def test_what_varies_over_time_and_what_does_not():
         (lambda: node(0, beta=(1.2, 0.5, 0.5)), "probabilit"),
         (lambda: node(0, steps=0), "steps: expected a positive whole number, got 0"),
         (
-            lambda: hg.h_infinity.system.disturb_gain(hg.hop(1.0, hg.Gaussian([[0.0]], [5.0]))),
+            lambda: hg.hop(1.0, hg.Gaussian([[0.0]], [5.0])).disturb_gain(),
             r"noise of an H-infinity design: expected a mean that its covariance can make, got \[5.0\]",
         ),
         (

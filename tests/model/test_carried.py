@@ -3,7 +3,6 @@
 import pytest
 
 import heliograph as hg
-from heliograph.model.channel import carry_angles
 
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
 CLEAN, NOISY, HALF = hg.hop(1.0, 0.1), hg.hop(1.0, 2.0), hg.hop(0.5, 0.1)
@@ -28,7 +27,7 @@ MODES = hg.random_affine.Modes
     ],
 )
 def test_gain_one_noise_and_losses_that_are_informed(channel, sent, result):
-    assert carry_angles(channel, sent) == result
+    assert channel.carry_angles(sent) == result
 
 
 @pytest.mark.parametrize(
@@ -46,7 +45,7 @@ def test_gain_one_noise_and_losses_that_are_informed(channel, sent, result):
 )
 def test_any_other_gain_is_refused_with_the_remedy(channel):
     with pytest.raises(ValueError, match=r"expected gain 1 on circular outputs .*send sine and cosine"):
-        carry_angles(channel, (0,))
+        channel.carry_angles((0,))
     sensor = hg.LinearSensor([[1.0]], 0.1, circular=["y0"])
     with pytest.raises(ValueError, match="sine and cosine"):
         hg.cubature_filter(hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, circular=["x0"]), sensor, channel)
@@ -55,4 +54,4 @@ def test_any_other_gain_is_refused_with_the_remedy(channel):
 def test_a_sum_of_angle_and_something_else_is_none():
     for rows in ([[1.0, 1.0]], [[1.0, 0.5]]):
         with pytest.raises(ValueError, match="gain 1"):
-            carry_angles(hg.random_affine.known(rows), (0,))
+            hg.random_affine.known(rows).carry_angles((0,))

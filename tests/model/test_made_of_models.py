@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.model.channel import carry_angles
 from heliograph.model.over_time import at
 from heliograph.model.plant import JointNoise
 from heliograph.random_affine.base import AbstractRandomAffine, memories
@@ -122,7 +121,7 @@ MODELS = (named, inputs, angles, linear, laws)
 
 def an_angle(made, of, start):
     """The first number that is sent is an angle; so is what arrives of it."""
-    assert carry_angles(made, (start,))
+    assert made.carry_angles((start,))
 
 
 def knows_losses(made, of, start):

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.h_infinity.system import disturb_gain
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.intervals import moment_interval
 from heliograph.random_affine.moments.push import push_moments
 from heliograph.testing import check_random_affine
 
@@ -169,9 +167,9 @@ SENSOR = hg.LinearSensor([[1.0]], 0.1)
     [
         lambda c: c.moments(2),
         lambda c: push_moments(c, 2, np.ones(3)),
-        lambda c: moment_interval(c, 2),
+        lambda c: c.moment_interval(2),
         hg.random_affine.second_order,
-        disturb_gain,
+        lambda c: c.disturb_gain(),
         hg.model.mean_gain,
         lambda c: hg.linear_filter(PLANT, SENSOR, c),
         lambda c: hg.cubature_filter(PLANT, SENSOR, c),

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.random_affine.outliers import branches_of_noise, has_bounded_noise
+from heliograph.random_affine.outliers import has_bounded_noise
 
 R = np.array([[1.0, 0.3], [0.3, 2.0]])
 
@@ -54,7 +54,7 @@ def test_share_and_delay_of_a_one_sided_law_can_be_free():
 @pytest.mark.parametrize("nu", [2.0, 3.0, 5.0])
 def test_branches_of_students_law_have_its_density(nu):
     """To 0.08 in the logarithm within 100 scales: what 25 precisions over 5.7 decades give for 2 to 5 degrees."""
-    part = branches_of_noise(hg.StudentT(1.0, nu))
+    part = hg.StudentT(1.0, nu).branches()
     e = np.linspace(-100, 100, 2001)
     density = np.sum(np.exp(part.log_share[0]) * stats.norm.pdf(e[:, None], 0, np.sqrt(part.variance[0])), axis=1)
     assert np.max(np.abs(np.log(density) - stats.t.logpdf(e, nu))) < 0.08
@@ -68,7 +68,7 @@ def test_students_law_tends_to_the_gaussian_one():
 
 def test_components_apart_keep_the_branches_of_each():
     law = hg.random_affine.Independent([hg.Contaminated(1.0, 0.1, 9.0), hg.Gaussian([[2.0]])])
-    part = branches_of_noise(law)
+    part = law.branches()
     np.testing.assert_allclose(np.exp(part.log_share), [[0.9, 0.1], [1.0, 0.0]])
     np.testing.assert_allclose(part.variance[:, 0], [1.0, 2.0])
 

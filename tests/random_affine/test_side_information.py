@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.erasure import outcomes
 
 HALF = hg.erasure(hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7]), 0.1), 0.5)
 
@@ -23,7 +22,7 @@ def test_outcomes_are_those_of_draws(channel):
     """Frequencies of each set of losses in 4,000 draws, within 4 standard errors, and the mean map of what arrived."""
     draws = np.asarray(jax.vmap(channel.sample)(jax.random.split(jax.random.key(0), 4000)))[:, :-1]
     arrived = ~np.isnan(draws).any(axis=2)
-    result = outcomes(channel)
+    result = channel.list_outcomes()
     np.testing.assert_allclose(sum(o.probability for o in result), 1.0)
     for kind in {tuple(o.arrived) for o in result}:
         alike = [o for o in result if tuple(o.arrived) == kind]
@@ -36,18 +35,18 @@ def test_outcomes_are_those_of_draws(channel):
 
 
 def test_a_channel_without_erasures_tells_nothing():
-    (only,) = outcomes(hg.dropout(hg.perfect(), 0.5))
+    (only,) = hg.dropout(hg.perfect(), 0.5).list_outcomes()
     assert only.probability == 1 and only.arrived.all()
 
 
 def test_what_never_happens_is_left_out():
-    (only,) = outcomes(hg.erasure(hg.perfect(), 1.0))
+    (only,) = hg.erasure(hg.perfect(), 1.0).list_outcomes()
     assert only.arrived.all()
 
 
 def test_what_cannot_be_said_is_refused():
     mixed = hg.random_affine.Mixture([HALF, hg.perfect()], [0.5, 0.5])
     with pytest.raises(ValueError, match="channel with erasures: expected erasures in series and stacks, got Mixture"):
-        outcomes(mixed)
+        mixed.list_outcomes()
     with pytest.raises(ValueError, match="expected at most 1024 sets of losses, got 2,048"):
-        outcomes(hg.parallel([HALF] * 11))
+        hg.parallel([HALF] * 11).list_outcomes()

@@ -14,19 +14,12 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
-from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.components import Branches
 from heliograph.random_affine.moments.second_moments import SecondOrder
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.noise import AbstractNoise, Independent
 from heliograph.random_affine.outliers import (
-    Branches,
     StudentT,
-    branches_of_noise,
-    has_outliers,
-    noise_without_outliers,
 )
-from heliograph.random_affine.superposed import Superposed
 
 Vector = Float[jax.Array | np.ndarray, " m"]
 Matrix = Float[jax.Array | np.ndarray, "m branches"]
@@ -91,41 +84,6 @@ class ReceivedNoise(Module):
         )
 
 
-class ChannelAndNoise(NamedTuple):
-    """A channel whose last hop has no noise with outliers any more, and that noise (None: there is none)."""
-
-    plain: AbstractRandomAffine
-    noise: AbstractNoise | None
-
-
-def detach_outlier_noise(channel: AbstractRandomAffine) -> ChannelAndNoise:
-    """Replace the last hop's noise by its mean where its law has outliers; return the channel left and that noise."""
-    match channel:
-        case GainAndNoise() if has_outliers(channel.noise):
-            still = Gaussian(np.zeros((channel.outputs, channel.outputs)), channel.noise.mean)
-            return ChannelAndNoise(GainAndNoise(channel.law, channel.matrix, still), channel.noise)
-        case Superposed() if has_outliers(channel.noise):
-            still = Gaussian(np.zeros((channel.outputs, channel.outputs)), channel.noise.mean)
-            plain = Superposed(channel.maps, still, channel.places, channel.inputs)
-            return ChannelAndNoise(plain, channel.noise)
-        case Series():
-            *before, last = channel.maps
-            end = detach_outlier_noise(last)
-            return (
-                ChannelAndNoise(Series([*before, end.plain]), end.noise)
-                if end.noise
-                else ChannelAndNoise(channel, None)
-            )
-        case Stack():
-            # Parallel links are split one by one; one without outliers has no noise to take.
-            links = [detach_outlier_noise(affine) for affine in channel.maps]
-            if not any(link.noise for link in links):
-                return ChannelAndNoise(channel, None)
-            noises = [link.noise or Gaussian(np.zeros((link.plain.outputs,) * 2)) for link in links]
-            return ChannelAndNoise(Stack([link.plain for link in links]), Independent(noises))
-    return ChannelAndNoise(channel, None)
-
-
 def separate_outlier_noise(
     sensor: AnySensor, channel: Channel, apart: bool
 ) -> tuple[SecondOrder | OverTime, ReceivedNoise | OverTime]:
@@ -138,15 +96,15 @@ def separate_outlier_noise(
     """
     steps = max((model.steps for model in (sensor, channel) if isinstance(model, OverTime)), default=None)
     if steps is None:
-        parted = detach_outlier_noise(first(channel))
-        plain = Polytope().describe(parted.plain)
-        return plain, describe_outlier_noise(first(sensor).noise, parted.noise, plain, apart)
+        left, noise = first(channel).detach_outliers()
+        plain = Polytope().describe(left)
+        return plain, describe_outlier_noise(first(sensor).noise, noise, plain, apart)
     channels = unstack(channel) if isinstance(channel, OverTime) else [channel] * steps
-    pieces = [detach_outlier_noise(step) for step in channels]
-    plains = [Polytope().describe(piece.plain) for piece in pieces]
+    pieces = [step.detach_outliers() for step in channels]
+    plains = [Polytope().describe(left) for left, _ in pieces]
     noises = [
-        describe_outlier_noise(at(sensor, k).noise, piece.noise, plain, apart)
-        for k, (piece, plain) in enumerate(zip(pieces, plains, strict=True))
+        describe_outlier_noise(at(sensor, k).noise, noise, plain, apart)
+        for k, ((_, noise), plain) in enumerate(zip(pieces, plains, strict=True))
     ]
     return over_time(plains) if isinstance(channel, OverTime) else plains[0], over_time(noises)
 
@@ -163,7 +121,7 @@ def describe_outlier_noise(
     rows, xp = np.arange(m), library(plain.power.center, sensed, late)
     squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
     # Moments of the noise without its outliers, as it arrives.
-    base, last = noise_without_outliers(sensed), noise_without_outliers(late) if late is not None else None
+    base, last = sensed.without_outliers(), late.without_outliers() if late is not None else None
     source = _find_noisy_outputs(squares, base.covariance, plain)
     covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
     center = plain.mean_gain @ base.mean
@@ -171,12 +129,12 @@ def describe_outlier_noise(
         covariance, center = covariance + last.covariance, center + last.mean
     _check_weighable(covariance, apart)
     # Branches of the sensor's noise, and their pairs with those of the last hop's.
-    log_share, mean, variance = (values[source] for values in branches_of_noise(sensed))
+    log_share, mean, variance = (values[source] for values in sensed.branches())
     late_mean: Array = np.zeros(mean.shape)
     late_variance: Array = late_mean
     if late is not None:
         log_share, mean, variance, late_mean, late_variance = _combine_branches(
-            Branches(log_share, mean, variance), branches_of_noise(late)
+            Branches(log_share, mean, variance), late.branches()
         )
     return ReceivedNoise(
         log_share=log_share, mean=mean, variance=variance, late_mean=late_mean, late_variance=late_variance,

@@ -1,6 +1,5 @@
 """The error system of H-infinity designs, and joint second moments of a channel's gain and of its noise's gain."""
 
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -11,135 +10,11 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, rank, scalar, standard_deviations
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, check_maps, fold
-from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.base import check_maps
+from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 
 LARGEST = 1e100  # of levels, gains and weights: products of three of them are numbers
 ROUNDING = 1e-13  # relative to the largest eigenvalue, in units of each component: smaller ones are rounding
-
-
-class DisturbedGain(NamedTuple):
-    """First and second moments of H = [G, N]: G takes the signal (inputs columns), N the disturbances (the others).
-
-    Shapes: mean (m, c), second[a, b, i, j] = E[H_ab H_ij] of shape (m, c, m, c); inputs is the number of columns of G.
-    """
-
-    mean: np.ndarray
-    second: np.ndarray
-    inputs: int
-
-    @property
-    def disturbances(self) -> int:
-        """Number of noise sources."""
-        return int(self.mean.shape[1]) - self.inputs
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """Cov(H_ab, H_ij), shape (m, c, m, c)."""
-        covariance: np.ndarray = self.second - np.multiply.outer(self.mean, self.mean)
-        return covariance
-
-    def spreads(self) -> np.ndarray:
-        """Matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
-
-        They are the eigenvectors of the covariance of H's entries, in units of each entry, times the roots of their
-        eigenvalues; as many as its rank, so none where nothing is random.
-
-        Shapes: (rank, m, c).
-        """
-        m, c = self.mean.shape
-        size = np.sqrt(np.diagonal(self.second.reshape(m * c, m * c)))
-        unit = np.where(size > 0, size, 1.0)  # each entry in units of its own: rounding is relative to these
-        values, vectors = np.linalg.eigh(self.covariance.reshape(m * c, m * c) / np.outer(unit, unit))
-        used = values > ROUNDING * max(1.0, float(np.max(values, initial=0.0)))
-        factors: np.ndarray = (unit[:, None] * np.sqrt(values[used]) * vectors[:, used]).T.reshape(-1, m, c)
-        return factors
-
-
-def disturb_gain(channel: AbstractRandomAffine) -> DisturbedGain:
-    """Joint moments of a channel's gain and of the gains of its noise sources, in the order of the signal's way.
-
-    A noise of covariance R counts as rank(R) sources of unit size, and its mean as their disturbance: a mean that they
-    cannot make is refused. Uncertain probabilities count as nominal.
-    """
-    gain: DisturbedGain = fold(channel, {
-        GainAndNoise: lambda hop, _: _disturb_hop(hop),
-        Series: lambda _, parts: reduce(_compose, parts),
-        Mixture: lambda mixture, parts: _disturb_mixture(mixture, parts),
-        Stack: lambda stack, parts: _stack_gains(parts, stack.inputs),
-        Superposed: lambda channel, _: disturb_gain(channel.as_stack),
-    }, "channel", "hops, series, mixtures, stacks and sums of them")  # fmt: skip
-    return gain
-
-
-def _disturb_hop(channel: GainAndNoise) -> DisturbedGain:
-    """Joint moments of [g A, N] of one hop, N a root of its noise's covariance."""
-    covariance = np.asarray(channel.noise.covariance)
-    unit = standard_deviations(covariance)
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # of correlations: free of units
-    used = values > ROUNDING * np.max(values, initial=0.0)
-    root = unit[:, None] * np.sqrt(values[used]) * vectors[:, used]
-    root = root * np.where(root.sum(axis=0) < 0, -1.0, 1.0)
-    mean = np.asarray(channel.noise.mean) / unit
-    if np.any(np.abs(mean - vectors[:, used] @ (vectors[:, used].T @ mean)) > SYMMETRY_TOLERANCE * np.abs(mean).max()):
-        got = np.asarray(channel.noise.mean).tolist()
-        raise fail("noise of an H-infinity design", "a mean that its covariance can make", got)
-    scaled = np.concatenate([np.asarray(channel.matrix), np.zeros_like(root)], axis=1)
-    fixed = np.concatenate([np.zeros_like(np.asarray(channel.matrix)), root], axis=1)
-    first, second = float(channel.law.moment(1)), float(channel.law.moment(2))
-    outer = np.multiply.outer
-    cross = first * (outer(scaled, fixed) + outer(fixed, scaled))
-    return DisturbedGain(
-        first * scaled + fixed, second * outer(scaled, scaled) + cross + outer(fixed, fixed), channel.inputs
-    )
-
-
-def _compose(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
-    """[G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2], with independent factors."""
-    passed = _stack_gains([first, _disturb_known(np.eye(then.disturbances))], shared=0)
-    mean = then.mean @ passed.mean
-    second = np.einsum("aicj,ibjd->abcd", then.second, passed.second)
-    return DisturbedGain(mean, second, first.inputs)
-
-
-def _disturb_mixture(channel: Mixture, parts: list[DisturbedGain]) -> DisturbedGain:
-    widened = [_place_columns(gain, channel.inputs, parts, i) for i, gain in enumerate(parts)]
-    weights = np.asarray(channel.choice.probabilities)
-    mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
-    second = np.tensordot(weights, [gain.second for gain in widened], axes=1)
-    return DisturbedGain(mean, second, channel.inputs)
-
-
-def _disturb_known(matrix: np.ndarray) -> DisturbedGain:
-    return DisturbedGain(matrix, np.multiply.outer(matrix, matrix), 0)
-
-
-def _place_columns(gain: DisturbedGain, shared: int, parts: list[DisturbedGain], index: int) -> DisturbedGain:
-    """The same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
-    private_widths = [p.mean.shape[1] - shared for p in parts]
-    start = shared + sum(private_widths[:index])
-    columns = [*range(shared), *range(start, start + private_widths[index])]
-    m, total = gain.mean.shape[0], shared + sum(private_widths)
-    mean, second = np.zeros((m, total)), np.zeros((m, total, m, total))
-    mean[:, columns] = gain.mean
-    second[np.ix_(range(m), columns, range(m), columns)] = gain.second
-    return DisturbedGain(mean, second, shared)
-
-
-def _stack_gains(parts: list[DisturbedGain], shared: int) -> DisturbedGain:
-    """Independent maps one above the other that share their first `shared` inputs; E[H_ab H_ij] factors across maps."""
-    placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]
-    mean = np.concatenate([gain.mean for gain in placed])
-    second = np.multiply.outer(mean, mean)
-    row = 0
-    for gain in placed:
-        rows = slice(row, row + gain.mean.shape[0])
-        second[rows, :, rows, :] = gain.second
-        row = rows.stop
-    return DisturbedGain(mean, second, shared)
 
 
 Varying = TypeAliasType("Varying", ArrayLike | OverTime)  # the same at all steps, or one for each
@@ -285,10 +160,10 @@ def _moments_of_links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]
         )
         raise fail("channel of an H-infinity design", expected, "one that remembers")
     if not isinstance(channel, OverTime):
-        return (disturb_gain(channel),) * steps
+        return (channel.disturb_gain(),) * steps
     if channel.steps < steps:
         raise fail("channel over time", f"at least {steps} steps", channel.steps)
-    links = tuple(disturb_gain(c) for c in unstack(channel)[:steps])
+    links = tuple(c.disturb_gain() for c in unstack(channel)[:steps])
     if len({(link.mean.shape, link.inputs) for link in links}) != 1:
         raise fail("channel over time", "the same noise sources at each step", [link.disturbances for link in links])
     return links

@@ -14,7 +14,6 @@ from heliograph.numerics.check import check_count, check_seed, fail, instance, s
 from heliograph.numerics.module import readable, same
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -140,7 +139,7 @@ def _draw_likelihood_ratios(
     u = np.zeros((count, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     said = []
     for channel in (true, other):
-        received = condition_on_arrival(channel)
+        received = channel.condition_on_arrival()
         filter, parts = cubature_filter(network.plant, node.sensor, received), StackDensities.of(received, nodes)
         y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in filter.expect_signals(z, u))
         said.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))

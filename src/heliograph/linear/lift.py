@@ -20,7 +20,6 @@ from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.known_gain import find_outputs_of_known_gain
 from heliograph.random_affine.moments.monomials import (
     MEMORY_LIMIT_ENTRIES,
     count_monomials,
@@ -248,7 +247,7 @@ class LiftedMap:
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
         # Monomials of z that hold no output of a random gain, and the highest moments of y in Cov(Z_i, Z_j | y).
-        random = ~find_outputs_of_known_gain(route)
+        random = ~route.known_gains
         known = ~np.any(np.array(exponents(route.outputs + 1, degree))[:, :-1][:, random], axis=1)
         lowered = degrees(route.outputs, degree) - known
         self.highest = lowered[:, None] + lowered

@@ -7,7 +7,6 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractTrigger, Periodic
-from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import joint_modes
 
 DEAD = 1e-3  # probability below which heartbeats are not lost one after another by chance
@@ -46,7 +45,7 @@ class LossChain(NamedTuple):
     def of_channel(channel: Channel) -> "LossChain":
         """Losses of a link."""
         modes = joint_modes(first(channel))
-        loss = [sum(float(o.probability) for o in outcomes(m) if not o.arrived.any()) for m in modes.maps]
+        loss = [sum(float(o.probability) for o in m.list_outcomes() if not o.arrived.any()) for m in modes.maps]
         return LossChain(np.array(loss), np.asarray(modes.transition), np.asarray(modes.initial))
 
     def in_a_row(self, apart: int, count: int) -> float:

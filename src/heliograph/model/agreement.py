@@ -24,7 +24,7 @@ from heliograph.numerics.traced import is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Series, Stack, maps_in_series
-from heliograph.random_affine.erasure import condition_on_arrival, outcomes, second_moments
+from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.memory import drop_names
@@ -224,7 +224,7 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
     try:
         if order == MEAN_AND_COVARIANCE:
             return _same_moments(a, b)
-        return (a.erases or b.erases) and same(condition_on_arrival(a), condition_on_arrival(b))
+        return (a.erases or b.erases) and same(a.condition_on_arrival(), b.condition_on_arrival())
     except ValueError:  # no moments, or more than can be listed
         return False
 
@@ -296,14 +296,14 @@ def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.nda
     """
     maps: Sequence[AbstractRandomAffine]
     try:
-        whole = condition_on_arrival(channel)
+        whole = channel.condition_on_arrival()
     except ValueError:  # losses that depend on the mode: where all modes are alike, no memory of the gains is left
         maps = joint_modes(channel).maps
     else:
         if memory_matters(whole):
             raise ValueError("memory")
         maps = unstack(without_memory(whole))
-    parts = [outcome for m in maps for outcome in outcomes(m) if outcome.arrived.any()]
+    parts = [outcome for m in maps for outcome in m.list_outcomes() if outcome.arrived.any()]
     if any(outcome.map.corner_count() > 1 for outcome in parts):
         raise ValueError("uncertain probabilities")
     return [(np.asarray(outcome.arrived), second_moments(outcome.map)) for outcome in parts]

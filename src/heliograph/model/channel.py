@@ -11,15 +11,13 @@ from heliograph.model.plant import AnyPlant, check_turns
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps, inner_maps
-from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps
+from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.delay import (
     Delay,
     Delayed,
-    DelayLine,
-    Relayed,
     connect_in_series,
     place_part,
     signal_size,
@@ -29,7 +27,7 @@ from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.memory import separate_memories
 from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate
+from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
 from heliograph.random_affine.superposed import Superposed
 
@@ -311,67 +309,7 @@ def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -
     start, senses = first(plant), first(sensor)
     check_turns("sensor of a plant", senses.measure, start.initial_mean, start.angles, senses.angles)
     steps = unstack(channel) if isinstance(channel, OverTime) and senses.circular else [first(channel)]
-    results = {carry_angles(step, senses.angles) for step in steps}
+    results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
     if len(results) > 1:
         raise fail("channel", "the same angles at every step", sorted(results))
     return results.pop()
-
-
-ROUNDING = 1e-12  # of a gain of 1 that was computed
-
-
-def carry_angles(channel: AbstractRandomAffine, sent: Angles) -> Angles:
-    """Return the indices of outputs that are angles, from those of the inputs; noise and erasures leave angles."""
-    if not sent:
-        return ()
-    match channel:
-        case GainAndNoise():
-            return _trace_angles(channel, sent)
-        case Series():
-            for affine in channel.maps:
-                sent = carry_angles(affine, sent)
-            return sent
-        # Outputs of parts stand one after another.
-        case Stack():
-            starts = np.cumsum([0, *(affine.outputs for affine in channel.maps)])
-            items = zip(starts, channel.maps, strict=False)
-            return tuple(int(start) + i for start, affine in items for i in carry_angles(affine, sent))
-        case Erasure() | OneStepLate() | Delayed():  # a time stamp of what is late stands after it
-            return carry_angles(inner_maps(channel)[0], sent)
-        case DelayLine():  # of what was sent at each of the steps that may arrive
-            size = channel.inputs // (1 + channel.past)
-            return carry_angles(channel.line, tuple(t * size + i for t in range(1 + channel.past) for i in sent))
-        case ModeOutput():  # a class, of whatever is sent
-            return ()
-        case Relayed():
-            for stage in channel.stages:
-                sent = carry_angles(stage, sent)
-            return sent
-        # All choices must agree.
-        case Mixture() | Modes():
-            results = {carry_angles(affine, sent) for affine in channel.maps}
-            if len(results) == 1:
-                return results.pop()
-    raise _refuse(type(channel).__name__)
-
-
-def _trace_angles(channel: GainAndNoise, sent: Angles) -> Angles:
-    matrix = channel.matrix
-    if is_traced(matrix):
-        raise _refuse("a gain that is traced")
-    of_angles = np.asarray(matrix)[:, list(sent)]
-    touched = np.flatnonzero(np.any(of_angles != 0, axis=1))
-    if not touched.size:
-        return ()
-    if not isinstance(channel.law, Constant) or is_traced(channel.law.value):
-        raise _refuse(f"a gain that is {type(channel.law).__name__}")
-    rows = float(channel.law.value) * np.asarray(matrix)[touched]
-    whole = np.abs(rows - np.round(rows)) <= ROUNDING
-    if not np.all(whole & (np.round(rows) >= 0)) or np.any(np.round(rows).sum(axis=1) != 1):
-        raise _refuse(f"the gains {rows[rows != 0].tolist()}")
-    return tuple(int(i) for i in touched)
-
-
-def _refuse(got: str) -> ValueError:
-    expected = "gain 1 on circular outputs (behind any other, send sine and cosine, which are no angles)"
-    return fail("channel", expected, got)

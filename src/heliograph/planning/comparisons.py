@@ -13,10 +13,11 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.network_design import design
 from heliograph.planning.problem import DesignProblem, PowerDesign
-from heliograph.planning.transmitters import Signal, transmitter_names, visit_hops
+from heliograph.planning.transmitters import transmitter_names, visit_hops
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.law import GivenMoments
+from heliograph.random_affine.route import Signal
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

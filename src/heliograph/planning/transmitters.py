@@ -7,9 +7,8 @@ received or not: of modes and mixtures in which it is silent it knows nothing. B
 relay sends only what arrived.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from math import prod
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -17,59 +16,13 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
-from heliograph.random_affine.base import AbstractRandomAffine, fold, inner_maps, replace_inner_maps
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
-from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
-from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
-from heliograph.random_affine.law import Constant
-from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
-from heliograph.random_affine.moments.tensors import second_moment_tensor
-from heliograph.random_affine.rotation import Rotation
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.modes import joint_modes
+from heliograph.random_affine.route import Position, Second, Signal, Visit
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
-
-Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
-
-
-class Signal(NamedTuple):
-    """Second moment of what a map receives, and the probability that it arrives."""
-
-    second: Second
-    arrives: Scalar
-
-
-Visit = Callable[[str, AbstractHop, Signal | None], AbstractRandomAffine]
-
-
-class Position(NamedTuple):
-    """Position in a channel: prefix of names, number of hops before it along the chain, and the signal there."""
-
-    prefix: str
-    hops: int
-    signal: Signal | None
-
-
-def transmits(hop: AbstractHop) -> bool:
-    """Decide whether a hop transmits, rather than passes its input on by a wire."""
-    return not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
-
-
-def _gain_is_one(hop: AbstractHop) -> bool:
-    return (
-        isinstance(hop, GainAndNoise)
-        and isinstance(hop.law, Constant)
-        and not is_traced(hop.law.value)
-        and float(hop.law.value) == 1.0
-    )
-
-
-def is_silent(channel: AbstractRandomAffine) -> bool:
-    """Decide whether a channel delivers noise alone, as a loss or a mode without reception does."""
-    return isinstance(channel, GainAndNoise) and is_zero(channel.matrix) and _gain_is_one(channel)
 
 
 def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | None = None) -> AbstractRandomAffine:
@@ -78,122 +31,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
-    return _visit(channel, visit, Position("", 0, signal))[0]
-
-
-def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
-    """The changed channel, and the position behind it; its signal is set by the series that the channel is in."""
-    inside = inner_maps(channel)
-    match channel:
-        # A hop that transmits is visited; a wire is not.
-        case AbstractHop():
-            if not transmits(channel):
-                return channel, position
-            after = position._replace(hops=position.hops + 1)
-            return visit(f"{position.prefix}hop{after.hops}", channel, position.signal), after
-        case Series():
-            visited, position = _visit_chain(inside, visit, position)
-        case Stack():
-            visited = [_visit(affine, visit, at)[0] for affine, at in _number_maps(inside, position, "part")]
-        case Superposed():
-            places = _number_maps(inside, position, "link")
-            parts = zip(places, channel.places, strict=True)
-            visited = [_visit(affine, visit, _taking(at, chosen))[0] for (affine, at), chosen in parts]
-        case Mixture() | Modes():
-            # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
-            several = isinstance(channel, Mixture) and sum(not is_silent(affine) for affine in inside) > 1
-            choices = _number_maps(inside, position, "choice") if several else [(affine, position) for affine in inside]
-            pairs = [_visit(affine, visit, at) for affine, at in choices]
-            visited = [affine for affine, _ in pairs]
-            position = position if several else max((at for _, at in pairs), key=lambda at: at.hops)
-        case ModeOutput() | Rotation():
-            return channel, position
-        # What wraps a link: inside it; the line of past signals goes into a map of the line.
-        case Erasure() | OneStepLate() | Delayed() | DelayLine():
-            if isinstance(channel, DelayLine) and position.signal is not None:
-                line = _line(position.signal.second, channel.inputs // signal_size(channel))
-                position = position._replace(signal=position.signal._replace(second=line))
-            link, position = _visit(inside[0], visit, position)
-            visited = [link, *inside[1:]]
-        case _:
-            expected = "hops in series, stacks, sums, mixtures, modes, losses and delays"
-            raise fail("transmitters of a channel", expected, type(channel).__name__)
-    return replace_inner_maps(channel, visited), position
-
-
-def _number_maps(
-    maps: Sequence[AbstractRandomAffine], position: Position, word: str
-) -> list[tuple[AbstractRandomAffine, Position]]:
-    """Maps side by side, each with its position: names begin with the word and the map's number."""
-    at = [position._replace(prefix=f"{position.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
-    return list(zip(maps, at, strict=True))
-
-
-def _taking(position: Position, places: Sequence[int]) -> Position:
-    """The position at a link that takes the components at these places."""
-    if position.signal is None:
-        return position
-    chosen = np.array([*places, -1])
-    return position._replace(signal=position.signal._replace(second=position.signal.second[chosen[:, None], chosen]))
-
-
-def _visit_chain(
-    maps: Sequence[AbstractRandomAffine], visit: Visit, position: Position
-) -> tuple[list[AbstractRandomAffine], Position]:
-    """The changed maps of a series, each of which receives what comes through those before it."""
-    parts, signal = list[AbstractRandomAffine](), position.signal
-    for i, affine in enumerate(maps):
-        changed, position = _visit(affine, visit, position._replace(signal=signal))
-        parts.append(changed)
-        if signal is not None and i + 1 < len(maps):
-            signal = Signal(_behind(affine, signal.second), signal.arrives * _arrival(affine))
-    return parts, position
-
-
-def _arrival(channel: AbstractRandomAffine) -> Scalar:
-    """Probability that a signal comes through."""
-    probability: Scalar = fold(channel, {
-        Erasure: lambda loss, parts: plain(loss.arrival) * parts[0],
-        Series: lambda _, parts: prod(parts),
-        Delayed: lambda _, parts: parts[0],
-        AbstractRandomAffine: _certain,
-    })  # fmt: skip
-    return probability
-
-
-def _certain(channel: AbstractRandomAffine, _: object) -> Scalar:
-    if channel.erases:
-        raise fail("transmitter behind a loss", "a chain that erases", type(channel).__name__)
-    return 1.0
-
-
-def _behind(channel: AbstractRandomAffine, second: Second) -> Second:
-    """E (z, 1)(z, 1)' behind a map, of what arrives."""
-    match channel:
-        case Erasure():
-            return _behind(channel.base, second)
-        case Series():
-            for affine in channel.maps:
-                second = _behind(affine, second)
-            return second
-        case Delayed():
-            return _behind(channel.link, second)
-    # E h Y h' by the second moments of the random map h, and its mean.
-    moments = channel.moments(2)
-    tensor = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
-    mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
-    behind: Second = xp.block(
-        [[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]]
-    )
-    return behind
-
-
-def _line(second: Second, times: int) -> Second:
-    """Moment of the line (y_k, y_{k-1}, ...): each as the present one; a delay chooses one of them, so no two meet."""
-    xp = library(second)
-    mean, blocks = xp.tile(second[:-1, -1], times), xp.kron(np.eye(times), second[:-1, :-1])
-    line: Second = xp.block([[blocks, mean[:, None]], [mean[None], np.ones((1, 1))]])
-    return line
+    return channel.visit_hops(visit, Position("", 0, signal))[0]
 
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
@@ -253,7 +91,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
 
         def note(name: str, hop: AbstractHop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> AbstractHop:
             assert signal is not None and isinstance(hop, GainAndNoise)
-            if not is_silent(hop):
+            if not hop.is_silent:
                 powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
             return hop
 

@@ -1,22 +1,29 @@
 """Random affine maps z = G y + n: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import wraps
-from types import UnionType
 from typing import Any, NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
 import numpy as np
 
+from heliograph.numerics.angle import Angles
+from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, stack_parts
-from heliograph.numerics.types import Float, PyTree
-from heliograph.random_affine.chain import AbstractMemory
+from heliograph.numerics.types import Bool, Float, PyTree
+from heliograph.random_affine.chain import AbstractMemory, unique_memories
+from heliograph.random_affine.components import Component
+from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
+from heliograph.random_affine.moments.intervals import CORNERS, Interval
 from heliograph.random_affine.moments.monomials import Moments, count_monomials
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.route import Position, Signal, Visit, carry_by_moments, refuse_gain_on_angles
 
 T = TypeVar("T")
+KnownGains = Bool[np.ndarray, " m"]
 
 
 @readable
@@ -127,9 +134,124 @@ class AbstractRandomAffine(Module):
         """Return E[Sym^order(H)] of each of the `extremes`."""
         return stack_parts([m.moments(order).matrix for m in self.extremes()])
 
+    def moment_interval(self, order: int) -> Interval:
+        """Lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
+
+        Up to CORNERS corner laws the ends are attained, since every entry is linear in each uncertain law; above, the
+        intervals of the parts are multiplied: sound but not attained.
+        """
+        check_forgets("channel of a bound", self)
+        corners = count_corners(self)
+        if corners is None or corners > CORNERS:
+            return self._interval_of_parts(order)
+        matrices = self.corner_moments(order)
+        return matrices.min(axis=0), matrices.max(axis=0)
+
+    def _interval_of_parts(self, order: int) -> Interval:
+        """Combine intervals of the parts' moments; by default a refusal."""
+        raise fail("uncertain channel", f"at most {CORNERS} corner laws", count_corners(self))
+
     def mean_gain(self) -> "AbstractRandomAffine":
         """Return the map whose gains are constant at their means; noises stay."""
         raise unwritten(self, "mean_gain")
+
+    @property
+    def known_gains(self) -> KnownGains:
+        """Which components of z = G y + n have a constant row of G (m,)."""
+        return self.carry_known_gains(np.ones(self.inputs, dtype=bool))
+
+    @property
+    def has_known_gain(self) -> bool:
+        """True if z = G y + n has a constant G."""
+        return bool(np.all(self.known_gains))
+
+    def carry_known_gains(self, known: KnownGains) -> KnownGains:
+        """Find which outputs have a known gain, from which of the inputs have; by default none."""
+        return np.zeros(self.outputs, dtype=bool)
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Return the indices of outputs that are angles, from those of the inputs.
+
+        Raises:
+            ValueError: angles that are no angles behind this map, as behind any gain but 1; by default all.
+        """
+        if sent:
+            raise refuse_gain_on_angles(type(self).__name__)
+        return ()
+
+    def degree_in(self, identity: str) -> int:
+        """Return the degree of H as a polynomial in the state of a memory: one for each map in series that it fades."""
+        return sum(affine.degree_in(identity) for affine in inner_maps(self))
+
+    def condition_on_arrival(self) -> "AbstractRandomAffine":
+        """Return the map given that everything arrives, where losses are independent of gains.
+
+        Raises:
+            ValueError: losses that are not; by default, of whatever can be lost.
+        """
+        if self.erases:
+            raise fail("channel", "erasures of channels, not mixtures of them", type(self).__name__)
+        return self
+
+    def list_outcomes(self) -> list["Outcome"]:
+        """List every set of losses of a map without memory; those of probability 0 are left out."""
+        check_forgets("channel with erasures", self)
+        if not self.erases:
+            return [Outcome(1.0, self, np.ones(self.outputs, dtype=bool))]
+        return [o for o in self._outcomes() if is_traced(o.probability) or o.probability > 0]
+
+    def _outcomes(self) -> list["Outcome"]:
+        """List the sets of losses of a map that erases; by default a refusal."""
+        raise fail("channel with erasures", "erasures in series and stacks", type(self).__name__)
+
+    def list_atoms(self) -> list[Component]:
+        """List all combinations of gains and noises, where these are finitely many; by default a refusal."""
+        raise fail("mixture filter", "maps made of hops, series, stacks, sums and mixtures", type(self).__name__)
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Joint moments of the gain and of the gains of the noise sources, in the order of the signal's way.
+
+        A noise of covariance R counts as rank(R) sources of unit size, and its mean as their disturbance: a mean that
+        they cannot make is refused. Uncertain probabilities count as nominal.
+
+        Raises:
+            ValueError: a map that does not know them, as by default.
+        """
+        raise fail("channel", "hops, series, mixtures, stacks and sums of them", type(self).__name__)
+
+    def in_words(self) -> str:
+        """Return the map in words, such as "Rician hop → hop of gain 1.1"; nothing for one that only selects."""
+        return type(self).__name__
+
+    def detach_outliers(self) -> tuple["AbstractRandomAffine", AbstractNoise | None]:
+        """Replace the last noise by its mean where its law has outliers; return the map left, and that noise if any."""
+        return self, None
+
+    @property
+    def is_silent(self) -> bool:
+        """True if the map is known to deliver noise alone, as a loss or a mode without reception does."""
+        return False
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple["AbstractRandomAffine", Position]:
+        """Return the map with each hop replaced by visit(name, hop, signal), and the position behind it.
+
+        The signal behind it is not set: a series does so by `carry_signal`.
+
+        Raises:
+            ValueError: a map whose transmitters are not known; by default all.
+        """
+        expected = "hops in series, stacks, sums, mixtures, modes, losses and delays"
+        raise fail("transmitters of a channel", expected, type(self).__name__)
+
+    def carry_signal(self, signal: Signal) -> Signal:
+        """Return E (z, 1)(z, 1)' of what arrives behind the map, and the probability that it does.
+
+        Raises:
+            ValueError: by default, of a map that erases: it must say itself with which probability.
+        """
+        if self.erases:
+            raise fail("transmitter behind a loss", "a chain that erases", type(self).__name__)
+        return carry_by_moments(signal, self.moments(2))
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """Return a point at which moments can be compared with samples (a lifted map takes only lifted points)."""
@@ -175,27 +297,21 @@ def _fields(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
     return jax.tree.flatten(channel, is_leaf=lambda x: x is not channel and isinstance(x, AbstractRandomAffine))
 
 
-def fold(
-    channel: AbstractRandomAffine,
-    cases: Mapping[type | UnionType, Callable[[Any, list[T]], T]],
-    name: str = "channel",
-    expected: str = "a map of a known kind",
-) -> T:
-    """Return the value of a channel from the values of its `inner_maps`, one case for each kind of map.
+@cache_by_object
+def count_corners(channel: AbstractRandomAffine) -> int | None:
+    """Return the number of corner laws of a channel; None where they are too many to be counted."""
+    try:
+        return channel.corner_count()
+    except ValueError:  # one law with more uncertain atoms than corners are listed for
+        return None
 
-    Args:
-        channel: a tree of maps.
-        cases: value of a map, from the map and the values of those it holds, by kind; the first that fits counts.
-        name: name of the channel in the refusal of other kinds ("channel" unless given).
-        expected: kinds that there are cases for, in words ("a map of a known kind" unless given).
 
-    Raises:
-        ValueError: a map of another kind.
-    """
-    for kind, case in cases.items():
-        if isinstance(channel, kind):
-            return case(channel, [fold(affine, cases, name, expected) for affine in inner_maps(channel)])
-    raise fail(name, expected, type(channel).__name__)
+class Outcome(NamedTuple):
+    """Set of losses that the receiver can observe: with `probability` the outputs in `arrived` come through `map`."""
+
+    probability: float | jax.Array
+    map: AbstractRandomAffine
+    arrived: Bool[np.ndarray, " outputs"]
 
 
 class AbstractModal(AbstractRandomAffine):
@@ -211,6 +327,15 @@ class AbstractModal(AbstractRandomAffine):
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
         """Return the map, without memory, for this state of the memory."""
         raise unwritten(self, "given")
+
+    @property
+    def memory_in_words(self) -> str:
+        """Name of the memory and a colon; nothing where it has none."""
+        return "" if self.memory.name is None else f"{self.memory.name!r}: "
+
+    def degree_in(self, identity: str) -> int:
+        """One in its own memory."""
+        return int(self.memory.identity == identity)
 
 
 class ChannelState(NamedTuple):
@@ -239,16 +364,6 @@ def memories(channel: PyTree) -> dict[str, AbstractMemory]:
     """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
     parts = jax.tree.leaves(channel, is_leaf=is_modal)
     return unique_memories(leaf.memory for leaf in parts if is_modal(leaf))
-
-
-def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Memories without repetition, told apart by their labels, in order of appearance."""
-    results: dict[str, AbstractMemory] = {}
-    for memory in held:
-        known = results.setdefault(memory.identity, memory)
-        if not (known is memory or is_traced(known, memory) or eqx.tree_equal(known, memory)):
-            raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
-    return results
 
 
 def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
@@ -283,8 +398,3 @@ def check_forgets(name: str, channel: AbstractRandomAffine) -> None:
     """Raise ValueError where a map remembers, for what knows only laws that are independent over time."""
     if channel.remembers:
         raise fail(name, "one that forgets", f"{type(channel).__name__}, which remembers")
-
-
-def apply(h: jax.Array, y: jax.Array) -> jax.Array:
-    """z = G y + n for a drawn H."""
-    return h[:-1, :-1] @ y + h[:-1, -1]

@@ -1,5 +1,6 @@
 """Memories of links: a Markov chain of modes, or a Gaussian fading that drifts; neither depends on what is sent."""
 
+from collections.abc import Iterable
 from copy import copy
 from math import comb, factorial
 from typing import NamedTuple
@@ -260,3 +261,13 @@ def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     x, w = hermegauss(count)
     scale = np.sqrt([float(factorial(m)) for m in range(count)])
     return x, w / np.sqrt(2 * np.pi), hermevander(x, count - 1) / scale
+
+
+def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
+    """Memories without repetition, told apart by their labels, in order of appearance."""
+    results: dict[str, AbstractMemory] = {}
+    for memory in held:
+        known = results.setdefault(memory.identity, memory)
+        if not (known is memory or is_traced(known, memory) or eqx.tree_equal(known, memory)):
+            raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
+    return results

@@ -1,7 +1,7 @@
 """Maps made of independent maps: in series, and side by side."""
 
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
@@ -9,12 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.composite import AbstractComposite
+from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, Outcome, check_forgets, check_maps
+from heliograph.random_affine.components import Component, combine
+from heliograph.random_affine.composite import ARROW, AbstractComposite, list_in_words
+from heliograph.random_affine.hop import known
+from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, stack_gains
+from heliograph.random_affine.moments.intervals import Interval, multiply_matrices, multiply_rows
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count_monomials,
@@ -23,7 +28,11 @@ from heliograph.random_affine.moments.monomials import (
     position,
     refuse_if_too_large,
 )
+from heliograph.random_affine.moments.tensors import second_moment_tensor
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.route import Position, Signal, Visit
 
+OUTCOME_LIMIT = 1024  # sets of losses that are listed
 Corners = Float[jax.Array | np.ndarray, "corner rows columns"]
 
 
@@ -42,6 +51,10 @@ class AbstractCombination(AbstractComposite):
         keys = jax.random.split(key, len(self.maps))
         return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
 
+    def degree_in(self, identity: str) -> int:
+        """Largest degree of a map, since they stand side by side."""
+        return max(affine.degree_in(identity) for affine in self.maps)
+
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
     ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
@@ -49,6 +62,15 @@ class AbstractCombination(AbstractComposite):
         states = state if self.remembers else ((),) * len(self.maps)
         pairs = [m.draw(s, k) for m, s, k in zip(self.maps, states, keys, strict=True)]
         return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
+
+
+def _join_outcomes(
+    a: list[Outcome], b: list[Outcome], join: Callable[[Outcome, Outcome], tuple[AbstractRandomAffine, np.ndarray]]
+) -> list[Outcome]:
+    """Losses of independent parts: probabilities multiply."""
+    if len(a) * len(b) > OUTCOME_LIMIT:
+        raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
+    return [Outcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
 
 
 class Series(AbstractCombination):
@@ -93,6 +115,71 @@ class Series(AbstractCombination):
             products = corners @ first[:, None]
             first = products.reshape(-1, *products.shape[2:])
         return first
+
+    def _interval_of_parts(self, order: int) -> Interval:
+        """Products of the parts' intervals."""
+        intervals = [m.moment_interval(order) for m in self.maps]
+        return reduce(lambda before, after: multiply_matrices(after, before), intervals)
+
+    def carry_known_gains(self, known: KnownGains) -> KnownGains:
+        """Those that are known behind each map in turn."""
+        return reduce(lambda before, affine: affine.carry_known_gains(before), self.maps, known)
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those that are angles behind each map in turn."""
+        return reduce(lambda before, affine: affine.carry_angles(before), self.maps, sent)
+
+    def degree_in(self, identity: str) -> int:
+        """Sum of the maps' degrees, since they are multiplied."""
+        return sum(affine.degree_in(identity) for affine in self.maps)
+
+    def condition_on_arrival(self) -> AbstractRandomAffine:
+        """The same series of maps through which everything arrives."""
+        return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
+
+    def _outcomes(self) -> list[Outcome]:
+        """An output is lost where the later map loses it or has a gain on what the earlier one lost."""
+        return reduce(partial(_join_outcomes, join=_join_in_series), (m.list_outcomes() for m in self.maps))
+
+    def list_atoms(self) -> list[Component]:
+        """Every atom of each map, one after another."""
+        return combine([affine.list_atoms() for affine in self.maps], Component.then)
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Those of each map, then of the next."""
+        return reduce(DisturbedGain.then, (affine.disturb_gain() for affine in self.maps))
+
+    def in_words(self) -> str:
+        """The maps in words, with arrows between them."""
+        return ARROW.join(filter(None, (affine.in_words() for affine in self.maps)))
+
+    def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
+        """Take the noise of the last map."""
+        *before, last = self.maps
+        plain, noise = last.detach_outliers()
+        return (self, None) if noise is None else (Series([*before, plain]), noise)
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit the maps in their order, each with the signal that comes through those before it."""
+        visited, signal = list[AbstractRandomAffine](), position.signal
+        for i, affine in enumerate(self.maps):
+            changed, position = affine.visit_hops(visit, position._replace(signal=signal))
+            visited.append(changed)
+            if signal is not None and i + 1 < len(self.maps):
+                signal = affine.carry_signal(signal)
+        return self.rebuilt(*visited), position
+
+    def carry_signal(self, signal: Signal) -> Signal:
+        """The signal behind each map in turn."""
+        return reduce(lambda before, affine: affine.carry_signal(before), self.maps, signal)
+
+
+def _join_in_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+    received = known(np.diag(x.arrived.astype(float)))
+    second = y.map.moments(2)
+    power = np.asarray(second_moment_tensor(second.matrix, second.outputs, second.inputs))[..., :-1, :-1]
+    uses = np.einsum("iiaa->ia", power) > 0  # E[G_ia^2]
+    return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
 
 
 def maps_in_series(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
@@ -142,6 +229,59 @@ class Stack(AbstractCombination):
         return Moments(
             stack_parts(stack_rows(self, order, tables, multiply_polynomials)), self.outputs, self.inputs, order
         )
+
+    def _interval_of_parts(self, order: int) -> Interval:
+        """Products of the parts' interval polynomials, row by row."""
+        tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
+        rows = stack_parts(stack_rows(self, order, tables, multiply_rows))
+        return rows[:, 0], rows[:, 1]
+
+    def carry_known_gains(self, known: KnownGains) -> KnownGains:
+        """Those of the maps, one after another."""
+        return np.concatenate([affine.carry_known_gains(known) for affine in self.maps])
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those of the maps, whose outputs stand one after another."""
+        starts = np.cumsum([0, *(affine.outputs for affine in self.maps)])
+        items = zip(starts, self.maps, strict=False)
+        return tuple(int(start) + i for start, affine in items for i in affine.carry_angles(sent))
+
+    def condition_on_arrival(self) -> AbstractRandomAffine:
+        """The same stack of maps through which everything arrives."""
+        return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
+
+    def _outcomes(self) -> list[Outcome]:
+        """Every set of losses of each map with every one of the others."""
+        return reduce(partial(_join_outcomes, join=_join_in_stack), (m.list_outcomes() for m in self.maps))
+
+    def list_atoms(self) -> list[Component]:
+        """Every atom of each map, one above another."""
+        return combine([affine.list_atoms() for affine in self.maps], Component.above)
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Those of the maps, one above another."""
+        return stack_gains([affine.disturb_gain() for affine in self.maps], self.inputs)
+
+    def in_words(self) -> str:
+        """The maps in words, between bars."""
+        return list_in_words(self.maps)
+
+    def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
+        """Take the noise of each map, none where a map has no outliers."""
+        parts = [affine.detach_outliers() for affine in self.maps]
+        if all(noise is None for _, noise in parts):
+            return self, None
+        noises = [noise or Gaussian(np.zeros((plain.outputs, plain.outputs))) for plain, noise in parts]
+        return Stack([plain for plain, _ in parts]), Independent(noises)
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit each map as one part."""
+        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number(self.maps, "part")]
+        return self.rebuilt(*visited), position
+
+
+def _join_in_stack(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+    return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
 
 
 def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]) -> list[Any]:

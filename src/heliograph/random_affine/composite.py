@@ -6,10 +6,15 @@ from math import prod
 
 import equinox as eqx
 import jax
+import numpy as np
 
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
+from heliograph.random_affine.route import Position, Visit, refuse_gain_on_angles
+
+ARROW, DIRECT = " → ", "direct"  # between maps in series, and of one that only selects
 
 
 class AbstractComposite(AbstractRandomAffine):
@@ -70,8 +75,32 @@ class AbstractUniform(AbstractRandomAffine):
         """Inputs of each map."""
         return self.maps[0].inputs
 
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those of every map: all choices must agree."""
+        results = {affine.carry_angles(sent) for affine in self.maps}
+        if len(results) > 1:
+            raise refuse_gain_on_angles(type(self).__name__)
+        return results.pop()
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit the hops of each map, which are the same transmitters in each."""
+        pairs = [affine.visit_hops(visit, position) for affine in self.maps]
+        visited: AbstractRandomAffine = replace_inner_maps(self, [affine for affine, _ in pairs])
+        return visited, max((after for _, after in pairs), key=lambda after: after.hops)
+
     def check_shapes(self, name: str) -> None:
         """Raise ValueError where the maps have several shapes."""
         shapes = [(m.outputs, m.inputs) for m in self.maps]
         if len(set(shapes)) != 1:
             raise fail(name, "maps of one shape", shapes)
+
+
+def list_in_words(maps: Sequence[AbstractRandomAffine]) -> str:
+    """Return maps side by side in words, with bars between them; equal ones by their number."""
+    parts = [affine.in_words() or DIRECT for affine in maps]
+    return f"{len(parts)} × ({parts[0]})" if len(set(parts)) == 1 else f"({' | '.join(parts)})"
+
+
+def percent_in_words(share: object) -> str:
+    """Return a share as a percentage of three digits."""
+    return f"{100 * float(np.asarray(share)):.3g}%"

@@ -1,6 +1,7 @@
 """Delayed links: at step k arrives what was sent d steps before; and such links in series, whose relays may store."""
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import TypeVar
 
 import equinox as eqx
@@ -9,18 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps, replace_inner_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.composite import AbstractWrapper
+from heliograph.random_affine.composite import DIRECT, AbstractWrapper
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.route import Position, Signal, Visit
 
 # Steps; their law at each step; or a chain whose mode is the number of steps.
 Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)
@@ -68,6 +71,20 @@ class DelayLine(AbstractDelayLine):
     def past(self) -> int:
         """Steps back that the line reaches."""
         return self.steps
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those of the map, from the angles of what was sent at each of the steps that may arrive."""
+        size = signal_size(self)
+        return self.line.carry_angles(tuple(t * size + i for t in range(1 + self.past) for i in sent))
+
+    def in_words(self) -> str:
+        """The map in words."""
+        return self.plain.in_words()
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit the hops of the map, to which the line of past signals goes."""
+        plain, position = self.plain.visit_hops(visit, position.on_delay_line(self.inputs // signal_size(self)))
+        return replace_inner_maps(self, [plain]), position
 
 
 class Delayed(AbstractDelayLine):
@@ -122,6 +139,24 @@ class Delayed(AbstractDelayLine):
     def constant(self) -> bool:
         """True if the delay never varies."""
         return isinstance(self.delay, GainAndNoise)
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those of the link; a time stamp stands after them."""
+        return self.link.carry_angles(sent)
+
+    def in_words(self) -> str:
+        """The link in words, and how late it is."""
+        late = f"{'/'.join(map(str, self.times))} steps late{', timestamped' if self.timestamped else ''}"
+        return f"{self.link.in_words() or DIRECT}, {late}"
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit the hops of the link."""
+        link, position = self.link.visit_hops(visit, position)
+        return replace_inner_maps(self, [link, self.delay]), position
+
+    def carry_signal(self, signal: Signal) -> Signal:
+        """The signal behind the link, as if it were not late."""
+        return self.link.carry_signal(signal)
 
     def given(self, d: int) -> AbstractRandomAffine:
         """Return the map of the line for one delay d, without the time stamp."""
@@ -238,6 +273,10 @@ class Relayed(AbstractDelayLine):
         for stage in self.stages[1:]:
             whole = Series([DelayedLine(whole, size, stage.past), place_on_delay_line(stage)])
         return whole
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those that are angles behind each stage in turn."""
+        return reduce(lambda before, stage: stage.carry_angles(before), self.stages, sent)
 
     @property
     def past(self) -> int:

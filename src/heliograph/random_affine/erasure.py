@@ -1,22 +1,19 @@
 """A loss that the receiver knows of: the channel of complete packets, and every set of losses with its probability."""
 
-from collections.abc import Callable
-from functools import reduce
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.traced import is_traced, plain
-from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.composite import AbstractWrapper
+from heliograph.numerics.traced import plain
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine, Outcome, check_maps
+from heliograph.random_affine.composite import DIRECT, AbstractWrapper, percent_in_words
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.moments.tensors import second_moment_tensor
+from heliograph.random_affine.route import Position, Signal, Visit
 
 
 class Erasure(AbstractWrapper):
@@ -41,73 +38,37 @@ class Erasure(AbstractWrapper):
         lost = ~jax.random.bernoulli(arrives, self.arrival)
         return state, h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
 
+    def condition_on_arrival(self) -> AbstractRandomAffine:
+        """What arrives through the map."""
+        return self.base.condition_on_arrival()
+
+    def _outcomes(self) -> list[Outcome]:
+        """Either what the map delivers, or nothing."""
+        arrival, lost = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
+        listed = [o._replace(probability=arrival * o.probability) for o in self.base.list_outcomes()]
+        return [*listed, Outcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those of the map: what is lost is none."""
+        return self.base.carry_angles(sent)
+
+    def in_words(self) -> str:
+        """The map in words, and how much of it is lost."""
+        return f"{self.base.in_words() or DIRECT}, {percent_in_words(1 - self.arrival)} lost"
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit the hops of the map, which send whether they are received or not."""
+        base, position = self.base.visit_hops(visit, position)
+        return self.rebuilt(base), position
+
+    def carry_signal(self, signal: Signal) -> Signal:
+        """The signal behind the map, of what arrives."""
+        signal = self.base.carry_signal(signal)
+        return signal._replace(arrives=signal.arrives * plain(self.arrival))
+
     def moments(self, order: int) -> Moments:
         """Refuse: a filter skips lost packets, and asks for the moments of the channel inside."""
         raise fail("moments of a channel", "one without erasures (give the filter what is inside)", "an erasure")
-
-
-def condition_on_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the channel given that everything arrives, where losses are independent of gains."""
-    if not channel.erases:
-        return channel
-    match channel:
-        case Erasure():
-            return condition_on_arrival(channel.base)
-        case Series() | Stack():
-            return channel.rebuilt(*map(condition_on_arrival, channel.maps))
-    raise fail("channel", "erasures of channels, not mixtures of them", type(channel).__name__)
-
-
-OUTCOME_LIMIT = 1024  # sets of losses that are listed
-
-
-class Outcome(NamedTuple):
-    """Set of losses that the receiver can observe: with `probability` the outputs in `arrived` come through `map`."""
-
-    probability: float | jax.Array
-    map: AbstractRandomAffine
-    arrived: Bool[np.ndarray, " outputs"]
-
-
-def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
-    """List every set of losses of a channel without memory; outcomes of probability 0 are left out."""
-    check_forgets("channel with erasures", channel)
-    if not channel.erases:
-        return [Outcome(1.0, channel, np.ones(channel.outputs, dtype=bool))]
-    match channel:
-        case Erasure():
-            # Either what the base delivers, or nothing.
-            arrival, lost = plain(channel.arrival), np.zeros(channel.outputs, dtype=bool)
-            listed = [o._replace(probability=arrival * o.probability) for o in outcomes(channel.base)]
-            listed.append(Outcome(1 - arrival, known(np.zeros((channel.outputs, channel.inputs))), lost))
-        # Losses of independent parts: probabilities multiply.
-        case Series() | Stack():
-            join = _join_series if isinstance(channel, Series) else _join_parallel
-            listed = reduce(lambda done, more: _join_outcomes(done, more, join), map(outcomes, channel.maps))
-        case _:
-            raise fail("channel with erasures", "erasures in series and stacks", type(channel).__name__)
-    return [o for o in listed if is_traced(o.probability) or o.probability > 0]
-
-
-def _join_outcomes(
-    a: list[Outcome], b: list[Outcome], join: Callable[[Outcome, Outcome], tuple[AbstractRandomAffine, np.ndarray]]
-) -> list[Outcome]:
-    if len(a) * len(b) > OUTCOME_LIMIT:
-        raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
-    return [Outcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
-
-
-def _join_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
-    """Join outcomes in series: an output is lost where y loses it or has a gain on what x lost."""
-    received = known(np.diag(x.arrived.astype(float)))
-    power = second_moments(y.map)[1][..., :-1, :-1]  # E[G_ia G_jb]
-    uses = np.einsum("iiaa->ia", power) > 0
-    return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
-
-
-def _join_parallel(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
-    """Join outcomes in parallel: the outputs of both, one after another."""
-    return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
 
 
 def second_moments(

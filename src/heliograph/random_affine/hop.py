@@ -5,12 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.traced import library, scatter, stack_parts
+from heliograph.numerics.traced import is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, KnownGains
+from heliograph.random_affine.components import Component
 from heliograph.random_affine.law import AbstractLaw, Constant
+from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, disturb_hop, noise_gain
+from heliograph.random_affine.moments.intervals import Interval
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count_monomials,
@@ -20,6 +24,10 @@ from heliograph.random_affine.moments.monomials import (
     symmetric_power,
 )
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_vector
+from heliograph.random_affine.route import Position, Visit, refuse_gain_on_angles
+
+NOTHING_SENT = "nothing sent"  # in words
+ROUNDING = 1e-12  # of a gain of 1 that was computed
 
 
 class AbstractHop(AbstractRandomAffine):
@@ -37,6 +45,23 @@ class AbstractHop(AbstractRandomAffine):
     def inputs(self) -> int:
         """Length of y."""
         return int(self.matrix.shape[-1])
+
+    @property
+    def transmits(self) -> bool:
+        """True of a radio; False of a wire, which passes its input on without gain and noise."""
+        return not (self._gain_is_one and is_zero(self.noise.covariance))
+
+    @property
+    def _gain_is_one(self) -> bool:
+        return False
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit a hop that transmits, as the next along its chain."""
+        if not self.transmits:
+            return self, position
+        after = position._replace(hops=position.hops + 1)
+        visited: AbstractRandomAffine = visit(f"{position.prefix}hop{after.hops}", self, position.signal)
+        return visited, after
 
 
 class GainAndNoise(AbstractHop):
@@ -108,6 +133,81 @@ class GainAndNoise(AbstractHop):
         gains, basis = self.law.corner_moments(order), self.gain_coefficients(order)
         moment_map: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
         return moment_map
+
+    def _interval_of_parts(self, order: int) -> Interval:
+        """Sum the known B_k with the exact range of each E[g^k], from the closed-form LP of a discrete law."""
+        basis, xp = self.gain_coefficients(order), library(self.gain_coefficients(order))
+        ends = [self.law.moment_interval(k) for k in range(order + 1)]
+        products = [
+            (xp.minimum(b * lo, b * hi), xp.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
+        ]
+        return sum(low for low, _ in products), sum(high for _, high in products)
+
+    def carry_known_gains(self, known: KnownGains) -> KnownGains:
+        """Those that take nothing but known inputs, by a constant gain."""
+        takes = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
+        rows: KnownGains = isinstance(self.law, Constant) & ~np.any(takes & ~known, axis=1)
+        return rows
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those that take one angle each by a gain of 1, and with it whole numbers of turns."""
+        if not sent:
+            return ()
+        if is_traced(self.matrix):
+            raise refuse_gain_on_angles("a gain that is traced")
+        touched = np.flatnonzero(np.any(np.asarray(self.matrix)[:, list(sent)] != 0, axis=1))
+        if not touched.size:
+            return ()
+        if not isinstance(self.law, Constant) or is_traced(self.law.value):
+            raise refuse_gain_on_angles(f"a gain that is {type(self.law).__name__}")
+        rows = float(self.law.value) * np.asarray(self.matrix)[touched]
+        whole = np.abs(rows - np.round(rows)) <= ROUNDING
+        if not np.all(whole & (np.round(rows) >= 0)) or np.any(np.round(rows).sum(axis=1) != 1):
+            raise refuse_gain_on_angles(f"the gains {rows[rows != 0].tolist()}")
+        return tuple(int(i) for i in touched)
+
+    def list_atoms(self) -> list[Component]:
+        """Combine every gain with every noise."""
+        gains, noises = self.law.list_atoms(), self.noise.list_atoms()
+        return [Component(p * q, g * self.matrix, c, r) for p, g in gains for q, c, r in noises]
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Those of [g A, N], N a root of the noise's covariance."""
+        root = noise_gain(np.asarray(self.noise.mean), np.asarray(self.noise.covariance))
+        return disturb_hop(np.asarray(self.matrix), (float(self.law.moment(1)), float(self.law.moment(2))), root)
+
+    def in_words(self) -> str:
+        """The law, the gain where that is one known number, and whether the hop adds noise."""
+        matrix = np.asarray(self.matrix)
+        silent = not (np.any(np.asarray(self.noise.covariance)) or np.any(np.asarray(self.noise.mean)))
+        if not matrix.any():
+            return NOTHING_SENT
+        diagonal = matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
+        if not isinstance(self.law, Constant):
+            return f"{type(self.law).__name__} hop"
+        gain = float(self.law.value) * matrix[0, 0] if diagonal else np.nan
+        selects = float(self.law.value) == 1 and np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
+        if silent and (gain == 1 or selects):
+            return ""
+        kind = "known gain" if silent else "hop"
+        return f"{kind} {gain:.3g}" if diagonal and gain != 1 else kind
+
+    def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
+        """Take the noise away where its law has outliers."""
+        if not self.noise.has_outliers:
+            return self, None
+        still = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
+        return GainAndNoise(self.law, self.matrix, still), self.noise
+
+    @property
+    def is_silent(self) -> bool:
+        """True if A is zero and the gain is one, so that it says no more."""
+        return is_zero(self.matrix) and self._gain_is_one
+
+    @property
+    def _gain_is_one(self) -> bool:
+        """True of a gain that is known to be one."""
+        return isinstance(self.law, Constant) and not is_traced(self.law.value) and float(self.law.value) == 1.0
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Return the map E[g] A y + n."""

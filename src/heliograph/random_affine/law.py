@@ -54,6 +54,15 @@ class AbstractLaw(Module):
         """Return E[g^k], k = 0, ..., order, of each of the `extremes`."""
         return stack_parts([stack_parts([law.moment(k) for k in range(order + 1)]) for law in self.extremes()])
 
+    def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
+        """Lowest and highest E[g^order] over the possible laws, those of the `extremes`."""
+        ends = self.corner_moments(order)[:, order]
+        return plain(ends.min()), plain(ends.max())
+
+    def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
+        """List probability and value of each of finitely many gains; by default a refusal."""
+        raise fail("mixture filter", "gains of finitely many values", type(self).__name__)
+
     def mean_law(self) -> "Constant":
         """Return the constant law at E[g], for a filter that takes the mean gain as the true one."""
         return Constant(self.moment(1))
@@ -78,6 +87,10 @@ class Constant(AbstractLaw):
         """Return value^order."""
         return plain(self.value**order)
 
+    def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
+        """The value, which is certain."""
+        return [(1.0, plain(self.value))]
+
 
 class Discrete(AbstractLaw):
     """Gains `values` with `probabilities`, each known within its `radius`."""
@@ -98,6 +111,15 @@ class Discrete(AbstractLaw):
     def moment(self, order: int) -> float | jax.Array:
         """Return sum_i p_i v_i^order."""
         return plain(self.probabilities @ self.values**order)
+
+    def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
+        """Lowest and highest E[g^order], also where the corners are too many to list."""
+        powers = self.values**order
+        return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
+
+    def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
+        """The values, with their probabilities."""
+        return [(plain(p), plain(v)) for p, v in zip(self.probabilities, self.values, strict=True)]
 
     def worst(self, payoff: ArrayLike) -> float:
         """Exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.

@@ -12,11 +12,14 @@ from heliograph.numerics.traced import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
 from heliograph.random_affine.combine import AbstractCombination, Corners
-from heliograph.random_affine.composite import AbstractUniform
-from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.components import Component
+from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
+from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
 from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, mix_gains
 from heliograph.random_affine.moments.monomials import Moments, product_table
 from heliograph.random_affine.noise import Gaussian, Matrix
+from heliograph.random_affine.route import Position, Visit
 
 
 class Mixture(AbstractUniform, AbstractCombination):
@@ -79,6 +82,31 @@ class Mixture(AbstractUniform, AbstractCombination):
     def corner_count(self) -> int:
         """Extreme weights times the product of the maps' counts."""
         return len(self.choice.corners()) * super().corner_count()
+
+    def list_atoms(self) -> list[Component]:
+        """The atoms of each map, times its probability."""
+        parts = zip(self.choice.probabilities, self.maps, strict=True)
+        return [c._replace(weight=p * c.weight) for p, affine in parts for c in affine.list_atoms()]
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Those of one of the maps, drawn."""
+        parts = [affine.disturb_gain() for affine in self.maps]
+        return mix_gains(parts, np.asarray(self.choice.probabilities), self.inputs)
+
+    def in_words(self) -> str:
+        """The maps in words, with their shares; of a map and silence, a loss that nobody notices."""
+        parts, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
+        if len(parts) == 2 and parts[1] == NOTHING_SENT:
+            return f"{parts[0]}, {percent_in_words(shares[1])} lost unnoticed"
+        choices = (f"{words} ({percent_in_words(p)})" for words, p in zip(parts, shares, strict=True))
+        return f"({' or '.join(choices)})"
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit each map as a choice with transmitters of its own; a hop and its loss are one."""
+        if sum(not affine.is_silent for affine in self.maps) <= 1:
+            return super().visit_hops(visit, position)
+        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number(self.maps, "choice")]
+        return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""

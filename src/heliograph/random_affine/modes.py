@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import array, check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stack_parts
@@ -20,19 +21,16 @@ from heliograph.random_affine.base import (
     check_forgets,
     check_maps,
     condition_on_memories,
-    inner_maps,
     memories,
 )
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.composite import AbstractUniform, AbstractWrapper
+from heliograph.random_affine.composite import DIRECT, AbstractUniform, AbstractWrapper
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.moments.lift import Lift
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.route import Position, Visit
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
 
@@ -72,6 +70,10 @@ class Modes(AbstractUniform, AbstractModal):
         present: AbstractRandomAffine = jax.tree.unflatten(trees[0], numbers)
         return present
 
+    def in_words(self) -> str:
+        """The maps in words, and the name of the memory."""
+        return f"{self.memory_in_words}modes ({' or '.join(affine.in_words() or DIRECT for affine in self.maps)})"
+
 
 class _Chosen(AbstractUniform):
     """One of several maps, by a traced index."""
@@ -103,6 +105,14 @@ class ModeOutput(AbstractModal):
         """Length of what is sent."""
         return self.sent
 
+    def carry_angles(self, sent: Angles) -> Angles:
+        """None: the number of a mode, whatever is sent."""
+        return ()
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Nothing: it has no transmitter."""
+        return self, position
+
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
         """Return the constant map to this state."""
         return known(np.zeros((1, self.sent)), library(state).stack([state]))
@@ -132,6 +142,15 @@ class OneStepLate(AbstractWrapper):
         inner, before = state
         inner, h = self.base.draw(inner, key)
         return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Those of the map."""
+        return self.base.carry_angles(sent)
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit the hops of the map."""
+        base, position = self.base.visit_hops(visit, position)
+        return self.rebuilt(base), position
 
 
 class Faded(AbstractHop, AbstractModal):
@@ -168,6 +187,10 @@ class Faded(AbstractHop, AbstractModal):
         self.deviation = scalar("deviation of the gain", deviation, 0.0)
         self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
+
+    def in_words(self) -> str:
+        """What it is, and the name of the memory."""
+        return f"{self.memory_in_words}drifting hop"
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
         """The map with the gain mean + deviation c."""
@@ -216,7 +239,7 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     held = memories(channel)
-    chains = [_nodes_of_memory(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
+    chains = [_nodes_of_memory(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
@@ -239,18 +262,6 @@ def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> 
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)
     return memory.nodes(degree)
-
-
-def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
-    """Return the degree of H as a polynomial in the state of a memory: one for each map in series that it fades."""
-    match channel:
-        case AbstractModal():
-            return int(channel.memory.identity == identity)
-        case Stack() | Superposed() | Mixture():
-            return max(degree_in(affine, identity) for affine in channel.maps)
-        case Lift():
-            return channel.degree * degree_in(channel.base, identity)
-    return sum(degree_in(affine, identity) for affine in inner_maps(channel))
 
 
 ROUNDING = 1e-12  # relative: of sums over modes that cancel

@@ -15,6 +15,7 @@ from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.components import Branches, NoiseAtom, NoiseWithoutOutliers, combine, stack_branches
 from heliograph.random_affine.law import draw_index
 from heliograph.random_affine.moments.monomials import Exponents, exponents
 
@@ -50,6 +51,38 @@ class AbstractNoise(Module):
         """Covariance as a sum of squares W diag(w) W': by the root that is drawn from, where there is one."""
         return columns_of(self.covariance)
 
+    @property
+    def has_outliers(self) -> bool:
+        """True if the law says that there are outliers."""
+        return False
+
+    @property
+    def is_symmetric(self) -> bool:
+        """True if the law is known to be symmetric about its mean."""
+        return False
+
+    def branches(self) -> Branches:
+        """Each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
+        variances = library(self.covariance).diagonal(self.covariance)[:, None]
+        return Branches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
+
+    def without_outliers(self) -> NoiseWithoutOutliers:
+        """Mean, relative to that of the whole, and covariance of the noise without its outliers."""
+        return NoiseWithoutOutliers(np.zeros(self.dimension), self.covariance)
+
+    def list_atoms(self) -> list[NoiseAtom]:
+        """List all combinations of the atoms of the noise, where these are finitely many; by default a refusal."""
+        raise fail("mixture filter", "noises of finite support or Gaussian", type(self).__name__)
+
+    def split(self, groups: Sequence[Sequence[int]]) -> "list[AbstractNoise] | None":
+        """Split into the noises of groups of components, None unless the groups are independent and complete."""
+        complete = [i for group in groups for i in group] == list(range(self.dimension))
+        return self._split(groups) if complete and not is_traced(self) else None
+
+    def _split(self, groups: Sequence[Sequence[int]]) -> "list[AbstractNoise] | None":
+        """Split at complete groups; by default, None."""
+        return None
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw one vector; shape (dimension,)."""
         raise unwritten(self, "sample")
@@ -84,6 +117,23 @@ class Gaussian(AbstractNoise):
     def columns(self) -> Columns:
         """A diag(w) A'."""
         return Columns(self.factor, self.weights)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Always True."""
+        return True
+
+    def list_atoms(self) -> list[NoiseAtom]:
+        """One atom, the mean, with the covariance about it."""
+        return [NoiseAtom(1.0, self.mean, self.covariance)]
+
+    def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
+        """Blocks of the covariance, where nothing stands between them."""
+        label = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        if np.any(np.asarray(self.covariance)[label[:, None] != label]):
+            return None
+        blocks = [np.ix_(group, group) for group in groups]
+        return [Gaussian(self.covariance[block], self.mean[block[0][:, 0]]) for block in blocks]
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw mean + A e with e normal of variances w."""
@@ -148,6 +198,11 @@ class FiniteSupport(AbstractNoise):
         centred = self.atoms - self.mean
         self.covariance = centred.T @ (self.probabilities[:, None] * centred)
 
+    def list_atoms(self) -> list[NoiseAtom]:
+        """The values, each without a spread about it."""
+        none = np.zeros((self.dimension, self.dimension))
+        return [NoiseAtom(plain(p), v, none) for p, v in zip(self.probabilities, self.atoms, strict=True)]
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Invert the distribution function at a uniform draw."""
         return jnp.asarray(self.atoms)[draw_index(self.probabilities, key)]
@@ -183,6 +238,37 @@ class Independent(AbstractNoise):
         weights = library(parts).concatenate([part.weights for part in parts])
         return Columns(block_diagonal(matrices), weights)
 
+    @property
+    def has_outliers(self) -> bool:
+        """True if one of the parts has."""
+        return any(component.has_outliers for component in self.parts)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """True if all parts are."""
+        return all(component.is_symmetric for component in self.parts)
+
+    def branches(self) -> Branches:
+        """Those of the parts, one above the other."""
+        return stack_branches([component.branches() for component in self.parts])
+
+    def without_outliers(self) -> NoiseWithoutOutliers:
+        """The parts without theirs, one above the other."""
+        parts = [component.without_outliers() for component in self.parts]
+        mean = library(parts).concatenate([part.mean for part in parts])
+        return NoiseWithoutOutliers(mean, block_diagonal([part.covariance for part in parts]))
+
+    def list_atoms(self) -> list[NoiseAtom]:
+        """Every atom of each part with every one of the others."""
+        return combine([component.list_atoms() for component in self.parts], NoiseAtom.above)
+
+    def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
+        """The parts of each group, where no part is of two."""
+        owners = np.repeat(np.arange(len(self.parts)), [component.dimension for component in self.parts])
+        owned = [[self.parts[i] for i in dict.fromkeys(owners[list(group)].tolist())] for group in groups]
+        whole = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
+        return [Independent(parts) for parts in owned] if whole else None
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""
         keys = jax.random.split(key, len(self.parts))
@@ -197,24 +283,6 @@ class Independent(AbstractNoise):
             start += component.dimension
             value *= component.moment(component_powers) if any(component_powers) else 1.0
         return value
-
-
-def split_into_groups(noise: AbstractNoise, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-    """Split a noise into those of groups of components, None unless the groups are independent and complete."""
-    if [i for group in groups for i in group] != list(range(noise.dimension)) or is_traced(noise):
-        return None
-    label = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-    match noise:
-        case Gaussian() if not np.any(np.asarray(noise.covariance)[label[:, None] != label]):
-            blocks = [np.ix_(group, group) for group in groups]
-            parts = [Gaussian(noise.covariance[block], noise.mean[block[0][:, 0]]) for block in blocks]
-            return list[AbstractNoise](parts)
-        case Independent():
-            owners = np.repeat(np.arange(len(noise.parts)), [part.dimension for part in noise.parts])
-            owned = [[noise.parts[i] for i in dict.fromkeys(owners[list(group)].tolist())] for group in groups]
-            whole = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
-            return [Independent(parts) for parts in owned] if whole else None
-    return None
 
 
 class Shaped(AbstractNoise):
@@ -241,6 +309,11 @@ class Shaped(AbstractNoise):
     def columns(self) -> Columns:
         """B W diag(w) (B W)'."""
         return self.source.columns.through(self.matrix)
+
+    def list_atoms(self) -> list[NoiseAtom]:
+        """Every atom of u mapped, B c and B R B'."""
+        b = self.matrix
+        return [NoiseAtom(p, b @ c, b @ r @ b.T) for p, c, r in self.source.list_atoms()]
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw B u."""

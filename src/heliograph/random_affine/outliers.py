@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from math import prod
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -11,11 +11,12 @@ import numpy as np
 
 from heliograph.numerics import check
 from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
-from heliograph.numerics.traced import block_diagonal, is_traced, library, plain, scipy_for
+from heliograph.numerics.traced import is_traced, library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.random_affine.components import Branches, NoiseWithoutOutliers
 from heliograph.random_affine.law import draw_index
 from heliograph.random_affine.moments.monomials import Exponents
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Number, Square, Vector
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector
 
 PRECISIONS = 10.0 ** (-5 + 5.7 * np.arange(25) / 24)
 """Precisions, in units of the scale's, at which Student's law is read as a mixture of Gaussian ones."""
@@ -59,6 +60,27 @@ class StudentT(AbstractNoise):
             raise fail("degrees of Student's law", expected, f"{float(nu):g}")
         total: Square = self.scale * (nu / (nu - 2))
         return total
+
+    @property
+    def has_outliers(self) -> bool:
+        """Always True."""
+        return True
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Always True."""
+        return True
+
+    def branches(self) -> Branches:
+        """One for each of the PRECISIONS."""
+        xp, n = library(self.degrees, self.scale), self.dimension
+        shape = (n, len(PRECISIONS))
+        shares = xp.broadcast_to(_log_or_minus_infinity(precision_shares(self.degrees)), shape)
+        return Branches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
+
+    def without_outliers(self) -> NoiseWithoutOutliers:
+        """Gaussian noise of the scale."""
+        return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw A w / sqrt(l), w standard normal."""
@@ -165,6 +187,27 @@ class Contaminated(AbstractNoise):
         object.__setattr__(law, "bounded", True)
         return law
 
+    @property
+    def has_outliers(self) -> bool:
+        """Always True."""
+        return True
+
+    @property
+    def is_symmetric(self) -> bool:
+        """True where no branch is biased."""
+        return not np.any(np.asarray(self.means) != 0)
+
+    def branches(self) -> Branches:
+        """Those of the law."""
+        xp, n = library(self.shares), self.dimension
+        shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
+        variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
+        return Branches(shares, (self.means - self.mean).T, variances)
+
+    def without_outliers(self) -> NoiseWithoutOutliers:
+        """The first branch."""
+        return NoiseWithoutOutliers(self.means[0] - self.mean, self.covariances[0])
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw the branch, then from it."""
         first, second = jax.random.split(key)
@@ -178,36 +221,6 @@ class Contaminated(AbstractNoise):
         return sum((plain(p) * Gaussian(r, m).moment(powers) for p, r, m in items), start=0.0)
 
 
-class Branches(NamedTuple):
-    """Each component of a noise as a mixture of Gaussian branches about the mean of the noise.
-
-    Shapes: log_share, mean, variance (n, branches); a branch that a component does not have has log_share -inf.
-    """
-
-    log_share: Matrix
-    mean: Matrix
-    variance: Matrix
-
-
-def branches_of_noise(noise: AbstractNoise) -> Branches:
-    """Mixture of Gaussian branches for each component: the law's, 25 of Student's, one of any other law."""
-    match noise:
-        case Independent():
-            return _stack_branches([branches_of_noise(component) for component in noise.parts])
-        case Contaminated():
-            xp, n = library(noise.shares), noise.dimension
-            shares = xp.broadcast_to(_log_or_minus_infinity(noise.shares), (n, len(noise.shares)))
-            variances = xp.diagonal(noise.covariances, axis1=1, axis2=2).T
-            return Branches(shares, (noise.means - noise.mean).T, variances)
-        case StudentT():
-            xp, n = library(noise.degrees, noise.scale), noise.dimension
-            shape = (n, len(PRECISIONS))
-            shares = xp.broadcast_to(_log_or_minus_infinity(precision_shares(noise.degrees)), shape)
-            return Branches(shares, np.zeros(shape), xp.diagonal(noise.scale)[:, None] / PRECISIONS)
-    variances = library(noise.covariance).diagonal(noise.covariance)[:, None]
-    return Branches(np.zeros((noise.dimension, 1)), np.zeros((noise.dimension, 1)), variances)
-
-
 def precision_shares(degrees: ArrayLike) -> Vector:
     """Mass of the gamma law of l between the geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
     xp: Any = library(degrees)
@@ -218,34 +231,6 @@ def precision_shares(degrees: ArrayLike) -> Vector:
     masses = xp.maximum(masses, LEAST_SHARE)
     shares: Vector = masses / xp.sum(masses)
     return shares
-
-
-class NoiseWithoutOutliers(NamedTuple):
-    """The noise without its outliers: mean (n,), relative to that of the whole, and covariance (n, n)."""
-
-    mean: Vector
-    covariance: Square
-
-
-def noise_without_outliers(noise: AbstractNoise) -> NoiseWithoutOutliers:
-    """Noise without its outliers: the first branch of contaminated noise, Student's scale, else the law."""
-    match noise:
-        case Independent():
-            items = [noise_without_outliers(law) for law in noise.parts]
-            mean = library(items).concatenate([law.mean for law in items])
-            return NoiseWithoutOutliers(mean, block_diagonal([law.covariance for law in items]))
-        case Contaminated():
-            return NoiseWithoutOutliers(noise.means[0] - noise.mean, noise.covariances[0])
-        case StudentT():
-            return NoiseWithoutOutliers(np.zeros(noise.dimension), noise.scale)
-    return NoiseWithoutOutliers(np.zeros(noise.dimension), noise.covariance)
-
-
-def has_outliers(noise: AbstractNoise) -> bool:
-    """Ask whether the law says that there are outliers."""
-    if isinstance(noise, Independent):
-        return any(has_outliers(component) for component in noise.parts)
-    return isinstance(noise, StudentT | Contaminated)
 
 
 def has_bounded_noise(*parts: PyTree) -> bool:
@@ -304,15 +289,3 @@ def _log_or_minus_infinity(value: Vector) -> Vector:
     with np.errstate(divide="ignore"):
         logarithm: Vector = np.log(np.maximum(value, 0.0))
     return logarithm
-
-
-def _stack_branches(parts: list[Branches]) -> Branches:
-    """Components of several laws one above the other, as many branches each as the one with most has."""
-    xp, most = library(parts), max(law.mean.shape[1] for law in parts)
-    fills = (-np.inf, 0.0, 1.0)
-
-    def padded(law: Branches) -> list[Matrix]:
-        more = ((0, 0), (0, most - law.mean.shape[1]))
-        return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, fills, strict=True)]
-
-    return Branches(*(xp.concatenate(rows) for rows in zip(*map(padded, parts), strict=True)))

@@ -11,6 +11,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments, exponents, symmetric_power
+from heliograph.random_affine.route import Position, Visit
 
 # (a, b, 1) to (w, its conjugate, 1) with w = a + i b.
 TO_COMPLEX = np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, 1]])
@@ -58,6 +59,10 @@ class Rotation(AbstractRandomAffine):
         there, back = (symmetric_power(matrix, order) for matrix in (TO_COMPLEX, np.linalg.inv(TO_COMPLEX)))
         matrix = (np.asarray(back) * factors) @ there
         return Moments(matrix.real, 2, 2, order)
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Nothing: it has no transmitter."""
+        return self, position
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Return the map exp(-deviation^2 / 2) y."""

@@ -12,10 +12,14 @@ from heliograph.numerics.caching import cache_arrays, cache_by_object
 from heliograph.numerics.check import check_count, fail, instance, items, show_value
 from heliograph.numerics.traced import library, scatter
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, memories
+from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, check_forgets, check_maps, memories
 from heliograph.random_affine.combine import AbstractCombination, Corners, Series, Stack, maps_in_series
+from heliograph.random_affine.components import Component
+from heliograph.random_affine.composite import list_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
+from heliograph.random_affine.moments.intervals import Interval
 from heliograph.random_affine.moments.monomials import (
     Moments,
     count_monomials,
@@ -27,7 +31,8 @@ from heliograph.random_affine.moments.monomials import (
     sum_plan,
     times_one,
 )
-from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise, noise_vector, split_into_groups
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_vector
+from heliograph.random_affine.route import Position, Visit
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y
 
@@ -127,6 +132,41 @@ class Superposed(AbstractCombination):
     def corner_moments(self, order: int) -> Corners:
         """The same with every combination of the maps' corners."""
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
+
+    def _interval_of_parts(self, order: int) -> Interval:
+        """That of the sum of a stack."""
+        return self.as_stack.moment_interval(order)
+
+    def carry_known_gains(self, known: KnownGains) -> KnownGains:
+        """Those that are known in every map."""
+        parts = zip(self.maps, self.places, strict=True)
+        rows: KnownGains = np.all([affine.carry_known_gains(known[list(at)]) for affine, at in parts], axis=0)
+        return rows
+
+    def list_atoms(self) -> list[Component]:
+        """Those of the sum of a stack."""
+        return self.as_stack.list_atoms()
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Those of the sum of a stack."""
+        return self.as_stack.disturb_gain()
+
+    def in_words(self) -> str:
+        """The sum of the maps in words."""
+        return f"sum of {list_in_words(self.maps)}"
+
+    def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
+        """Take the noise of the receiver where its law has outliers."""
+        if not self.noise.has_outliers:
+            return self, None
+        still = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
+        return Superposed(self.maps, still, self.places, self.inputs), self.noise
+
+    def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+        """Visit each map as one link, with the part of the signal that it takes."""
+        parts = zip(position.number(self.maps, "link"), self.places, strict=True)
+        visited = [affine.visit_hops(visit, at.select(taken))[0] for (affine, at), taken in parts]
+        return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
         """E[Sym^order] of the sum from those of the parts, each (corners, rows, columns)."""
@@ -244,7 +284,7 @@ def sensed_by_link(matrix: Matrix, noise: AbstractNoise, channel: AbstractRandom
     That holds where the parts of v that links carry are independent; else, and for another channel, there is none.
     """
     first, *rest = maps_in_series(channel)
-    if not isinstance(first, Superposed) or (parts := split_into_groups(noise, first.places)) is None:
+    if not isinstance(first, Superposed) or (parts := noise.split(first.places)) is None:
         return None
     links = [
         Series([GainAndNoise(Constant(1.0), np.asarray(matrix)[list(at)], part), link])

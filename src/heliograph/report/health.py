@@ -11,7 +11,6 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
-from heliograph.random_affine.erasure import outcomes
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
@@ -255,7 +254,7 @@ def _arrival_shares(receiver: Node) -> Float[np.ndarray, " received"] | None:
     if receiver.channel.remembers or not receiver.channel.erases:
         return None
     try:
-        sets = outcomes(receiver.channel)
+        sets = receiver.channel.list_outcomes()
     except InputError:  # more sets of losses than are listed
         return None
     return np.asarray(np.sum([float(o.probability) * o.arrived for o in sets], axis=0))

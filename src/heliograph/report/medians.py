@@ -5,9 +5,6 @@ import numpy as np
 
 from heliograph.model.over_time import first
 from heliograph.numerics.types import Float
-from heliograph.random_affine.erasure import condition_on_arrival
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
-from heliograph.random_affine.outliers import Contaminated, StudentT
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -34,8 +31,8 @@ def law_medians(
     receiver = network.nodes[node]
     if not isinstance(receiver, Node):
         return np.zeros(receiver.received)
-    noise, channel = first(receiver.sensor).noise, condition_on_arrival(first(receiver.channel))
-    if is_symmetric(noise) or channel.remembers or channel.past or channel.outputs != receiver.received:
+    noise, channel = first(receiver.sensor).noise, first(receiver.channel).condition_on_arrival()
+    if noise.is_symmetric or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
     # v through the mean gain, and what else the innovation is made of.
     with jax.enable_x64(True):
@@ -44,12 +41,3 @@ def law_medians(
     through = (drawn - np.asarray(noise.mean)) @ gain.T
     rest = np.sqrt(np.maximum(variance - through.var(axis=0), 0.0))
     return np.asarray(np.median(through + rest * np.random.default_rng(0).standard_normal(through.shape), axis=0))
-
-
-def is_symmetric(noise: AbstractNoise) -> bool:
-    """Test whether a law is known to be symmetric about its mean: contaminated noise is where no branch is biased."""
-    if isinstance(noise, Independent):
-        return all(map(is_symmetric, noise.parts))
-    if isinstance(noise, Contaminated):
-        return not np.any(np.asarray(noise.means) != 0)
-    return isinstance(noise, Gaussian | StudentT)

@@ -23,9 +23,9 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.base import AbstractRandomAffine, Outcome, memories
 from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
+from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import joint_modes, long_run_law
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -124,7 +124,7 @@ def _links(network: Network, states: int) -> JointLinks:
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
     # Modes that can occur.
     happens = initial @ np.linalg.matrix_power(np.eye(len(chain)) + chain, len(chain)) > 0
-    outputs = [outcomes(m) for m, ever in zip(modes.maps, happens, strict=True) if ever]
+    outputs = [m.list_outcomes() for m, ever in zip(modes.maps, happens, strict=True) if ever]
     noise = scipy.linalg.block_diag(*noises)
     links = initial[happens], chain[np.ix_(happens, happens)], outputs
     return JointLinks(*links, np.concatenate(matrices), np.concatenate(means), noise)

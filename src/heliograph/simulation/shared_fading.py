@@ -14,14 +14,14 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import (
     AbstractRandomAffine,
-    apply,
     draw_with_shared_memories,
     init_with_shared_memories,
     memories,
-    unique_memories,
 )
+from heliograph.random_affine.chain import unique_memories
 from heliograph.random_affine.delay import signal_size
 from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.route import apply
 from heliograph.simulation.draws import (
     CHANNEL,
     CHANNEL_START,

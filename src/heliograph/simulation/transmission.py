@@ -10,8 +10,9 @@ from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance, rank
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, apply
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.delay import Delayed
+from heliograph.random_affine.route import apply
 from heliograph.simulation.draws import CHANNEL, CHANNEL_START, checksum, draw_key
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

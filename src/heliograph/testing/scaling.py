@@ -17,7 +17,6 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.combine import Series
-from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, second_order
 from heliograph.simulation.network import Network
@@ -154,7 +153,7 @@ def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
 
 def _node(name: str, node: Node, units: Units) -> Node:
     channel = first(node.channel)
-    for affine in [] if channel.remembers else [outcome.map for outcome in outcomes(channel)]:
+    for affine in [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]:
         turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
         off = _measure_difference(rescaled_channel(second_order(affine), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"

@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.random_affine.atoms import list_atoms
 from tests.follow import follow
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model
@@ -54,13 +53,13 @@ def test_first_step_is_bayes_rule_on_a_grid():
 def test_atoms_have_the_channels_moments():
     s = model(oracle.paper_example(), 1)
     stacked = hg.random_affine.Stack([s.channel, hg.dropout(hg.hop(0.9, TWO), 0.7)])
-    atoms = list_atoms(stacked)
+    atoms = stacked.list_atoms()
     assert sum(a.weight for a in atoms) == pytest.approx(1.0, abs=1e-14)
     x = np.array([0.8])
     z = np.array([a.gain @ x + a.offset for a in atoms])
     mean = np.array([a.weight for a in atoms]) @ z
     np.testing.assert_allclose(mean, (stacked.moments(1).matrix @ [0.8, 1.0])[:2], rtol=1e-12)
-    assert len(list_atoms(s.channel)) == 36  # 3 powers x 2 atoms at each of two hops; the sensor's noise doubles it
+    assert len(s.channel.list_atoms()) == 36  # 3 powers x 2 atoms at each of two hops; the sensor's noise doubles it
 
 
 def test_a_missing_measurement_is_a_prediction():
@@ -121,7 +120,7 @@ def test_modes_are_weighed_with_their_atoms():
         p = moved.covariance[0, 0]
         likelihood = np.zeros(2)
         for i, m in enumerate(MODES):
-            for c in list_atoms(hg.random_affine.Series([hg.hop(1.0, TWO), m])):
+            for c in hg.random_affine.Series([hg.hop(1.0, TWO), m]).list_atoms():
                 g = c.gain[0, 0]
                 density = stats.norm.pdf(z, g * moved.mean[0] + c.offset[0], np.sqrt(g * p * g + c.noise[0, 0]))
                 likelihood[i] += c.weight * density

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.h_infinity.system import disturb_gain
 from tests.h_infinity.h_infinity_problems import channel
 
 probability = st.floats(0.0, 1.0)
@@ -29,7 +28,7 @@ def enumerated(beta):
 
 @given(st.tuples(probability, probability, probability))
 def test_moments_equal_the_enumeration_of_all_dropouts(beta):
-    result = disturb_gain(channel(beta))
+    result = channel(beta).disturb_gain()
     mean, second = enumerated(beta)
     np.testing.assert_allclose(result.mean, mean, atol=1e-15)
     np.testing.assert_allclose(result.second, second, atol=1e-15)
@@ -37,14 +36,14 @@ def test_moments_equal_the_enumeration_of_all_dropouts(beta):
 
 @given(st.tuples(probability, probability, probability))
 def test_spreads_reproduce_the_covariance(beta):
-    result = disturb_gain(channel(beta))
+    result = channel(beta).disturb_gain()
     spreads = result.spreads()
     np.testing.assert_allclose(np.einsum("jab,jcd->abcd", spreads, spreads), result.covariance, atol=1e-12)
     assert len(spreads) <= 3
 
 
 def test_nothing_is_spread_where_every_link_always_delivers():
-    assert len(disturb_gain(channel((1.0, 1.0, 1.0))).spreads()) == 0
+    assert len(channel((1.0, 1.0, 1.0)).disturb_gain().spreads()) == 0
 
 
 def test_signal_columns_agree_with_the_algebra():
@@ -52,7 +51,7 @@ def test_signal_columns_agree_with_the_algebra():
         [hg.hop(hg.Rayleigh(1.0), np.diag([0.2, 0.1])), hg.hop(hg.random_affine.bernoulli(0.4), np.diag([0.3, 0.2]))]
     )
     for item in (relay, hg.dropout(relay, 0.7), hg.model.with_direct_link(relay, hg.hop(1.0, np.diag([0.1, 0.4])))):
-        result = disturb_gain(item)
+        result = item.disturb_gain()
         np.testing.assert_allclose(result.mean[:, : result.inputs], item.moments(1).mean[:-1, :-1], atol=1e-14)
 
 
@@ -61,7 +60,7 @@ def test_noise_power_agrees_with_the_algebra_and_with_samples():
     item = hg.dropout(
         hg.amplify_and_forward([hg.hop(hg.Rayleigh(1.0), 0.2), hg.hop(hg.random_affine.bernoulli(0.4), 0.3)]), 0.7
     )
-    result = disturb_gain(item)
+    result = item.disturb_gain()
     power = np.einsum("abib->ai", result.second[:, result.inputs :, :, result.inputs :])[0, 0]
     np.testing.assert_allclose(power, item.moments(2).matrix[0, -1], rtol=1e-13)
     with jax.enable_x64(True):
@@ -72,4 +71,4 @@ def test_noise_power_agrees_with_the_algebra_and_with_samples():
 
 def test_a_lifted_channel_is_refused():
     with pytest.raises(ValueError, match=r"channel: expected hops, series, .* and sums of them, got Lift"):
-        disturb_gain(hg.random_affine.square(hg.hop(1.0, 0.1)))
+        hg.random_affine.square(hg.hop(1.0, 0.1)).disturb_gain()

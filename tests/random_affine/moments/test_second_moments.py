@@ -5,8 +5,6 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.random_affine import Independent, Series, Stack, Superposed, known
-from heliograph.random_affine.moments.intervals import moment_interval
-from heliograph.random_affine.moments.known_gain import find_outputs_of_known_gain, has_known_gain
 from heliograph.random_affine.moments.second_moments import second_order
 from tests.as_code import printing
 from tests.random_affine.conditional import conditional_moments
@@ -115,7 +113,7 @@ def test_interval_arithmetic_takes_over_beyond_the_corner_limit_and_stays_sound(
         [hg.hop(hg.Discrete([0.5, 1.0, 1.5], [0.2, 0.6, 0.2], 0.05), 0.1) for _ in range(5)]
     )
     assert chain.corner_count() > 2048
-    low, high = moment_interval(chain, 2)
+    low, high = chain.moment_interval(2)
     rng = np.random.default_rng(0)
     for _ in range(50):
         item = hg.random_affine.Series(
@@ -130,7 +128,7 @@ def test_interval_arithmetic_takes_over_beyond_the_corner_limit_and_stays_sound(
 def test_a_gain_with_many_uncertain_atoms_uses_the_closed_form_programme():
     p = np.full(14, 1 / 14)
     law = hg.Discrete(np.linspace(0.1, 1.4, 14), p, 0.01)
-    low, high = moment_interval(hg.hop(law, 0.5), 2)
+    low, high = hg.hop(law, 0.5).moment_interval(2)
     assert high[0, 0] == pytest.approx(law.worst(law.values**2), rel=1e-9)
     assert low[1, 1] == pytest.approx(-law.worst(-law.values), rel=1e-9)
 
@@ -183,9 +181,9 @@ def test_outputs_of_known_gain_are_those_that_take_nothing_through_a_random_one(
         (False, False, True): Superposed([mixed, swapped], Independent([hop.noise] * 3), [(0, 1), (2, 1)], 3),
     }
     for expected, channel in cases.items():
-        np.testing.assert_array_equal(find_outputs_of_known_gain(channel), expected)
-        assert not has_known_gain(channel)
-    assert has_known_gain(Series([pair, known(np.eye(2)[[0]])]))
+        np.testing.assert_array_equal(channel.known_gains, expected)
+        assert not channel.has_known_gain
+    assert Series([pair, known(np.eye(2)[[0]])]).has_known_gain
 
 
 def test_the_product_of_known_gains_has_no_spread():

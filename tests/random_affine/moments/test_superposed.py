@@ -10,7 +10,6 @@ import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.moments import second_moments, tensors
-from heliograph.random_affine.moments.intervals import moment_interval
 from heliograph.random_affine.moments.monomials import monomials
 from heliograph.random_affine.noise import FiniteSupport
 from heliograph.random_affine.superposed import Superposed
@@ -160,7 +159,7 @@ def test_shifts_of_many_relays_are_not_added_up_one_by_one():
 
 def test_intervals_of_a_sum_in_series_hold():
     channel = hg.superposed(links()[1:], COIN)
-    low, high = moment_interval(channel, 2)
+    low, high = channel.moment_interval(2)
     for m in channel.extremes():
         assert np.all(low <= m.moments(2).matrix + 1e-12)
         assert np.all(m.moments(2).matrix <= high + 1e-12)

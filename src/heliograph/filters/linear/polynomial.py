@@ -29,7 +29,6 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.moments.known_gain import has_known_gain
 from heliograph.random_affine.moments.moment_noise import about_mean
 from heliograph.random_affine.moments.monomials import count_monomials, monomials, position
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
@@ -55,7 +54,7 @@ class MeanBeforeData(Module):
 def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBeforeData | None:
     """Return the mean of a linear model's state; None where it is zero throughout or a gain is random."""
     plants, sensors, channels = unstack(plant), unstack(sensor), unstack(channel)
-    if not all(has_known_gain(c) for c in channels):
+    if not all(c.has_known_gain for c in channels):
         return None
     drifts = [np.asarray(p.noise_mean()) for p in plants]
     start = np.asarray(first(plant).initial_mean)

@@ -39,10 +39,10 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
-from heliograph.random_affine.atoms import COMPONENT_LIMIT, list_atoms
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import Autoregression
 from heliograph.random_affine.combine import Series
+from heliograph.random_affine.components import COMPONENT_LIMIT
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
@@ -244,7 +244,7 @@ def _list_combinations(sensor: AnySensor, now: JointModes, before: JointModes, f
     """List all atoms of z = G (C x + v) + n by mode, with the variance `floor` added to each noise."""
     assert isinstance(sensor, LinearSensor)  # checked before
     received = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
-    atoms = [(c, i) for i, m in enumerate(now.maps) for c in list_atoms(Series([received, m]))]
+    atoms = [(c, i) for i, m in enumerate(now.maps) for c in Series([received, m]).list_atoms()]
     parts = [(c, i) for c, i in atoms if is_traced(c.weight) or c.weight > 0]
     if len(parts) > COMPONENT_LIMIT:
         raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(parts):,}")

@@ -28,7 +28,6 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, condition_on_memories, memories
 from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.modes import degree_in
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,
     SecondOrder,
@@ -143,7 +142,7 @@ def _predict_channel(
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
         choices.append(
             memory.next_state_quadrature(
-                None if last is None else memory.state_from_number(number), degree_in(channel, identity)
+                None if last is None else memory.state_from_number(number), channel.degree_in(identity)
             )
         )
     chosen = list(product(*(range(len(weights)) for _, weights in choices)))

@@ -9,7 +9,8 @@ import numpy as np
 from heliograph.factors.columns import Columns
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float
-from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
+from heliograph.random_affine.base import Outcome
+from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import JointModes
 from heliograph.random_affine.moments.second_moments import divide_spread, join_gain_and_noise
 from heliograph.random_affine.moments.tensors import symmetric_product
@@ -42,7 +43,7 @@ class SideInformation(Module):
 
 def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
     """Moments of the channel at each step by mode and pattern of arrivals, the patterns being those of all steps."""
-    by_step = [[outcomes(m) for m in step.maps] for step in steps]
+    by_step = [[m.list_outcomes() for m in step.maps] for step in steps]
     distinct = {tuple(o.arrived) for modes in by_step for parts in modes for o in parts}
     patterns = sorted(distinct, key=lambda kind: (sum(kind), kind))
     before = [steps[0], *steps[:-1]]

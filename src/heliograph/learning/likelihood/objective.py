@@ -29,8 +29,6 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.module import same
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.erasure import condition_on_arrival
-from heliograph.random_affine.moments.known_gain import has_known_gain
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -59,7 +57,7 @@ def _joint_channel(channel: Channel) -> Channel:
     """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
-    complete: Channel = at_each_step(condition_on_arrival, channel)
+    complete: Channel = at_each_step(lambda step: step.condition_on_arrival(), channel)
     return complete
 
 
@@ -185,7 +183,7 @@ def forms_of(network: Network) -> list[Form]:
         if link.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
-    if not plain or has_known_gain(link) or not has_random_gain(link, second_order(link)):
+    if not plain or link.has_known_gain or not has_random_gain(link, second_order(link)):
         return ["linear"]
     return ["linear", "conditional"]
 

@@ -17,10 +17,9 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import readable
 from heliograph.numerics.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.atoms import Component, list_atoms
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.erasure import condition_on_arrival
+from heliograph.random_affine.components import Component
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete, LogNormal, Nakagami, Rayleigh, Rician
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond
@@ -148,7 +147,7 @@ def predictive(
     instance("sensor", sensor, AbstractSensor, "one sensor, that does not vary over time")
     instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     check_forgets("channel of a predictive likelihood", channel)
-    received = condition_on_arrival(channel)
+    received = channel.condition_on_arrival()
     filter = cubature_filter(plant, sensor, received)
     judge_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
     z = check_rows("measurements", measurements, None, filter.received, missing=True)
@@ -178,7 +177,7 @@ class StackDensities(tuple[StackDensity, ...]):
     def of(channel: AbstractRandomAffine, nodes: int) -> "StackDensities":
         """Combinations of each part of a stack, of everything else as a whole."""
         parts = channel.maps if isinstance(channel, Stack) else (channel,)
-        return StackDensities(_part(list_atoms(discretise_laws(affine, nodes))) for affine in parts)
+        return StackDensities(_part(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
 
 
 def _part(components: list[Component]) -> StackDensity:

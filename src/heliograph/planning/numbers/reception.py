@@ -29,7 +29,6 @@ from heliograph.planning.transmitters import powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain, stationary
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
 from heliograph.random_affine.moments.second_moments import has_known_mean, second_order
 from heliograph.simulation.network import Network
@@ -189,7 +188,7 @@ def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
 
 def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
     if not memories(channel):
-        cases = outcomes(channel)
+        cases = channel.list_outcomes()
         law = jnp.stack([jnp.asarray(case.probability) for case in cases])
         maps, arrived = [case.map for case in cases], [case.arrived for case in cases]
         return _Modes(jnp.tile(law, (len(cases), 1)), law, maps, arrived, forgets=True)

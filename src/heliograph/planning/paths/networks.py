@@ -12,7 +12,7 @@ from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.paths.model import Paths, Plants
-from heliograph.planning.transmitters import compute_sent_powers, transmits
+from heliograph.planning.transmitters import compute_sent_powers
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack, maps_in_series
 from heliograph.random_affine.hop import GainAndNoise
@@ -81,7 +81,7 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
     """
     head, *rest = maps_in_series(channel)
     # Wires multiply what is carried.
-    while isinstance(head, GainAndNoise) and not transmits(head):
+    while isinstance(head, GainAndNoise) and not head.transmits:
         rows = np.asarray(head.matrix) @ rows
         if not rest:
             return [Chain(row, {}) for row in rows]
@@ -112,7 +112,7 @@ def _chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], p
         # Hops, and wires between them.
         if not hops:
             row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]  # of one number, in its units
-        if transmits(affine):
+        if affine.transmits:
             if moved:
                 raise _unfit("a relay that takes a reference off")
             hops[f"{prefix}hop{len(hops) + 1}"] = _hop(affine)

@@ -66,6 +66,10 @@ class Lift(AbstractWrapper):
         repetitions = np.bincount(columns)
         return Moments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
 
+    def degree_in(self, identity: str) -> int:
+        """`degree` times that of the map."""
+        return self.degree * self.base.degree_in(identity)
+
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """A lifted point: the monomials of an input of the base map."""
         lifted: np.ndarray = monomials(self.base.example_input(generator), self.degree)[:-1]

@@ -15,10 +15,9 @@ from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, is_zero, library, stack_parts
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.moments.intervals import CORNERS, count_corners, moment_interval
-from heliograph.random_affine.moments.known_gain import find_outputs_of_known_gain, has_known_gain
+from heliograph.random_affine.moments.intervals import CORNERS
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments
 from heliograph.random_affine.moments.tensors import (
     Matrix,
@@ -119,9 +118,9 @@ def _or_one(value: jax.Array) -> jax.Array:
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
     """Return whether z depends on y through more than a known gain; a law with traced parameters counts as random."""
     if described.uncertain or is_traced(described.spread):
-        return described.uncertain or not has_known_gain(channel)
+        return described.uncertain or not channel.has_known_gain
     block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
-    return bool(np.any(block > 0)) and not has_known_gain(channel)
+    return bool(np.any(block > 0)) and not channel.has_known_gain
 
 
 def has_known_mean(described: SecondOrder) -> bool:
@@ -209,7 +208,7 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
 
 def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
     """Set the spread of a known gain to the zero that it is, of which a difference of moments leaves rounding."""
-    random = ~find_outputs_of_known_gain(channel)
+    random = ~channel.known_gains
     varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
     own: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
     return own
@@ -281,7 +280,7 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
         stop = start + affine.outputs
         # Diagonal block, and the reach |H_i - M_i| of the mean of each part.
         moments = second_order(affine)
-        low, high = moment_interval(affine, 1)
+        low, high = affine.moment_interval(1)
         xp = library(low, high, mean)
         reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
         blocks.append([_place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
@@ -383,7 +382,7 @@ def _place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> Quadrat
 
 def _bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
     """Bound spread, shift and power from the interval of each moment: raw - H0 m' - m H0' + H0 H0'."""
-    low, high = moment_interval(channel, 2)
+    low, high = channel.moment_interval(2)
     xp = library(low, high, mean)
     # Middle and half width of each moment.
     middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)

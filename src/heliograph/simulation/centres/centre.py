@@ -44,7 +44,6 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, PyTree
-from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 
@@ -228,7 +227,7 @@ def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel])
 
 def describe_channel(channel: Channel) -> SecondOrder | OverTime:
     """Second moments of the channel where all of it arrives, for each step where it varies."""
-    moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(condition_on_arrival(step)), channel)
+    moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(step.condition_on_arrival()), channel)
     return moments
 
 
@@ -301,7 +300,7 @@ def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[
 def _uncertain(channel: Channel) -> bool:
     """Test whether probabilities of the channel's laws are known up to a radius only."""
     try:
-        return any(condition_on_arrival(step).corner_count() > 1 for step in unstack(channel))
+        return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))
     except ValueError:  # too many corners to list
         return True
 

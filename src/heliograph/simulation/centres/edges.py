@@ -18,7 +18,7 @@ from heliograph.numerics.traced import library, plain
 from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps
 from heliograph.random_affine.delay import Delayed, signal_size
-from heliograph.random_affine.erasure import Erasure, condition_on_arrival
+from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.uplinks import SentReports
@@ -202,6 +202,6 @@ def _is_perfect(channel: AbstractRandomAffine) -> bool:
     """Test whether a channel delivers what is sent."""
     if channel.inputs != channel.outputs:
         return False
-    moments = second_order(condition_on_arrival(channel))
+    moments = second_order(channel.condition_on_arrival())
     same = np.array_equal(moments.mean_gain, np.eye(channel.inputs)) and not np.any(moments.offset)
     return same and not np.any(moments.nominal.center)

@@ -18,7 +18,6 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
 from heliograph.numerics.lapack import add_information
-from heliograph.random_affine.erasure import condition_on_arrival
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import claim_of_informed
 from heliograph.simulation.centres.edges import arrival_chance, edge_links, edges_of, loss_rate
@@ -228,7 +227,7 @@ def _scale_rows(h: np.ndarray) -> np.ndarray:
 
 def _model(node: Node) -> tuple[np.ndarray, np.ndarray]:
     """Matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
-    sensor, channel = first(node.sensor), second_order(condition_on_arrival(first(node.channel)))
+    sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
     gain = np.asarray(channel.mean_gain)
     noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
@@ -263,7 +262,7 @@ def _is_steady(node: Node) -> bool:
     """Test whether a node's measurement is the same at every step, and no signal adds to its noise."""
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False
-    return not np.any(np.asarray(second_order(condition_on_arrival(node.channel)).nominal.center)[:, :, :-1, :-1])
+    return not np.any(np.asarray(second_order(node.channel.condition_on_arrival()).nominal.center)[:, :, :-1, :-1])
 
 
 def check_decay(

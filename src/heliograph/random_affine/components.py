@@ -1,0 +1,105 @@
+"""Laws as mixtures: atoms of a map and of a noise, and the Gaussian branches of each component of a noise."""
+
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import NamedTuple, TypeAlias, TypeVar
+
+import jax
+import numpy as np
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.types import Array, Float
+
+COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
+Number: TypeAlias = float | jax.Array
+Atom = TypeVar("Atom", bound=tuple[object, ...])
+
+
+class Component(NamedTuple):
+    """One combination of atoms of a map: with probability `weight`, z = gain x + offset + N(0, noise).
+
+    Shapes: gain (m, n), offset (m,), noise (m, m).
+    """
+
+    weight: Number
+    gain: Array
+    offset: Array
+    noise: Array
+
+    def then(self, other: "Component") -> "Component":
+        """Compose with a map after it: G_y (G_x s + c_x + n_x) + c_y + n_y."""
+        weight, gain, offset, noise = other
+        spread = gain @ self.noise @ gain.T + noise
+        return Component(self.weight * weight, gain @ self.gain, gain @ self.offset + offset, spread)
+
+    def above(self, other: "Component") -> "Component":
+        """Stack on another map of the same input."""
+        gain, offset = _join_ends(self.gain, other.gain), _join_ends(self.offset, other.offset)
+        return Component(self.weight * other.weight, gain, offset, block_diagonal([self.noise, other.noise]))
+
+
+class NoiseAtom(NamedTuple):
+    """One atom of a noise: with probability `weight`, n = value + N(0, covariance).
+
+    Shapes: value (n,), covariance (n, n).
+    """
+
+    weight: Number
+    value: Array
+    covariance: Array
+
+    def above(self, other: "NoiseAtom") -> "NoiseAtom":
+        """Stack on an independent noise."""
+        value = _join_ends(self.value, other.value)
+        return NoiseAtom(self.weight * other.weight, value, block_diagonal([self.covariance, other.covariance]))
+
+
+def combine(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> list[Atom]:
+    """Combine every atom of each independent part with every one of the others.
+
+    Raises:
+        ValueError: more combinations than COMPONENT_LIMIT.
+    """
+
+    def pairs(a: list[Atom], b: list[Atom]) -> list[Atom]:
+        if len(a) * len(b) > COMPONENT_LIMIT:
+            raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
+        return [join(x, y) for x in a for y in b]
+
+    return reduce(pairs, parts)
+
+
+def _join_ends(a: Array, b: Array) -> Array:
+    joined: Array = library(a, b).concatenate([a, b])
+    return joined
+
+
+class Branches(NamedTuple):
+    """Each component of a noise as a mixture of Gaussian branches about the mean of the noise.
+
+    Shapes: log_share, mean, variance (n, branches); a branch that a component does not have has log_share -inf.
+    """
+
+    log_share: Float[Array, "n branches"]
+    mean: Float[Array, "n branches"]
+    variance: Float[Array, "n branches"]
+
+
+def stack_branches(parts: Sequence[Branches]) -> Branches:
+    """Components of several laws one above the other, as many branches each as the one with most has."""
+    xp, most = library(parts), max(law.mean.shape[1] for law in parts)
+    fills = (-np.inf, 0.0, 1.0)
+
+    def padded(law: Branches) -> list[Array]:
+        more = ((0, 0), (0, most - law.mean.shape[1]))
+        return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, fills, strict=True)]
+
+    return Branches(*(xp.concatenate(rows) for rows in zip(*map(padded, parts), strict=True)))
+
+
+class NoiseWithoutOutliers(NamedTuple):
+    """The noise without its outliers: mean (n,), relative to that of the whole, and covariance (n, n)."""
+
+    mean: Float[Array, " n"]
+    covariance: Float[Array, "n n"]

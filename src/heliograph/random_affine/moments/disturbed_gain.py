@@ -1,0 +1,118 @@
+"""Joint second moments of a map's gain and of the gains of its noises, as H-infinity designs take them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.check import SYMMETRY_TOLERANCE, fail, standard_deviations
+from heliograph.numerics.types import Float
+
+ROUNDING = 1e-13  # relative to the largest eigenvalue, in units of each component: smaller ones are rounding
+
+
+class DisturbedGain(NamedTuple):
+    """First and second moments of H = [G, N]: G takes the signal (inputs columns), N the disturbances (the others).
+
+    Shapes: mean (m, c), second[a, b, i, j] = E[H_ab H_ij] of shape (m, c, m, c); inputs is the number of columns of G.
+    """
+
+    mean: np.ndarray
+    second: np.ndarray
+    inputs: int
+
+    @property
+    def disturbances(self) -> int:
+        """Number of noise sources."""
+        return int(self.mean.shape[1]) - self.inputs
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Cov(H_ab, H_ij), shape (m, c, m, c)."""
+        covariance: np.ndarray = self.second - np.multiply.outer(self.mean, self.mean)
+        return covariance
+
+    def spreads(self) -> np.ndarray:
+        """Matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
+
+        They are the eigenvectors of the covariance of H's entries, in units of each entry, times the roots of their
+        eigenvalues; as many as its rank, so none where nothing is random.
+
+        Shapes: (rank, m, c).
+        """
+        m, c = self.mean.shape
+        size = np.sqrt(np.diagonal(self.second.reshape(m * c, m * c)))
+        unit = np.where(size > 0, size, 1.0)  # each entry in units of its own: rounding is relative to these
+        values, vectors = np.linalg.eigh(self.covariance.reshape(m * c, m * c) / np.outer(unit, unit))
+        used = values > ROUNDING * max(1.0, float(np.max(values, initial=0.0)))
+        factors: np.ndarray = (unit[:, None] * np.sqrt(values[used]) * vectors[:, used]).T.reshape(-1, m, c)
+        return factors
+
+    def then(self, other: "DisturbedGain") -> "DisturbedGain":
+        """[G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2] of a map and one after it, with independent factors."""
+        identity = np.eye(other.disturbances)
+        passed = stack_gains([self, DisturbedGain(identity, np.multiply.outer(identity, identity), 0)], shared=0)
+        second = np.einsum("aicj,ibjd->abcd", other.second, passed.second)
+        return DisturbedGain(other.mean @ passed.mean, second, self.inputs)
+
+
+def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> np.ndarray:
+    """Return a root N of a noise's covariance, (m, rank).
+
+    Raises:
+        ValueError: a mean of the noise that N cannot make.
+    """
+    unit = standard_deviations(covariance)
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # of correlations: free of units
+    used = values > ROUNDING * np.max(values, initial=0.0)
+    root: np.ndarray = unit[:, None] * np.sqrt(values[used]) * vectors[:, used]
+    root = root * np.where(root.sum(axis=0) < 0, -1.0, 1.0)
+    scaled = mean / unit
+    missed = scaled - vectors[:, used] @ (vectors[:, used].T @ scaled)
+    if np.any(np.abs(missed) > SYMMETRY_TOLERANCE * np.abs(scaled).max()):
+        raise fail("noise of an H-infinity design", "a mean that its covariance can make", mean.tolist())
+    return root
+
+
+def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray) -> DisturbedGain:
+    """Joint moments of [g A, N] of a hop, from E[g] and E[g^2] of its gain g."""
+    scaled = np.concatenate([gain, np.zeros_like(root)], axis=1)
+    fixed = np.concatenate([np.zeros_like(gain), root], axis=1)
+    first, second = moments
+    outer = np.multiply.outer
+    cross = first * (outer(scaled, fixed) + outer(fixed, scaled))
+    mean = first * scaled + fixed
+    return DisturbedGain(mean, second * outer(scaled, scaled) + cross + outer(fixed, fixed), gain.shape[1])
+
+
+def mix_gains(parts: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
+    """One of several maps, drawn: each has noises of its own."""
+    widened = [_place_columns(gain, inputs, parts, i) for i, gain in enumerate(parts)]
+    mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
+    second = np.tensordot(weights, [gain.second for gain in widened], axes=1)
+    return DisturbedGain(mean, second, inputs)
+
+
+def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGain], index: int) -> DisturbedGain:
+    """The same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
+    private_widths = [p.mean.shape[1] - shared for p in parts]
+    start = shared + sum(private_widths[:index])
+    columns = [*range(shared), *range(start, start + private_widths[index])]
+    m, total = gain.mean.shape[0], shared + sum(private_widths)
+    mean, second = np.zeros((m, total)), np.zeros((m, total, m, total))
+    mean[:, columns] = gain.mean
+    second[np.ix_(range(m), columns, range(m), columns)] = gain.second
+    return DisturbedGain(mean, second, shared)
+
+
+def stack_gains(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
+    """Independent maps one above the other that share their first `shared` inputs; E[H_ab H_ij] factors across maps."""
+    placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]
+    mean = np.concatenate([gain.mean for gain in placed])
+    second = np.multiply.outer(mean, mean)
+    row = 0
+    for gain in placed:
+        rows = slice(row, row + gain.mean.shape[0])
+        second[rows, :, rows, :] = gain.second
+        row = rows.stop
+    return DisturbedGain(mean, second, shared)

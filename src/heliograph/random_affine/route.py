@@ -1,0 +1,77 @@
+"""The way of a signal through a channel: the names of the hops that it meets, and its second moment at each."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import Array, Float, Scalar
+from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.tensors import second_moment_tensor
+
+T = TypeVar("T")
+Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
+
+
+class Signal(NamedTuple):
+    """Second moment E (y, 1)(y, 1)' of what a map receives, and the probability that it arrives."""
+
+    second: Second
+    arrives: Scalar
+
+
+Visit = Callable[[str, Any, Signal | None], Any]  # of the name of a hop, the hop, and what it receives: another hop
+
+
+class Position(NamedTuple):
+    """Position in a channel: prefix of names, number of hops before it along the chain, and the signal there."""
+
+    prefix: str
+    hops: int
+    signal: Signal | None
+
+    def number(self, maps: Sequence[T], word: str) -> "list[tuple[T, Position]]":
+        """Return maps side by side, each with its position: names begin with the word and the map's number."""
+        at = [self._replace(prefix=f"{self.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
+        return list(zip(maps, at, strict=True))
+
+    def select(self, places: Sequence[int]) -> "Position":
+        """Return the position at a map that takes the components at these places."""
+        if self.signal is None:
+            return self
+        chosen = np.array([*places, -1])
+        return self._replace(signal=self.signal._replace(second=self.signal.second[chosen[:, None], chosen]))
+
+    def on_delay_line(self, times: int) -> "Position":
+        """Return the position at a map of the line (y_k, y_{k-1}, ...) of so many signals.
+
+        Each is as the present one; a delay chooses one of them, so no two meet.
+        """
+        if self.signal is None:
+            return self
+        second, xp = self.signal.second, library(self.signal.second)
+        mean, blocks = xp.tile(second[:-1, -1], times), xp.kron(np.eye(times), second[:-1, :-1])
+        line = xp.block([[blocks, mean[:, None]], [mean[None], np.ones((1, 1))]])
+        return self._replace(signal=self.signal._replace(second=line))
+
+
+def carry_by_moments(signal: Signal, moments: Moments) -> Signal:
+    """E h Y h' behind a random map h, by its second moments, and its mean."""
+    second, tensor = signal.second, second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
+    behind = xp.block([[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]])
+    return signal._replace(second=behind)
+
+
+def refuse_gain_on_angles(got: str) -> ValueError:
+    """Return the error of a map behind which angles are no angles."""
+    expected = "gain 1 on circular outputs (behind any other, send sine and cosine, which are no angles)"
+    return fail("channel", expected, got)
+
+
+def apply(h: jax.Array, y: jax.Array) -> jax.Array:
+    """z = G y + n for a drawn H."""
+    return h[:-1, :-1] @ y + h[:-1, -1]
