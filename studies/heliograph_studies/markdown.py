@@ -30,7 +30,7 @@ from markdown_it import MarkdownIt
 from markdown_it.tree import SyntaxTreeNode
 
 from heliograph.numerics.check import fail
-from heliograph.report.page import (
+from heliograph.report.pages.page import (
     Block,
     Code,
     Judged,

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import heliograph
-from heliograph.numerics.extras import check_installed
-from heliograph.report.page import KeyFigures, Page, Section, Table
+from heliograph.numerics.process.extras import check_installed
+from heliograph.report.pages.page import KeyFigures, Page, Section, Table
 from heliograph.report.progress import Advance, progress
 from heliograph.report.results import Results, write_results
 from heliograph_studies import markdown

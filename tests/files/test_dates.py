@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.files.table import columns_of, read_table, write_table
-from heliograph.numerics.dates import dates, format_dates, instant, seconds_between
+from heliograph.numerics.times.dates import dates, format_dates, instant, seconds_between
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
 SENSOR = hg.Sensor(lambda x: x, noise=0.1, outputs=["pos"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.dates import horizons_in
+from heliograph.numerics.times.dates import horizons_in
 from heliograph.serving import Fleet, InMemoryStore, NetworkProgram, Options, Service
 from heliograph.serving.output import Estimates
 

@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.report.health import examine
-from heliograph.report.run_page import run_summary, shared_text
+from heliograph.report.pages.run import run_summary, shared_text
 
 PLANT = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]])
 SENSOR = hg.LinearSensor([[0.0]], hg.Gaussian([[0.0]], [1.0]))  # y = 1, so that z is the gain

@@ -24,8 +24,8 @@ from heliograph.campaign.store import (
 )
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from heliograph.numerics.check import fail, file_path
-from heliograph.report.explore_page import STATIC, Explored, Quantity, Value, explore_html
-from heliograph.report.page import Page, Points, Section
+from heliograph.report.pages.explore import STATIC, Explored, Quantity, Value, explore_html
+from heliograph.report.pages.page import Page, Points, Section
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from heliograph.campaign.store import parameter_values
 from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, svg
-from heliograph.report.page import Block, Code, Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.page import Block, Code, Page, Picture, Points, Section, Table, Text
 
 REPORT = "report.html"
 ROWS = 200  # of the table on the page

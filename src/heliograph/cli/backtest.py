@@ -38,7 +38,7 @@ def backtest(
     """
     from heliograph.disk.quoting import visible
     from heliograph.numerics.check import fail
-    from heliograph.numerics.dates import horizons_in
+    from heliograph.numerics.times.dates import horizons_in
     from heliograph.report.results import write_results
 
     # Check the options before anything is computed.
@@ -61,7 +61,7 @@ def backtest(
         return heliograph.backtest(loaded, z, ahead, u, time, truth, skip)
 
     def results(found: "heliograph.forecasting.Backtest") -> "Results":
-        from heliograph.report.backtest_page import make_backtest_results
+        from heliograph.report.pages.backtest import make_backtest_results
 
         return make_backtest_results(found, network)
 

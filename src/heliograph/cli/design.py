@@ -7,7 +7,7 @@ from heliograph.cli.app import folder, path_option
 
 if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
-    from heliograph.report.design_page import DesignResults
+    from heliograph.report.pages.design import DesignResults
     from heliograph.report.progress import Advance
     from heliograph.report.results import Results
 
@@ -36,7 +36,7 @@ def design(
     file = read_design(task)
 
     def results(designed: "DesignResults") -> "Results":
-        from heliograph.report.design_page import design_results
+        from heliograph.report.pages.design import design_results
 
         return design_results(designed)
 
@@ -59,7 +59,7 @@ def work(file: "DesignFile", advance: "Advance") -> "DesignResults":
     import heliograph as hg
     from heliograph.files.design_file import write_designed_source
     from heliograph.planning.comparisons import totals_about
-    from heliograph.report.design_page import SOURCE, DesignResults
+    from heliograph.report.pages.design import SOURCE, DesignResults
 
     # The design, and the powers before it.
     advance("designing")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
     from heliograph.learning.losses.fates import Fates
-    from heliograph.report.fit_page import Learned
+    from heliograph.report.pages.fit import Learned
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
     from heliograph.simulation.network import Network
@@ -91,7 +91,7 @@ def learn(
     from heliograph.learning.losses.losses import learn_losses
     from heliograph.learning.senders import has_deciding_sender
     from heliograph.numerics.check import fail
-    from heliograph.report.fit_page import Learned
+    from heliograph.report.pages.fit import Learned
 
     # The network as it starts, and the data.
     build = NetworkAgain(network)
@@ -189,7 +189,7 @@ def _fit_with_progress(
 def results(learned: "Learned", out: Path, network: str) -> "Results":
     """Return the content of the results folder."""
     from heliograph.files.fitted import as_json, write_fitted
-    from heliograph.report.fit_page import fit_figures, pages
+    from heliograph.report.pages.fit import fit_figures, pages
     from heliograph.report.results import Results
 
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)

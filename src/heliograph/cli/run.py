@@ -61,7 +61,7 @@ def run(
         holds several. The name may be that of a function that returns one.
     """
     from heliograph.numerics.check import fail
-    from heliograph.numerics.dates import horizons_in
+    from heliograph.numerics.times.dates import horizons_in
     from heliograph.report.progress import progress
 
     # Check the options before JAX is imported.
@@ -292,7 +292,7 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
     """Check before the work starts that files can be read and written, and that what that takes is installed."""
     from heliograph.disk.whole_file import FORMATS, check_output
     from heliograph.numerics.check import fail
-    from heliograph.numerics.extras import check_installed
+    from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results import NEEDS
 
     kinds = {path.suffix.lower() for path in (measurements, out) if path is not None}
@@ -324,7 +324,7 @@ def _write_report(
         }
 
     def results_of(health: dict[str, Health]) -> Results:
-        from heliograph.report.run_page import make_run_results, results_of_plants
+        from heliograph.report.pages.run import make_run_results, results_of_plants
 
         (first, *more) = health.values()
         return results_of_plants(health, name) if more else make_run_results(first, name)

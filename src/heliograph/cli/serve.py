@@ -60,7 +60,7 @@ class ServeOptions:
         """Load the network, and return the settings of its service."""
         from heliograph.files.network_file import load_module
         from heliograph.live.fleet import Options
-        from heliograph.numerics.dates import horizons_in
+        from heliograph.numerics.times.dates import horizons_in
         from heliograph.serving.brokers.url import parse_address
         from heliograph.serving.running import ServiceSettings, name_of, settings_of_node, store_of
 

@@ -99,7 +99,7 @@ def run(
         ValueError: an unknown study or setting, a value of the wrong kind, a folder that cannot be written.
     """
     from heliograph.numerics.check import fail
-    from heliograph.numerics.extras import check_installed
+    from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results import NEEDS
 
     known = studies_of(kind)

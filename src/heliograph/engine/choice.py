@@ -15,8 +15,8 @@ import numpy as np
 from heliograph.engine.limits import LONG, SHORT
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.collector import no_collector
-from heliograph.numerics.stack import make_room
+from heliograph.numerics.process.collector import no_collector
+from heliograph.numerics.process.stack import make_room
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, compile

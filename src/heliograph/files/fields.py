@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.live.event import check_63_bits
 from heliograph.numerics.check import InputError, fail, show_value
-from heliograph.numerics.dates import UNITS, dates, instant
+from heliograph.numerics.times.dates import UNITS, dates, instant
 
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
 STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"))  # ROS 2, ROS 1, protobuf

@@ -15,7 +15,7 @@ from heliograph.files.bags.mcap_chunks import messages_of as bag_messages
 from heliograph.files.fields import TimeUnit, decode_json, nanoseconds, parse_arrival
 from heliograph.files.message_files import is_message_file, message_name, messages_of, payload_of
 from heliograph.numerics.check import InputError, fail, show_error
-from heliograph.numerics.dates import UNITS, looks_like_date
+from heliograph.numerics.times.dates import UNITS, looks_like_date
 
 SECOND = 1e9  # nanoseconds
 STAMP = "header.stamp"

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from heliograph.files.fields import decode_json, parse_number
 from heliograph.files.table import check_separators, csv_header, csv_lines, kind_of, open_text
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.dates import instant
+from heliograph.numerics.times.dates import instant
 
 TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
 ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second

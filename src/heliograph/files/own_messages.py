@@ -15,7 +15,7 @@ from heliograph.files.table import csv_header, kind_of
 from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
-from heliograph.numerics.dates import looks_like_date, moment_of
+from heliograph.numerics.times.dates import looks_like_date, moment_of
 from heliograph.simulation.network import Network
 
 EXACT = 2**53  # up to here doubles hold every whole number

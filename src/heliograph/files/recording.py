@@ -14,9 +14,9 @@ from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.inputs import time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import fail, flag, instance
-from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.module import readable
-from heliograph.numerics.times import backwards, backwards_text
+from heliograph.numerics.times.dates import seconds_between
+from heliograph.numerics.times.row_times import backwards, backwards_text
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record

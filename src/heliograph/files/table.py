@@ -16,8 +16,8 @@ import numpy as np
 from heliograph.disk.quoting import quote_for_cell, unquote_cell
 from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
 from heliograph.numerics.check import InputError, fail, file_path, show_value, table
-from heliograph.numerics.dates import dates, format_dates, looks_like_date
 from heliograph.numerics.masked import fill_masked, is_absent
+from heliograph.numerics.times.dates import dates, format_dates, looks_like_date
 from heliograph.numerics.types import Shaped
 
 TIME = "time"

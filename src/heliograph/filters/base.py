@@ -18,7 +18,7 @@ from heliograph.filters.vector import check_vector
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
-from heliograph.model.premise import NOTHING, Kept, Premise, believes
+from heliograph.model.premises.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64

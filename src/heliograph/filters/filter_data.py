@@ -17,7 +17,7 @@ from heliograph.model.row_times import common_dates, judge_dates
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
-from heliograph.numerics.rows import check_rows
+from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 

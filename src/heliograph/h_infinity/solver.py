@@ -18,7 +18,7 @@ from heliograph.h_infinity.step_inequality import (
     linear_forms,
 )
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.extras import how_to_install
+from heliograph.numerics.process.extras import how_to_install
 from heliograph.numerics.types import Float
 
 if TYPE_CHECKING:

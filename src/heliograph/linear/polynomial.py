@@ -21,7 +21,7 @@ from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable

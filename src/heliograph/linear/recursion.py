@@ -10,7 +10,7 @@ from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last
 from heliograph.model.estimate import Claim, weakest
-from heliograph.model.premise import believing
+from heliograph.model.premises.premise import believing
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Float

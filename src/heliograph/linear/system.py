@@ -10,7 +10,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import STRENGTH, Claim
-from heliograph.model.premise import NOTHING, Kept
+from heliograph.model.premises.premise import NOTHING, Kept
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, file_path, instance, show_value
 from heliograph.numerics.module import Module, readable

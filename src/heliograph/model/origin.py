@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.dates import seconds_between
+from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.types import PyTree
 
 Moment: TypeAlias = "float | np.datetime64"

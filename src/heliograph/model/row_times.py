@@ -8,8 +8,8 @@ import numpy as np
 
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import fail
-from heliograph.numerics.dates import unequal_steps
-from heliograph.numerics.times import row_dates
+from heliograph.numerics.times.dates import unequal_steps
+from heliograph.numerics.times.row_times import row_dates
 
 ONE_STEP = "a plant without the input dt takes each for one; insert the rows that are missing, or give it dt"
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.collector import no_collector
+from heliograph.numerics.process.collector import no_collector
 from heliograph.numerics.types import PyTree
 
 _first: list[int] = []  # the process in which something was computed first; a fork inherits it

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import lazy_loader
 
-from heliograph.numerics.collector import no_collector
+from heliograph.numerics.process.collector import no_collector
 
 MOST = 3  # names that are offered
 ALIKE = 0.7  # as difflib measures it, so that neess offers nees and foo nothing

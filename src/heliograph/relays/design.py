@@ -12,7 +12,7 @@ from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.estimate import lower_to_upper
-from heliograph.model.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compile_in_float64

@@ -12,7 +12,7 @@ from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, stacked_panels
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.outputs import round_to
-from heliograph.report.page import Choice, Picture, Section, Table, Text
+from heliograph.report.pages.page import Choice, Picture, Section, Table, Text
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from heliograph.disk.whole_file import check_replaceable, whole_folder
-from heliograph.numerics.extras import check_installed
+from heliograph.numerics.process.extras import check_installed
 from heliograph.report.progress import Advance, progress
 
 if TYPE_CHECKING:  # a missing extra is reported by `write_results`, in one line
     from matplotlib.figure import Figure
 
-    from heliograph.report.page import Page
+    from heliograph.report.pages.page import Page
 
 SUMMARY = "summary.json"  # also tells earlier results from other folders
 NEEDS = ("jinja2", "matplotlib")

@@ -13,7 +13,7 @@ from pydantic_core.core_schema import no_info_after_validator_function, str_sche
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import InputError, fail, instance, show_value
-from heliograph.numerics.dates import instant
+from heliograph.numerics.times.dates import instant
 
 Name = TypeAliasType("Name", Annotated[str, Field(max_length=200, pattern=r"^[^\x00]*$")])  # PostgreSQL keeps no NUL
 # Text that is no date is refused: "0.1" is no number of seconds, nor a moment of 1970.

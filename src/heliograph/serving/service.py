@@ -18,7 +18,7 @@ from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
-from heliograph.numerics.collector import no_collector
+from heliograph.numerics.process.collector import no_collector
 from heliograph.serving.ahead import ForecastPublisher, Spans
 from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange

@@ -9,9 +9,9 @@ import jax
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.rules import Fusion
-from heliograph.model.agreement import differences, join_premises, part_of
 from heliograph.model.estimate import Claim
-from heliograph.model.premise import Kept, Premise
+from heliograph.model.premises.agreement import differences, join_premises, part_of
+from heliograph.model.premises.premise import Kept, Premise
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 
 UNSAID = "something that it does not say"

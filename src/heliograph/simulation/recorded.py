@@ -16,7 +16,7 @@ from heliograph.model.plant import TIME_STEP
 from heliograph.model.row_times import common_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
-from heliograph.numerics.times import check_times
+from heliograph.numerics.times.row_times import check_times
 from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally

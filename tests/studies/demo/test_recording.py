@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.numerics import extras
+from heliograph.numerics.process import extras
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.recording import (
     PlazaRecording,

@@ -33,7 +33,7 @@ from heliograph.filters.gaussian.scores import (
 from heliograph.filters.robust_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, over_time
-from heliograph.model.premise import believing
+from heliograph.model.premises.premise import believing
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.density import log_density

@@ -24,7 +24,7 @@ from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_s
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
-from heliograph.model.premise import believes
+from heliograph.model.premises.premise import believes
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64

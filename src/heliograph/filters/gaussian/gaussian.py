@@ -28,7 +28,7 @@ from heliograph.model.estimate import Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance

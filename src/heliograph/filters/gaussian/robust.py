@@ -30,7 +30,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
-from heliograph.model.premise import believes
+from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar

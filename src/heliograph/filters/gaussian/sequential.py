@@ -21,10 +21,10 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import smoother_step_by_transform
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.model.agreement import join_premises
 from heliograph.model.estimate import Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
-from heliograph.model.premise import believing
+from heliograph.model.premises.agreement import join_premises
+from heliograph.model.premises.premise import believing
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree

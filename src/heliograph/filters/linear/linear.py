@@ -25,7 +25,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_uppe
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premise import believes, believing
+from heliograph.model.premises.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64

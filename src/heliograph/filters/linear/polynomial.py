@@ -21,7 +21,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_uppe
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
-from heliograph.model.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.density import log_density

@@ -31,7 +31,7 @@ from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premise import believes
+from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.check import fail, scalar

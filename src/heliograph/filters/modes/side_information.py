@@ -40,7 +40,7 @@ from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premise import Premise, believing
+from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities

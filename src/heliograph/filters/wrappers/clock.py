@@ -28,7 +28,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premise import believes
+from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import nearest, wrap_angles
 from heliograph.numerics.check import fail, items

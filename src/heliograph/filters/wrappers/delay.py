@@ -31,7 +31,7 @@ from heliograph.model.enlarged import with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
-from heliograph.model.premise import believes, believing
+from heliograph.model.premises.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64

@@ -26,7 +26,7 @@ from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premise import believes
+from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64

@@ -15,7 +15,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import readable
-from heliograph.numerics.rows import check_rows
+from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack

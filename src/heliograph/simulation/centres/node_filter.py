@@ -17,7 +17,7 @@ from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.premise import believing
+from heliograph.model.premises.premise import believing
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize

@@ -11,10 +11,10 @@ from heliograph.disk.quoting import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.model.agreement import CHANNEL, matrix_of
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
+from heliograph.model.premises.agreement import CHANNEL, matrix_of
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable

@@ -24,8 +24,8 @@ MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim res
 class Premise:
     """What a filter believes of the world: its claim is about this plant, sensor, channel and trigger.
 
-    In a network the claim holds as far as they are the node's own (`heliograph.model.agreement`). The premise is kept
-    beside the filter's numbers and decides none of them: filters that differ in it alone have one structure.
+    In a network the claim holds as far as they are the node's own (`heliograph.model.premises.agreement`). The premise
+    is kept beside the filter's numbers and decides none of them: filters that differ in it alone have one structure.
 
     Args:
         plant: the plant.

@@ -13,7 +13,7 @@ from heliograph import cli
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.health import FilterHealth, examine
 from heliograph.report.outputs import errors_of, round_to
-from heliograph.report.run_page import errors_table, run_figures, run_page, run_summary
+from heliograph.report.pages.run import errors_table, run_figures, run_page, run_summary
 from heliograph.simulation.results.whiteness import MemoryTest
 from tests.losing import Tied
 

@@ -15,8 +15,8 @@ from heliograph.model.enlarged import JointSensor, joint_sensor, with_past
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs
-from heliograph.model.premise import MEAN_AND_COVARIANCE, Premise
-from heliograph.model.same_program import same_function
+from heliograph.model.premises.premise import MEAN_AND_COVARIANCE, Premise
+from heliograph.model.premises.same_program import same_function
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.module import same

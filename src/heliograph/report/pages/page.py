@@ -158,7 +158,7 @@ class Page:
 def environment() -> Environment:
     """Return the environment of this room's templates, in which all values are escaped."""
     templates = Environment(
-        loader=PackageLoader("heliograph.report", "."),
+        loader=PackageLoader("heliograph.report.pages", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -14,7 +14,7 @@ from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
-from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
+from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
 from heliograph.report.results import Json, Results
 
 MOST = 40  # transmitters that are drawn; the table and the summary hold all

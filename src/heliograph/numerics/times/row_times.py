@@ -6,8 +6,8 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.dates import YEARS, dates, looks_like_date
 from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.times.dates import YEARS, dates, looks_like_date
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 

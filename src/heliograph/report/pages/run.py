@@ -27,7 +27,7 @@ from heliograph.report.innovations import (
     tested_by_figure,
 )
 from heliograph.report.outputs import errors_of, output_numbers, round_to
-from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.position_map import coordinates_of, map_figure
 from heliograph.report.results import Json, Results, write_into
 from heliograph.simulation.network import Network

@@ -7,7 +7,7 @@ from importlib.resources import files
 
 from markupsafe import Markup
 
-from heliograph.report.page import Page, environment
+from heliograph.report.pages.page import Page, environment
 
 LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")  # 1.4 MB without its widgets; Plotly's one file has 4.8 MB
 STATIC = "static"  # sections of this kind are seen in print, and where no script runs
@@ -55,7 +55,7 @@ def explore_html(page: Page, tables: Sequence[Explored]) -> str:
             page=page,
             data=Markup(data.replace("<", "\\u003c")),  # no text can end the script
             library=Markup("\n".join(_library(name) for name in LIBRARY)),
-            program=Markup(files("heliograph.report").joinpath("explore.js").read_text(encoding="utf-8")),
+            program=Markup(files("heliograph.report.pages").joinpath("explore.js").read_text(encoding="utf-8")),
         )
     )
 

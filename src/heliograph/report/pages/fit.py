@@ -24,7 +24,7 @@ from heliograph.report.figures import (
     legend_above,
     stacked_panels,
 )
-from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
 MOST = 40  # numbers, filters and nodes that are drawn; tables hold all
 BINS = 20

@@ -1,7 +1,7 @@
 import re
 from importlib.resources import files
 
-from heliograph.report.page import (
+from heliograph.report.pages.page import (
     Code,
     Judged,
     KeyFigure,
@@ -79,4 +79,4 @@ def test_nothing_is_wider_than_its_window(fits, tmp_path) -> None:
 
 
 def test_template_is_part_of_the_package() -> None:
-    assert files("heliograph.report").joinpath("page.html.j2").is_file()
+    assert files("heliograph.report.pages").joinpath("page.html.j2").is_file()

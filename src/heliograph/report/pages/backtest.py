@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, MUTED, STYLE, WIDTH, legend_above
 from heliograph.report.outputs import round_to
-from heliograph.report.page import Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.page import Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 
 if TYPE_CHECKING:
