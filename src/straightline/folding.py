@@ -5,6 +5,7 @@ known zero leaves its term out (`rules/matrices.py`).
 """
 
 import math
+import operator
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -135,7 +136,15 @@ def folded(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | 
     return _evaluated(graph, op, type, args)
 
 
+# The same of doubles, as Python computes them in a tenth of the time: of a matrix's known zeros there are millions.
+OF_DOUBLES: dict[str, Callable[[float, float], float]] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul,
+}  # fmt: skip
+
+
 def _evaluated(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    if type == "f64" and op in OF_DOUBLES:
+        return graph.constant(OF_DOUBLES[op](float(args[0].value), float(args[1].value)), type)
     numbers = [DTYPES[a.type](a.value) for a in args]
     with np.errstate(all="ignore"):
         if op == "select":

@@ -4,7 +4,8 @@ A node is one number in every run. Constants are folded when a node is made (`fo
 outermost block that has all its arguments: what a loop does not change is computed before it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from straightline.folding import COMMUTATIVE, DTYPES, folded
@@ -46,6 +47,16 @@ class Graph:
         if self.serial > self.most:
             raise Unsupported(f"a program of more than {self.most} operations")
         return Node(op, type, args, block, value, self.serial)
+
+    @contextmanager
+    def at_most(self, count: int) -> Iterator[None]:
+        """Allow so many more nodes; if there are more, which is refused, the block that was open is open again."""
+        most, block = self.most, self.current
+        self.most = min(most, self.serial + count)
+        try:
+            yield
+        finally:
+            self.most, self.current = most, block
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
         """Load buffer[offset + sum strides * indices], after the buffer is filled."""

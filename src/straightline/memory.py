@@ -60,6 +60,12 @@ class InMemory:
             return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
         return self.view(self.shape[1:], self.strides[1:], 0, (self.strides[0], index))
 
+    def numbers(self) -> np.ndarray:
+        """Return the numbers of a known array."""
+        assert self.buffer.table is not None
+        table = np.ascontiguousarray(self.buffer.table).ravel()[self.offset :]
+        return np.lib.stride_tricks.as_strided(table, self.shape, [s * table.itemsize for s in self.strides])
+
     def nodes(self, graph: Graph) -> np.ndarray:
         """Load all numbers."""
         if self.loaded is None or self.loaded[0] not in graph.current.inwards():

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import straightline
 from heliograph.factors.columns import (
     Columns,
     columns_of,
@@ -122,3 +123,24 @@ def test_a_variance_below_zero_by_rounding_leaves_no_pivot_below_zero(n):
         for least in (0.0, 2e-14):
             weights = eliminate(jnp.diag(jnp.where(np.arange(n) % 2, 1.0, -1e-16)), least).weights
             assert np.all(np.asarray(weights) >= 0)
+
+
+@pytest.mark.parametrize("n", [12, 40])
+def test_natively_the_noise_of_many_outputs_on_their_own_costs_what_that_of_each_costs(n):
+    """Its columns are two of each output: its variance is a sum of two squares, and nothing is correlated.
+
+    By operations: reading 2 n numbers, of each output a sum of two squares and no more than ten to judge it, for the
+    n (n + 1) 2 n products of rows that are full.
+    """
+
+    def noise(w):
+        factors = triangularise(Columns(jnp.concatenate([jnp.diag(w[:n]), jnp.diag(w[n:])], axis=1), jnp.ones(2 * n)))
+        return factors.matrix, factors.weights, eliminate(jnp.diag(w[:n])).weights
+
+    w = np.random.default_rng(2).uniform(0.5, 2.0, size=(3, 2 * n))
+    code = straightline.compile(noise, w[0])
+    assert code.operations < 20 * n
+    matrix, weights, eliminated = code(w)
+    np.testing.assert_array_equal(matrix, np.broadcast_to(np.eye(n), (3, n, n)))
+    np.testing.assert_allclose(weights, w[:, :n] ** 2 + w[:, n:] ** 2, rtol=1e-15)
+    np.testing.assert_array_equal(eliminated, w[:, :n])

@@ -180,6 +180,21 @@ def test_to_jax_an_operation_is_the_plain_function():
         np.testing.assert_allclose(slope, np.einsum("ik,kj->kij", u, v), rtol=1e-12)
 
 
+@sl.operation(lambda x: jnp.sum(jnp.stack([x**k for k in range(2, 400)])))
+def summed_powers(x):
+    """sum_i sum_k x_i^k by Horner's rule, in a loop over k."""
+    return jnp.sum(jax.lax.fori_loop(0, 398, lambda _, s: (s + 1) * x, jnp.zeros_like(x)) * x)
+
+
+@pytest.mark.parametrize("count", [2, 300])
+def test_a_native_function_of_too_many_operations_is_the_plain_one(count):
+    """Of a number 800 operations are written out, of 300 numbers a loop over the powers with 5 of each."""
+    x = RANDOM.uniform(-0.9, 0.9, size=(4, count))
+    code = sl.compile(summed_powers, x[0])
+    assert (code.operations > 100 * count) == (count == 2)
+    np.testing.assert_allclose(code(x), sum(x**k for k in range(2, 400)).sum(axis=1), rtol=1e-11)
+
+
 @sl.operation(lambda a, x: {"image": a @ x, "size": jnp.sum(x)})
 def image(a, x):
     return {"image": jnp.einsum("ij,j->i", a, x), "size": x.sum()}

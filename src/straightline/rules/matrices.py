@@ -135,7 +135,8 @@ def _sums_of_products(graph: Graph, type: Type, pairs: Sequence[tuple[np.ndarray
 
 
 def _leaves_out(x: Node, y: Node) -> bool:
-    return x.op == "constant" and not x.value and y.op != "constant"
+    """Return whether x is a known zero, and y anything but what is known to be no number, or infinite."""
+    return x.op == "constant" and not x.value and (y.op != "constant" or math.isfinite(y.value))
 
 
 def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:

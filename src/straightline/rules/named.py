@@ -10,7 +10,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from straightline.limits import MANY_TERMS
 from straightline.lowering import IN_MEMORY, Lowering, Value, like
+from straightline.nodes import Unsupported
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -44,7 +46,7 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 
     What is compiled by XLA, mapped by `vmap` or differentiated is the plain function. Native code takes the other one
     in its place, of one item after another where `vmap` maps them: where a form that suits XLA, all entries side by
-    side, is not the one that suits a straight line.
+    side, is not the one that suits a straight line. The plain function again where the other one is too long.
 
     Args:
         native: a function of the same arguments with the same results.
@@ -120,17 +122,29 @@ def _with_tangents(primals: Sequence[Any], tangents: Sequence[Any], **params: An
 
 
 def _by_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Inline the native function, traced once for equal shapes, in a loop over each level of `vmap`."""
+    """Inline the native function; the plain one where native code does not take that, or it has too many operations.
+
+    Known zeros of the arguments decide how many it has: so it is tried.
+    """
+    program: _Program = equation.params["program"]
+    try:
+        with lowering.graph.at_most(MANY_TERMS):
+            return lowering.inline(_traced(lowering, equation, program.native), inputs)
+    except Unsupported:
+        return lowering.inline(_traced(lowering, equation, jaxpr_as_fun(program.plain)), inputs)
+
+
+def _traced(lowering: Lowering, equation: JaxprEqn, function: Callable[..., list[Any]]) -> ClosedJaxpr:
+    """Trace a function of one item, once for equal shapes, in a loop over each level of `vmap`."""
     program, levels = equation.params["program"], equation.params["levels"]
     kinds = tuple((v.aval.shape, v.aval.dtype) for v in equation.invars)  # type: ignore[attr-defined]
-    key = program, levels, kinds
+    key = program, function is program.native, levels, kinds
     if key not in lowering.kernels:
-        function = program.native
         for axes in levels:
             function = partial(_one_by_one, function, axes)
         with jax.enable_x64(program.x64):
             lowering.kernels[key] = jax.make_jaxpr(function)(*(like(*kind) for kind in kinds))
-    return lowering.inline(lowering.kernels[key], inputs)
+    return lowering.kernels[key]
 
 
 def _one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.limits import FEW_TERMS, LOADED, MANY_TERMS, TABLE
-from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
+from straightline.graph import Graph
+from straightline.limits import LOADED, MANY_TERMS, TABLE, WRITTEN_OUT
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, like, result_shape, result_type
 from straightline.memory import InMemory
-from straightline.nodes import Node
+from straightline.nodes import Node, Type
 from straightline.rules.elementwise import ELEMENTWISE
 from straightline.rules.loops import Turn, in_memory, repeated
-from straightline.rules.matrices import write_product
+from straightline.rules.matrices import total, write_product
 
 OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
@@ -31,8 +32,12 @@ def is_long(inputs: list[Value]) -> bool:
     Those of tables are constants: they are no more where the other arguments are known too, or are as many nodes.
     """
     longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
-    known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
+    known = all(map(_is_table, (x for x in inputs if isinstance(x, InMemory))))
     return longest > LOADED or (longest > TABLE and not (known and _are_written_out(inputs, longest)))
+
+
+def _is_table(x: Value) -> bool:
+    return isinstance(x, InMemory) and x.buffer.kind == "table" and not x.moves
 
 
 def _are_written_out(inputs: list[Value], count: int) -> bool:
@@ -91,8 +96,11 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     """
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     to_number = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
-    if to_number or not is_long(inputs) or _has_few_terms(lowering, equation, inputs):
+    if to_number or not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
+    short = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
+    if (factors := _few_terms(equation, short)) is not None:
+        return list(_written_product(lowering, equation, factors))
     a, b = (in_memory(lowering, x) for x in inputs)
     free_left, free_right = (
         next((d for d in range(x.ndim) if d not in axes), None) for x, axes in ((a, left), (b, right))
@@ -157,15 +165,44 @@ def _accumulated(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn)
     return list(repeated(lowering, count, [start], add)[0])
 
 
-def _has_few_terms(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> bool:
-    """Return whether the known zeros of a factor, which leave terms out, leave few of them."""
-    terms = math.prod(result_shape(equation))
-    terms *= math.prod(inputs[0].shape[d] for d in equation.params["dimension_numbers"][0][0])
-    if any(x.size > LOADED for x in inputs):
-        return False
-    tables = [x for x in inputs if isinstance(x, InMemory) and x.buffer.kind == "table" and not x.moves]
-    shares = [sum(n.value != 0 for n in x.nodes(lowering.graph).ravel().tolist()) / x.size for x in tables if x.size]
-    return any(terms * share <= FEW_TERMS for share in shares)
+def _few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the factors of a product by a known matrix as (free, contracted) if its zeros leave few terms, else None.
+
+    A known factor is an array of numbers, the other one of nodes.
+    """
+    dimensions, (batch, _) = equation.params["dimension_numbers"]
+    tables = [_is_table(x) for x in inputs]
+    loaded = [x.numbers() if t else x for x, t in zip(inputs, tables, strict=True)]
+    if batch or not any(tables) or any(isinstance(x, InMemory) for x in loaded):
+        return None
+    factors, count = [], np.ones(1, dtype=np.int64)
+    for x, table, contracted in zip(loaded, tables, dimensions, strict=True):
+        free = [d for d in range(x.ndim) if d not in contracted]
+        rows = np.transpose(x, [*free, *contracted]).reshape(-1, math.prod(x.shape[d] for d in contracted))
+        count = count * (np.count_nonzero(rows, axis=0) if table else _count_data(rows, 1))
+        factors.append(rows)
+    return (factors[0], factors[1]) if count.sum() <= WRITTEN_OUT else None
+
+
+def _written_product(
+    lowering: Lowering, equation: JaxprEqn, factors: tuple[np.ndarray, np.ndarray]
+) -> list[np.ndarray]:
+    """Sum the terms of a product that known zeros leave, of each entry in the order of the contracted axis."""
+    graph, type = lowering.graph, result_type(equation)
+    left, right = ([_terms_of(graph, type, row) for row in factor] for factor in factors)
+    entries = []
+    for a in left:
+        for b in right:
+            terms = [graph.node("mul", type, a[k], b[k]) for k in a if k in b]
+            entries.append(total(graph, "add", type, terms, 0.0))
+    return [array_of(entries, result_shape(equation))]
+
+
+def _terms_of(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
+    """Return the entries of a row that are no known zeros, by their places."""
+    if row.dtype != object:
+        return {int(k): graph.constant(row[k].item(), type) for k in np.flatnonzero(row)}
+    return {k: n for k, n in enumerate(row.tolist()) if n.op != "constant" or n.value}
 
 
 def _first(x: InMemory, axis: int) -> InMemory:

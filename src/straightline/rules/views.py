@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.limits import PLACES, TABLE
+from straightline.limits import LOADED, PLACES, TABLE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, result_shape
 from straightline.memory import InMemory, contiguous
 from straightline.nodes import Buffer, Key, Node
@@ -148,7 +148,9 @@ def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Concatenate along the first axis in new memory, along another axis row by row."""
     shape, axis = result_shape(equation), equation.params["dimension"]
-    if math.prod(shape) <= TABLE or not any(isinstance(x, InMemory) for x in inputs):
+    in_memory_ = [x for x in inputs if isinstance(x, InMemory)]
+    known = all(x.buffer.kind == "table" and not x.moves and x.size <= LOADED for x in in_memory_)
+    if math.prod(shape) <= TABLE or known:
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     if axis != 0:
         parts = [in_memory(lowering, x) for x in inputs]

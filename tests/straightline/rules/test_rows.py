@@ -39,6 +39,23 @@ def test_a_table_with_numbers_that_are_written_out_is_written_out_too():
     assert explain(mirrored, np.zeros(9)) == "99 operations"
 
 
+def test_of_a_product_by_a_long_known_matrix_its_zeros_are_left_out():
+    """G x, and sum_ab T_ijab x_a x_b, of 40 outputs on their own: 40 entries that are read and one product each."""
+    gain, spread = np.diag(np.arange(1.0, 41.0)), np.zeros((40, 40, 41, 41))
+    spread[(np.arange(40),) * 4] = 2.0
+    x = RANDOM.normal(size=(RUNS, 40))
+
+    def moment(x):
+        y = jax.numpy.append(x, 1.0)
+        return jax.numpy.einsum("ijab,ab->ij", spread, y[:, None] * y)
+
+    assert explain(lambda x: gain @ x, x[0]) == "79 operations"  # of the first the product by 1 is none
+    assert explain(moment, x[0]) == "120 operations"
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(over_runs(lambda x: gain @ x, x), x @ gain, rtol=0)
+        np.testing.assert_allclose(over_runs(moment, x), [np.diag(2 * y * y) for y in x], rtol=1e-15)
+
+
 def test_a_sum_over_all_entries_of_long_arrays_is_accumulated():
     """Arrays that are not loaded whole, (65, 65): to rounding of 4,225 terms of size 1, whose sum is some 65."""
     table = np.random.default_rng(1).normal(size=(65, 65))
