@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
+from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper, compile_native_step, compile_xla_step
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
-from heliograph.live.stepper import NativeStepper, XlaStepper, compile_native_step, compile_xla_step
 from heliograph.live.stored.layout import can_read, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
 from heliograph.model.channel import Channel
@@ -289,13 +289,13 @@ class _Placed:
         self.estimate: PyTree = jax.tree.structure(JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, 0.0, 0))
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
-    def stepper(self) -> NativeStepper | XlaStepper:
+    def stepper(self) -> NativeFilterStepper | XlaFilterStepper:
         """Return a stepper at the prior."""
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:
-            return XlaStepper(compile_xla_step(self._static), self.numbers, self._start)
+            return XlaFilterStepper(compile_xla_step(self._static), self.numbers, self._start)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self._start)]
-        return NativeStepper(code, [np.asarray(leaf) for leaf in self.numbers], leaves)
+        return NativeFilterStepper(code, [np.asarray(leaf) for leaf in self.numbers], leaves)
 
     @cached_property
     def identity(self) -> Identity:

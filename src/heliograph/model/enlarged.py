@@ -1,6 +1,6 @@
 """Plants with further states: past outputs of the sensor, offset and drift of clocks."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.bias import driven_by
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, parallel
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, Plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, check_linear, check_sensor
@@ -254,3 +254,19 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | JointS
     if len(states) > 1:
         raise fail("sensors", "those of one state", f"matrices of {sorted(states)} columns")
     return LinearSensor(library(linear).concatenate(linear), noise, outputs, circular)
+
+
+def join_links(sensors: Mapping[str, AnySensor], channels: Sequence[Channel]) -> tuple[AnySensor, Channel]:
+    """Return the sensors and the channels of several nodes as one sensor behind one channel, over time if one varies.
+
+    Args:
+        sensors: by node, in their order; the outputs are named NODE_OUTPUT.
+        channels: of the nodes, in the same order.
+    """
+
+    def joint(*parts: AbstractSensor) -> AbstractSensor:
+        return joint_sensor(dict(zip(sensors, parts, strict=True)))
+
+    sensor: AnySensor = at_each_step(joint, *sensors.values())
+    channel: Channel = at_each_step(lambda *parts: parallel(parts), *channels)
+    return sensor, channel

@@ -130,17 +130,20 @@ def measurement_moment(sensor: AnySensor, second: Float[Array, "n1 n1"], step: i
     now = at(sensor, step)
     c, offset, noise = now.matrix, now.noise.mean, now.noise.covariance
     rows = _extend(c, offset)
-    return rows @ second @ rows.T + library(noise).pad(noise, ((0, 1), (0, 1)))  # type: ignore[no-any-return]
+    sensed: Array = rows @ second @ rows.T + library(noise).pad(noise, ((0, 1), (0, 1)))
+    return sensed
 
 
 def _extend(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
     """Matrix of (x, 1) -> (M x + shift, 1)."""
     last = np.eye(1, matrix.shape[1] + 1, matrix.shape[1])
     xp = library(matrix, shift)
-    return xp.concatenate([xp.concatenate([matrix, shift[:, None]], axis=1), last])  # type: ignore[no-any-return]
+    extended: Array = xp.concatenate([xp.concatenate([matrix, shift[:, None]], axis=1), last])
+    return extended
 
 
 def _second_moment(mean: Float[Array, "n"], covariance: Float[Array, "n n"]) -> Float[Array, "n1 n1"]:
     xp = library(mean, covariance)
     extended = xp.append(mean, 1.0)
-    return xp.outer(extended, extended) + xp.pad(covariance, ((0, 1), (0, 1)))  # type: ignore[no-any-return]
+    second: Array = xp.outer(extended, extended) + xp.pad(covariance, ((0, 1), (0, 1)))
+    return second

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from heliograph.filters.linear.linear import linear_filter
-from heliograph.model.channel import Channel, parallel
-from heliograph.model.enlarged import joint_sensor
+from heliograph.model.channel import Channel
+from heliograph.model.enlarged import join_links
 from heliograph.model.over_time import OverTime, at, first, over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, fail, instance, table
@@ -65,10 +65,8 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     fused = {}
     if len(nodes) > 1:
         # All sensors and channels as one node, for the filter of all that is received.
-        sensors = {name: node.sensor for name, node in nodes.items()}
-        covered = min((sensor.steps for sensor in sensors.values() if isinstance(sensor, OverTime)), default=1)
-        joint = _make_over_time([joint_sensor({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
-        fused = {BEST: linear_filter(plant, joint, _make_over_time([parallel(list(step.values())) for step in steps]))}
+        joint = join_links({name: node.sensor for name, node in nodes.items()}, list(channels.values()))
+        fused = {BEST: linear_filter(plant, *joint)}
     realised = Network(plant, designed, fused)
     return repeat_network(realised) if error.period > 1 else realised
 

@@ -222,4 +222,5 @@ def _average_draws(
         return over_time
 
     runs: dict[str, jax.Array] = jax.vmap(jax.vmap(run))(keys)
-    return jax.tree.map(lambda moments: moments.mean(axis=1), runs)  # type: ignore[no-any-return]
+    averages: dict[str, jax.Array] = jax.tree.map(lambda moments: moments.mean(axis=1), runs)
+    return averages

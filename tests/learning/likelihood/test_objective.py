@@ -71,3 +71,30 @@ def test_scores_are_the_derivatives_of_the_likelihood(both):
         ends = [evaluate_at_points(objective, x + sign * DIFFERENCE * np.eye(len(x)), data).total for sign in (-1, 1)]
         slopes = (ends[1] - ends[0]) / (2 * DIFFERENCE)
         np.testing.assert_allclose(result.gradient[0], slopes, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())
+
+
+def test_nodes_of_which_one_varies_over_time_are_learned_as_one_node():
+    """Both networks describe one world, so that their fits agree to rounding."""
+    steps = 30
+    rising = [hg.LinearSensor([[1.0 + 0.1 * k]], [[0.2]]) for k in range(steps)]
+    still = hg.LinearSensor([[0.5]], [[0.1]])
+
+    def plant():
+        return hg.LinearPlant([[0.9]], hg.free(0.3, "q"), [0.0], [[1.0]])
+
+    def several():
+        nodes = {"a": hg.Node(hg.model.over_time(rising), hg.perfect(), {}), "b": hg.Node(still, hg.perfect(), {})}
+        return hg.Network(plant(), nodes)
+
+    def whole():
+        joint = hg.model.over_time(
+            [hg.LinearSensor([s.matrix[0], still.matrix[0]], np.diag([0.2, 0.1])) for s in rising]
+        )
+        return hg.Network(plant(), {"ab": hg.Node(joint, hg.perfect(2), {})})
+
+    record = hg.simulate(several(), horizon=steps, key=0)
+    z = record.measurements
+    apart = hg.fit(several, record, starts=1)
+    together = hg.fit(whole, {"ab": np.concatenate([z["a"], z["b"]], axis=-1)}, starts=1)
+    assert apart.values["q"] == pytest.approx(together.values["q"], rel=1e-9)
+    assert apart.log_likelihood["linear"] == pytest.approx(together.log_likelihood["linear"], rel=1e-12)

@@ -15,11 +15,11 @@ from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.filters.linear.linear import linear_filter
 from heliograph.learning.description import Build, Description
 from heliograph.learning.likelihood.data import Data
-from heliograph.model.channel import Channel, parallel
-from heliograph.model.enlarged import joint_sensor
+from heliograph.model.channel import Channel
+from heliograph.model.enlarged import join_links
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
-from heliograph.model.over_time import OverTime, at_each_step, first
+from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import nearest
@@ -38,19 +38,18 @@ def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Plant, sensor and channel of all nodes together, in their order, as if no observed loss ever happened.
 
     Raises:
-        ValueError: relays that filter and forward, several nodes of which one varies over time.
+        ValueError: relays that filter and forward.
     """
     if network.relays is not None:
         raise fail("network to be learned", "nodes that receive sensors through channels", "relays that filter")
     if network.common is not None:
         return network.plant, network.common.sensor, _joint_channel(network.common.channel)
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
+    channels = [_joint_channel(node.channel) for node in nodes]
     if len(nodes) == 1:
-        return network.plant, nodes[0].sensor, _joint_channel(nodes[0].channel)
-    if any(isinstance(model, OverTime) for node in nodes for model in (node.sensor, node.channel)):
-        raise fail("network to be learned", "one node, where its sensor or channel varies over time", len(nodes))
-    sensors = {name: first(node.sensor) for name, node in zip(network.names, nodes, strict=True)}
-    return network.plant, joint_sensor(sensors), parallel([first(_joint_channel(node.channel)) for node in nodes])
+        return network.plant, nodes[0].sensor, channels[0]
+    sensors = {name: node.sensor for name, node in zip(network.names, nodes, strict=True)}
+    return network.plant, *join_links(sensors, channels)
 
 
 def _joint_channel(channel: Channel) -> Channel:

@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from heliograph.model.channel import Channel, parallel
-from heliograph.model.enlarged import JointSensor, joint_sensor, with_past
+from heliograph.model.channel import Channel
+from heliograph.model.enlarged import JointSensor, join_links, with_past
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs
@@ -83,9 +83,10 @@ def join_premises(premises: Sequence[Premise]) -> Premise:
     sensors = [premise.sensor for premise in premises if premise.sensor is not None]
     channels = [premise.channel for premise in premises if premise.channel is not None]
     triggers = [p.trigger for p in premises if p.trigger is not None and not isinstance(p.trigger, Periodic)]
+    sensor, channel = join_links({str(i): s for i, s in enumerate(sensors)}, channels)
     return premises[0].replaced(
-        sensor=at_each_step(lambda *parts: joint_sensor({str(i): s for i, s in enumerate(parts)}), *sensors),
-        channel=at_each_step(lambda *parts: parallel(parts), *channels),
+        sensor=sensor,
+        channel=channel,
         trigger=triggers[0] if triggers else None,
         order=None if any(premise.order is None for premise in premises) else MEAN_AND_COVARIANCE,
     )

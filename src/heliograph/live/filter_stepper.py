@@ -1,4 +1,8 @@
-"""A filter's step on live data with its plausibility check, in one program: native code if possible, else XLA."""
+"""One filter's step on live data, which keeps its state where something is implausible, until told to accept it.
+
+In one program: native code if possible, else XLA. The step of a network (`simulation/rows/row_step.py`) is another: it
+leaves implausible measurements out and goes on, and takes many rows at once.
+"""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -18,8 +22,8 @@ from straightline import Unsupported, compile_one
 Leaves = list[np.ndarray]
 
 
-class NativeStepper:
-    """State of one filter, stepped in place by native code."""
+class NativeFilterStepper:
+    """One filter's step by native code, which writes over the state."""
 
     def __init__(self, code: Any, numbers: Leaves, state: Leaves):
         self._code = code.again(numbers)
@@ -55,8 +59,8 @@ class NativeStepper:
         return [leaf.copy() for leaf in self._estimate]
 
 
-class XlaStepper:
-    """State of one filter, stepped by a program of XLA."""
+class XlaFilterStepper:
+    """One filter's step by a program of XLA, with its state."""
 
     def __init__(self, run: Any, numbers: list[jax.Array], state: PyTree):
         self._run, self._numbers = run, numbers
@@ -119,11 +123,11 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
     """Compile native code with arguments (numbers, state, z, u, k), flattened; None if XLA has to step the filter."""
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
-    return _compile_stepper(static, shapes, (len(numbers), len(leaves)), tree, setting())
+    return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, setting())
 
 
 @lru_cache
-def _compile_stepper(
+def _compile_step(
     static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
 ) -> Any:
     """Compile the native code, once for each structure, set of shapes and engine."""

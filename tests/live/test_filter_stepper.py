@@ -9,7 +9,7 @@ import pytest
 from jax.scipy.special import betainc
 
 import heliograph as hg
-from heliograph.live.stepper import NativeStepper, XlaStepper
+from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1, [1.0, -1.0], 1.0, [[1.0], [0.0]], inputs=["push"])
 SENSOR = hg.LinearSensor(np.eye(2), 0.5)
@@ -53,7 +53,7 @@ def filters():
 def stream_of(item, engine, monkeypatch, *arguments):
     monkeypatch.setenv("HELIOGRAPH_ENGINE", engine)
     stream = hg.Stream(item, *arguments)
-    assert isinstance(stream._stepper, NativeStepper if engine == "native" else XlaStepper)
+    assert isinstance(stream._stepper, NativeFilterStepper if engine == "native" else XlaFilterStepper)
     return stream
 
 
@@ -166,5 +166,5 @@ def test_a_filter_that_native_code_does_not_take_is_stepped_by_xla(monkeypatch):
     assert "\n" not in str(caught.value)
     monkeypatch.delenv("HELIOGRAPH_ENGINE")
     stream = hg.Stream(item)
-    assert isinstance(stream._stepper, XlaStepper)
+    assert isinstance(stream._stepper, XlaFilterStepper)
     assert np.isfinite(stream.push([0.1, 0.2], [0.3]).mean).all()
