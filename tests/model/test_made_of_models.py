@@ -12,7 +12,8 @@ import pytest
 import heliograph as hg
 from heliograph.model.over_time import at
 from heliograph.model.plant import JointNoise
-from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.memory import memories
 
 PAGE = Path(__file__).parents[2] / "docs" / "names.md"
 KINDS = (

@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
-from heliograph.random_affine.combine import Series, maps_in_series
+from heliograph.random_affine.combine import Series
 from heliograph.random_affine.route import Position, Signal
 
 HOP = hg.hop(hg.Rayleigh(0.8), 0.1)
@@ -67,4 +67,4 @@ def test_a_map_holds_others_in_place_of_its_own():
 
 def test_series_are_opened_at_any_depth():
     nested = Series([HOP, Series([HOP, Series([RELAYED.maps[1]])])])
-    assert maps_in_series(nested) == [HOP, HOP, RELAYED.maps[1]] and maps_in_series(HOP) == [HOP]
+    assert nested.in_series == [HOP, HOP, RELAYED.maps[1]] and HOP.in_series == [HOP]

@@ -9,10 +9,11 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import check_maps, memories
+from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.erasure import second_moments
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.moments.tensors import symmetric_product
 

@@ -10,12 +10,12 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, flag, scalar, text
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, check_maps, memories
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.chain import Autoregression, MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.memory import replace_memories
+from heliograph.random_affine.memory import memories, replace_memories
 from heliograph.random_affine.modes import (
     Faded,
     ModeOutput,

@@ -150,3 +150,21 @@ def scatter(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.n
     table = np.zeros(size)
     np.add.at(table, places, values)
     return table
+
+
+EQUAL = 1e-12  # relative: numbers that were computed in another order
+
+
+def equal_to_rounding(a: Any, b: Any) -> bool:
+    """Test whether all entries are equal to rounding; a traced one is equal to itself alone."""
+    if is_traced(a, b) or np.shape(a) != np.shape(b):
+        return a is b
+    x, y = np.asarray(a), np.asarray(b)
+    return bool(np.all(np.abs(x - y) <= EQUAL * np.maximum(np.abs(x), np.abs(y))))
+
+
+def within(own: Any, room: Any, believed: Any, radius: Any) -> bool:
+    """Test whether probabilities with their room are all within a radius of the believed ones."""
+    if is_traced(own, room, believed, radius) or np.shape(own) != np.shape(believed):
+        return False
+    return bool(np.all(np.abs(own - believed) + room <= np.asarray(radius) + EQUAL))

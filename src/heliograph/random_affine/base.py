@@ -4,18 +4,22 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, NamedTuple, TypeVar, cast
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, items, show_value
-from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.numerics.module import Module, readable, same, unwritten
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Bool, Float, PyTree
-from heliograph.random_affine.chain import AbstractMemory, unique_memories
 from heliograph.random_affine.components import Component
+from heliograph.random_affine.memory import (
+    AbstractWithMemory,
+    draw_with_shared_memories,
+    init_with_shared_memories,
+    memories,
+)
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import CORNERS, Interval
 from heliograph.random_affine.moments.monomials import Moments, count_monomials
@@ -24,6 +28,7 @@ from heliograph.random_affine.route import Position, Signal, Visit, carry_by_mom
 
 T = TypeVar("T")
 KnownGains = Bool[np.ndarray, " m"]
+SameNoise = Callable[[AbstractNoise, AbstractNoise], bool]
 
 
 @readable
@@ -228,6 +233,30 @@ class AbstractRandomAffine(Module):
         return self, None
 
     @property
+    def in_series(self) -> list["AbstractRandomAffine"]:
+        """The maps that this one is a series of, at any depth; itself alone where it is none."""
+        return [self]
+
+    def covers(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
+        """Test whether another map is written like this one, its laws within what this one believes possible.
+
+        Args:
+            own: the other map.
+            same_noise: tests whether two noises agree.
+        """
+        if same(self, own):
+            return True
+        believed, parts = self.in_series, own.in_series
+        if len(believed) == 1 == len(parts):
+            return believed[0].covers_kind(parts[0], same_noise)
+        pairs = zip(believed, parts, strict=False)
+        return len(believed) == len(parts) and all(x.covers(y, same_noise) for x, y in pairs)
+
+    def covers_kind(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
+        """As `covers`, of a map that is no series; by default, the same alone."""
+        return same(self, own)
+
+    @property
     def is_silent(self) -> bool:
         """True if the map is known to deliver noise alone, as a loss or a mode without reception does."""
         return False
@@ -314,10 +343,8 @@ class Outcome(NamedTuple):
     arrived: Bool[np.ndarray, " outputs"]
 
 
-class AbstractModal(AbstractRandomAffine):
+class AbstractModal(AbstractWithMemory, AbstractRandomAffine):
     """Random affine map whose law at each step depends on the state of a memory."""
-
-    memory: eqx.AbstractVar[AbstractMemory]
 
     @property
     def remembers(self) -> bool:
@@ -336,51 +363,6 @@ class AbstractModal(AbstractRandomAffine):
     def degree_in(self, identity: str) -> int:
         """One in its own memory."""
         return int(self.memory.identity == identity)
-
-
-class ChannelState(NamedTuple):
-    """State of a channel: of its memories, in order of appearance, and of the map given them."""
-
-    memories: tuple[jax.Array, ...]
-    rest: PyTree[jax.Array]
-
-
-def init_with_shared_memories(channel: AbstractRandomAffine, key: jax.Array, keys: Sequence[jax.Array]) -> ChannelState:
-    """Draw a channel's state before the first draw, with one key for each of its `memories`."""
-    states = tuple(m.begin(k) for m, k in zip(memories(channel).values(), keys, strict=True))
-    return ChannelState(states, condition_on_memories(channel, states).init(key))
-
-
-def draw_with_shared_memories(
-    channel: AbstractRandomAffine, state: ChannelState, key: jax.Array, keys: Sequence[jax.Array]
-) -> tuple[ChannelState, jax.Array]:
-    """Draw H given the memories' states, and move these; memories of one key move alike."""
-    rest, h = condition_on_memories(channel, state.memories).draw(state.rest, key)
-    held = memories(channel).values()
-    return ChannelState(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
-
-
-def memories(channel: PyTree) -> dict[str, AbstractMemory]:
-    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
-    parts = jax.tree.leaves(channel, is_leaf=is_modal)
-    return unique_memories(leaf.memory for leaf in parts if is_modal(leaf))
-
-
-def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
-    """The map that forgets which modes, for the states of its `memories`; whatever is combined of maps stays so."""
-    assert isinstance(channel, AbstractRandomAffine)
-    by_identity = dict(zip(memories(channel), states, strict=True))
-
-    def chosen(leaf: PyTree) -> PyTree:
-        return leaf.given(by_identity[leaf.memory.identity]) if is_modal(leaf) else leaf
-
-    memoryless: T = jax.tree.map(chosen, channel, is_leaf=is_modal)
-    return memoryless
-
-
-def is_modal(leaf: object) -> bool:
-    """True for a map whose law depends on the state of a memory."""
-    return isinstance(leaf, AbstractModal)
 
 
 def check_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:

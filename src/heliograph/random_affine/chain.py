@@ -26,7 +26,7 @@ from heliograph.numerics.check import (
     scalar,
 )
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.traced import equal_to_rounding, is_traced, library, within
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.law import draw_index
 
@@ -134,6 +134,12 @@ class MarkovChain(AbstractMemory):
         self.radius = radii("radius of the transition", radius, rows)
         self.initial = stationary(rows) if initial is None else probabilities("initial law", initial, len(rows))
         self.name, self.identity = name, _identify_memory(name)
+
+    def covers(self, own: "MarkovChain") -> bool:
+        """Test whether another chain is this memory, its transition within the radius."""
+        if own.identity != self.identity or not equal_to_rounding(self.initial, own.initial):
+            return False
+        return within(own.transition, own.radius, self.transition, self.radius)
 
     @property
     def modes(self) -> int:

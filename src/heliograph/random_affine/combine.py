@@ -14,7 +14,14 @@ from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import stack_parts
 from heliograph.numerics.types import Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, Outcome, check_forgets, check_maps
+from heliograph.random_affine.base import (
+    AbstractRandomAffine,
+    KnownGains,
+    Outcome,
+    SameNoise,
+    check_forgets,
+    check_maps,
+)
 from heliograph.random_affine.components import Component, combine
 from heliograph.random_affine.composite import ARROW, AbstractComposite, list_in_words
 from heliograph.random_affine.hop import known
@@ -54,6 +61,12 @@ class AbstractCombination(AbstractComposite):
     def degree_in(self, identity: str) -> int:
         """Largest degree of a map, since they stand side by side."""
         return max(affine.degree_in(identity) for affine in self.maps)
+
+    def covers_maps(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Test whether another map is of this kind and each of its maps covered by that of this one."""
+        if not isinstance(own, AbstractCombination) or type(own) is not type(self) or len(own.maps) != len(self.maps):
+            return False
+        return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
 
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
@@ -121,6 +134,11 @@ class Series(AbstractCombination):
         intervals = [m.moment_interval(order) for m in self.maps]
         return reduce(lambda before, after: multiply_matrices(after, before), intervals)
 
+    @property
+    def in_series(self) -> list[AbstractRandomAffine]:
+        """Its maps, those of series within it too."""
+        return [m for affine in self.maps for m in affine.in_series]
+
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Those that are known behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_known_gains(before), self.maps, known)
@@ -182,11 +200,6 @@ def _join_in_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.nd
     return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
 
 
-def maps_in_series(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
-    """Return the maps of a channel in series, those of series within it too; itself alone where it is none."""
-    return [m for affine in channel.maps for m in maps_in_series(affine)] if isinstance(channel, Series) else [channel]
-
-
 def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
     """The product of two drawn maps, where NaN rows of the first are lost: what has no gain on them is not."""
     lost = jnp.isnan(first).any(axis=1)
@@ -235,6 +248,10 @@ class Stack(AbstractCombination):
         tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
         rows = stack_parts(stack_rows(self, order, tables, multiply_rows))
         return rows[:, 0], rows[:, 1]
+
+    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """A stack of maps that are covered one by one."""
+        return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Those of the maps, one after another."""

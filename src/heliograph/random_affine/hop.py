@@ -8,9 +8,9 @@ import numpy as np
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.traced import is_traced, is_zero, library, scatter, stack_parts
+from heliograph.numerics.traced import equal_to_rounding, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, KnownGains
+from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise
 from heliograph.random_affine.components import Component
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, disturb_hop, noise_gain
@@ -142,6 +142,12 @@ class GainAndNoise(AbstractHop):
             (xp.minimum(b * lo, b * hi), xp.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
         ]
         return sum(low for low, _ in products), sum(high for _, high in products)
+
+    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """A hop of this matrix whose gain has a law that is believed possible."""
+        if not isinstance(own, GainAndNoise) or not self.law.covers(own.law):
+            return False
+        return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Those that take nothing but known inputs, by a constant gain."""

@@ -16,8 +16,8 @@ from typing_extensions import TypeAliasType
 from heliograph.numerics import check
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, radii, scalar
-from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stack_parts
+from heliograph.numerics.module import Module, readable, same, unwritten
+from heliograph.numerics.traced import equal_to_rounding, is_traced, library, plain, scipy_for, stack_parts, within
 from heliograph.numerics.types import ArrayLike, Float
 
 Scalar = Float[jax.Array | np.ndarray, ""]
@@ -58,6 +58,10 @@ class AbstractLaw(Module):
         """Lowest and highest E[g^order] over the possible laws, those of the `extremes`."""
         ends = self.corner_moments(order)[:, order]
         return plain(ends.min()), plain(ends.max())
+
+    def covers(self, own: "AbstractLaw") -> bool:
+        """Test whether another law, with all that it may be, is one of those that this one may be."""
+        return same(self, own)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
         """List probability and value of each of finitely many gains; by default a refusal."""
@@ -116,6 +120,12 @@ class Discrete(AbstractLaw):
         """Lowest and highest E[g^order], also where the corners are too many to list."""
         powers = self.values**order
         return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
+
+    def covers(self, own: AbstractLaw) -> bool:
+        """A law of the same values whose probabilities stay within the radius."""
+        if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
+            return same(self, own)
+        return within(own.probabilities, own.radius, self.probabilities, self.radius)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
         """The values, with their probabilities."""

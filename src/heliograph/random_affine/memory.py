@@ -1,16 +1,71 @@
-"""Memories of several maps told apart, or made one and the same."""
+"""Memories of maps: those that a channel holds, the channel given their states, and memories told apart or made one."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
 
+from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import is_modal, memories
-from heliograph.random_affine.chain import AbstractMemory
+from heliograph.random_affine.chain import AbstractMemory, unique_memories
 
 T = TypeVar("T")
+
+
+class AbstractWithMemory(Module):
+    """Whatever has a law at each step that depends on the state of a memory."""
+
+    memory: eqx.AbstractVar[AbstractMemory]
+
+    def given(self, state: int | float | jax.Array | np.ndarray) -> Any:
+        """Return the same without memory, for this state of the memory."""
+        raise unwritten(self, "given")
+
+
+class ChannelState(NamedTuple):
+    """State of a channel: of its memories, in order of appearance, and of the map given them."""
+
+    memories: tuple[jax.Array, ...]
+    rest: PyTree[jax.Array]
+
+
+def init_with_shared_memories(channel: Any, key: jax.Array, keys: Sequence[jax.Array]) -> ChannelState:
+    """Draw a channel's state before the first draw, with one key for each of its `memories`."""
+    states = tuple(m.begin(k) for m, k in zip(memories(channel).values(), keys, strict=True))
+    return ChannelState(states, condition_on_memories(channel, states).init(key))
+
+
+def draw_with_shared_memories(
+    channel: Any, state: ChannelState, key: jax.Array, keys: Sequence[jax.Array]
+) -> tuple[ChannelState, jax.Array]:
+    """Draw H given the memories' states, and move these; memories of one key move alike."""
+    rest, h = condition_on_memories(channel, state.memories).draw(state.rest, key)
+    held = memories(channel).values()
+    return ChannelState(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
+
+
+def memories(channel: PyTree) -> dict[str, AbstractMemory]:
+    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
+    parts = jax.tree.leaves(channel, is_leaf=is_modal)
+    return unique_memories(leaf.memory for leaf in parts if is_modal(leaf))
+
+
+def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
+    """The map that forgets which modes, for the states of its `memories`; whatever is combined of maps stays so."""
+    by_identity = dict(zip(memories(channel), states, strict=True))
+
+    def chosen(leaf: PyTree) -> PyTree:
+        return leaf.given(by_identity[leaf.memory.identity]) if is_modal(leaf) else leaf
+
+    memoryless: T = jax.tree.map(chosen, channel, is_leaf=is_modal)
+    return memoryless
+
+
+def is_modal(leaf: object) -> bool:
+    """True for a map whose law depends on the state of a memory."""
+    return isinstance(leaf, AbstractWithMemory)
 
 
 def drop_names(channel: T) -> T:

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.traced import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.combine import AbstractCombination, Corners
 from heliograph.random_affine.components import Component
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
@@ -82,6 +82,10 @@ class Mixture(AbstractUniform, AbstractCombination):
     def corner_count(self) -> int:
         """Extreme weights times the product of the maps' counts."""
         return len(self.choice.corners()) * super().corner_count()
+
+    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """A mixture by a law that is believed possible, of maps that are covered one by one."""
+        return isinstance(own, Mixture) and self.choice.covers(own.choice) and self.covers_maps(own, same_noise)
 
     def list_atoms(self) -> list[Component]:
         """The atoms of each map, times its probability."""

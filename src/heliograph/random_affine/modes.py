@@ -15,18 +15,12 @@ from heliograph.numerics.check import array, check_count, fail, instance, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.random_affine.base import (
-    AbstractModal,
-    AbstractRandomAffine,
-    check_forgets,
-    check_maps,
-    condition_on_memories,
-    memories,
-)
+from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, AbstractWrapper
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.memory import condition_on_memories, memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
@@ -69,6 +63,12 @@ class Modes(AbstractUniform, AbstractModal):
         numbers = [jnp.stack([jnp.asarray(leaf) for leaf in same])[state] for same in zip(*leaves, strict=True)]
         present: AbstractRandomAffine = jax.tree.unflatten(trees[0], numbers)
         return present
+
+    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Modes of a chain that is believed possible, with maps that are covered one by one."""
+        if not isinstance(own, Modes) or not self.memory.covers(own.memory) or len(own.maps) != len(self.maps):
+            return False
+        return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
 
     def in_words(self) -> str:
         """The maps in words, and the name of the memory."""

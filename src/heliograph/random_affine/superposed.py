@@ -12,12 +12,13 @@ from heliograph.numerics.caching import cache_arrays, cache_by_object
 from heliograph.numerics.check import check_count, fail, instance, items, show_value
 from heliograph.numerics.traced import library, scatter
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, check_forgets, check_maps, memories
-from heliograph.random_affine.combine import AbstractCombination, Corners, Series, Stack, maps_in_series
+from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise, check_forgets, check_maps
+from heliograph.random_affine.combine import AbstractCombination, Corners, Series, Stack
 from heliograph.random_affine.components import Component
 from heliograph.random_affine.composite import list_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import Interval
 from heliograph.random_affine.moments.monomials import (
@@ -136,6 +137,12 @@ class Superposed(AbstractCombination):
     def _interval_of_parts(self, order: int) -> Interval:
         """That of the sum of a stack."""
         return self.as_stack.moment_interval(order)
+
+    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """A sum at the same places with such a noise, of maps that are covered one by one."""
+        if not isinstance(own, Superposed) or own.places != self.places or not same_noise(self.noise, own.noise):
+            return False
+        return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Those that are known in every map."""
@@ -283,7 +290,7 @@ def sensed_by_link(matrix: Matrix, noise: AbstractNoise, channel: AbstractRandom
 
     That holds where the parts of v that links carry are independent; else, and for another channel, there is none.
     """
-    first, *rest = maps_in_series(channel)
+    first, *rest = channel.in_series
     if not isinstance(first, Superposed) or (parts := noise.split(first.places)) is None:
         return None
     links = [

@@ -23,9 +23,10 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, Outcome, memories
+from heliograph.random_affine.base import AbstractRandomAffine, Outcome
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.erasure import second_moments
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes, long_run_law
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

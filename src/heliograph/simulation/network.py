@@ -24,8 +24,8 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
-from heliograph.random_affine.base import check_forgets, memories
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.base import check_forgets
+from heliograph.random_affine.memory import drop_names, memories
 from heliograph.simulation.centres.centre import along_estimates, claim_of_informed, claim_of_reports
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.claims import (

@@ -12,15 +12,10 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import (
-    AbstractRandomAffine,
-    draw_with_shared_memories,
-    init_with_shared_memories,
-    memories,
-)
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import unique_memories
 from heliograph.random_affine.delay import signal_size
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memory import draw_with_shared_memories, drop_names, init_with_shared_memories, memories
 from heliograph.random_affine.route import apply
 from heliograph.simulation.draws import (
     CHANNEL,

@@ -7,7 +7,8 @@ import numpy as np
 import scipy
 
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.monomials import exponents, monomials
 from heliograph.simulation.runs.over_runs import over_runs

@@ -21,8 +21,8 @@ from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import memories
 from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 

@@ -25,7 +25,6 @@ from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import maps_in_series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
@@ -236,7 +235,7 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
 
     `variance` is the bound on var g of a hop.
     """
-    hops = [_describe_hop(hop) for hop in maps_in_series(channel)]
+    hops = [_describe_hop(hop) for hop in channel.in_series]
     # The recursion over the hops.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:

@@ -39,12 +39,13 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
-from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import Autoregression
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.components import COMPONENT_LIMIT
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
 
 

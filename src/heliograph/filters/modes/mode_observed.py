@@ -26,7 +26,8 @@ from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
-from heliograph.random_affine.base import AbstractRandomAffine, condition_on_memories, memories
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.memory import condition_on_memories, memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,

@@ -47,7 +47,7 @@ from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.base import memories
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes
 
 

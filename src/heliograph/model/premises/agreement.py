@@ -5,7 +5,6 @@ them, so that of such filters only these are compared: E[G], E[n] and Cov(z | y)
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -20,21 +19,17 @@ from heliograph.model.premises.same_program import same_function
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.module import same
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.combine import Series, Stack, maps_in_series
+from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.law import Constant
 from heliograph.random_affine.memory import drop_names
-from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.modes import Modes, joint_modes
+from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.outliers import has_bounded_noise
-from heliograph.random_affine.superposed import Superposed
 
-ROUNDING = 1e-12  # relative: moments that were computed in another order
 PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"
 
 
@@ -112,37 +107,35 @@ def _is_over_time(leaf: object) -> bool:
     return isinstance(leaf, OverTime)
 
 
-def _close(a: Any, b: Any) -> bool:
-    """Test whether all entries are equal to rounding."""
-    if is_traced(a, b) or np.shape(a) != np.shape(b):
-        return a is b
-    x, y = np.asarray(a), np.asarray(b)
-    return bool(np.all(np.abs(x - y) <= ROUNDING * np.maximum(np.abs(x), np.abs(y))))
-
-
 def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
     if same(a, b):
         return True
     if order != MEAN_AND_COVARIANCE or has_bounded_noise(a) != has_bounded_noise(b):
         return False
-    return _close(a.mean, b.mean) and _close(a.covariance, b.covariance)
+    return equal_to_rounding(a.mean, b.mean) and equal_to_rounding(a.covariance, b.covariance)
 
 
 def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
     if same(a, b):
         return True
     sizes = [(len(plant.states), len(plant.inputs), plant.angles) for plant in (a, b)]
-    if sizes[0] != sizes[1] or not _close(a.initial_mean, b.initial_mean):
+    if sizes[0] != sizes[1] or not equal_to_rounding(a.initial_mean, b.initial_mean):
         return False
     if order != MEAN_AND_COVARIANCE and not same(a.deviation, b.deviation):
         return False
-    return _close(a.initial_covariance, b.initial_covariance) and _same_motion(a, b) and _same_disturbance(a, b, order)
+    return (
+        equal_to_rounding(a.initial_covariance, b.initial_covariance)
+        and _same_motion(a, b)
+        and _same_disturbance(a, b, order)
+    )
 
 
 def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
     linear = [plant for plant in (a, b) if isinstance(plant, LinearPlant)]
     if len(linear) == 2 and not any(isinstance(m, OfInputs) for p in linear for m in (p.matrix, p.input_matrix)):
-        return _close(linear[0].matrix, linear[1].matrix) and _close(linear[0].input_matrix, linear[1].input_matrix)
+        return equal_to_rounding(linear[0].matrix, linear[1].matrix) and equal_to_rounding(
+            linear[0].input_matrix, linear[1].input_matrix
+        )
     return same_function(a.transition, b.transition, (len(a.states),), (len(a.inputs),))
 
 
@@ -161,7 +154,7 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
         return all(_same_sensor(x, y, order) for x, y in zip(a.parts, b.parts, strict=True))
     matrices = matrix_of(a), matrix_of(b)
     if matrices[0] is not None and matrices[1] is not None:
-        return _close(*matrices)
+        return equal_to_rounding(*matrices)
     return any(same_function(a.measure, b.measure, (n,)) for n in _states_of(a, b))
 
 
@@ -195,7 +188,7 @@ def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None)
 
 def _same_gains(believed: Premise, own: Premise) -> bool:
     """Test whether the relays that are there run the believed gains; others were left out of a recording."""
-    return all(_close(gain, own.gains[name]) for name, gain in believed.gains.items() if name in own.gains)
+    return all(equal_to_rounding(gain, own.gains[name]) for name, gain in believed.gains.items() if name in own.gains)
 
 
 def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
@@ -216,7 +209,7 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
         return True
     if is_traced(a, b) or (a.outputs, a.inputs, a.past) != (b.outputs, b.inputs, b.past) or a.past:
         return False
-    if _covers(a, b, order):
+    if a.covers(b, lambda x, y: _same_noise(x, y, order)):
         return True
     if isinstance(a, Stack) and isinstance(b, Stack) and [m.outputs for m in a.maps] == [m.outputs for m in b.maps]:
         return all(_same_map(x, y, order, loses) for x, y in zip(a.maps, b.maps, strict=True))
@@ -228,50 +221,6 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
         return (a.erases or b.erases) and same(a.condition_on_arrival(), b.condition_on_arrival())
     except ValueError:  # no moments, or more than can be listed
         return False
-
-
-def _covers(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None) -> bool:
-    """Test whether a channel is written like the one that is believed, its laws within the believed radius."""
-    if same(a, b):
-        return True
-    believed, own = maps_in_series(a), maps_in_series(b)
-    if len(believed) != len(own) or len(own) > 1:
-        return len(believed) == len(own) and all(_covers(x, y, order) for x, y in zip(believed, own, strict=True))
-    match believed[0], own[0]:
-        case GainAndNoise() as x, GainAndNoise() as y:
-            return _holds(x.law, y.law) and _close(x.matrix, y.matrix) and _same_noise(x.noise, y.noise, order)
-        case Mixture() as x, Mixture() as y if _holds(x.choice, y.choice):
-            pass
-        case Modes() as x, Modes() as y if _holds_chain(x.memory, y.memory):
-            pass
-        case Stack() as x, Stack() as y:
-            pass
-        case Superposed() as x, Superposed() as y if x.places == y.places and _same_noise(x.noise, y.noise, order):
-            pass
-        case _:
-            return False
-    return len(x.maps) == len(y.maps) and all(_covers(m, n, order) for m, n in zip(x.maps, y.maps, strict=True))
-
-
-def _holds(believed: AbstractLaw, own: AbstractLaw) -> bool:
-    """Test whether a law, with all that it may be, is one of those believed."""
-    if not isinstance(believed, Discrete) or not isinstance(own, Discrete):
-        return same(believed, own)
-    if not _close(believed.values, own.values):
-        return False
-    return _within(own.probabilities, own.radius, believed.probabilities, believed.radius)
-
-
-def _holds_chain(believed: MarkovChain, own: MarkovChain) -> bool:
-    if believed.identity != own.identity or not _close(believed.initial, own.initial):
-        return False
-    return _within(own.transition, own.radius, believed.transition, believed.radius)
-
-
-def _within(own: Any, room: Any, believed: Any, radius: Any) -> bool:
-    if is_traced(own, room, believed, radius) or np.shape(own) != np.shape(believed):
-        return False
-    return bool(np.all(np.abs(own - believed) + room <= np.asarray(radius) + ROUNDING))
 
 
 def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
@@ -316,8 +265,8 @@ def _agree(a: Moments, b: Moments, there: np.ndarray) -> bool:
     power = [np.abs(np.einsum("iiaa->ia", second))[there] for _, second in (a, b)]
     size = np.sqrt(np.maximum(*power))
     scale = size[:, None, :, None] * size[None, :, None, :]
-    means = np.abs(a[0] - b[0])[there] <= ROUNDING * size
-    return bool(np.all(means) and np.all(np.abs(a[1][rows] - b[1][rows]) <= ROUNDING * scale))
+    means = np.abs(a[0] - b[0])[there] <= EQUAL * size
+    return bool(np.all(means) and np.all(np.abs(a[1][rows] - b[1][rows]) <= EQUAL * scale))
 
 
 def _same_observation(

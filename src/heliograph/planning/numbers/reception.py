@@ -26,9 +26,10 @@ from heliograph.planning.error import Error
 from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.numbers.mode_riccati import ModeSystem
 from heliograph.planning.transmitters import powers_of_law, transmitter_names
-from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import MarkovChain, stationary
 from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
 from heliograph.random_affine.moments.second_moments import has_known_mean, second_order
 from heliograph.simulation.network import Network

@@ -14,7 +14,7 @@ from heliograph.planning.moments import check_design_plant, measurement_moment, 
 from heliograph.planning.paths.model import Paths, Plants
 from heliograph.planning.transmitters import compute_sent_powers
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Stack, maps_in_series
+from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.mixture import Mixture
 from heliograph.simulation.network import Network
@@ -79,7 +79,7 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
     Raises:
         ValueError: a channel that is not made of independent chains, each for one number.
     """
-    head, *rest = maps_in_series(channel)
+    head, *rest = channel.in_series
     # Wires multiply what is carried.
     while isinstance(head, GainAndNoise) and not head.transmits:
         rows = np.asarray(head.matrix) @ rows
@@ -105,7 +105,7 @@ def _chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], p
         # An unobserved loss is fading.
         if isinstance(affine, Mixture):
             inner, lost = _loss(affine)
-            parts, fading = [*maps_in_series(inner), *parts], fading * lost
+            parts, fading = [*inner.in_series, *parts], fading * lost
             continue
         if not isinstance(affine, GainAndNoise):
             raise _unfit(type(affine).__name__)

@@ -11,8 +11,8 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
 from heliograph.numerics.traced import describe_rounded, is_traced
-from heliograph.random_affine.base import memories
 from heliograph.random_affine.composite import ARROW, DIRECT
+from heliograph.random_affine.memory import memories
 from heliograph.simulation.claims import beliefs
 from heliograph.simulation.description.single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
