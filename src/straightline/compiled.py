@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
-from straightline.limits import ALONE, LITTLE, MADE
+from straightline.limits import ALONE, LITTLE, LONGEST
 from straightline.llvm.module import LINE, Code, written
 from straightline.machine import Machine, Tiers, features, generated, narrow
 from straightline.nodes import Unsupported
@@ -181,7 +181,7 @@ def compile(
     function: Callable[..., PyTree],
     *examples: PyTree,
     shared: Sequence[int] = (),
-    most: int = MADE,
+    most: int | None = None,
     single: bool = False,
 ) -> Compiled:
     """Compile a JAX function of one run's arrays for many runs, in double precision or in single.
@@ -204,7 +204,7 @@ def compile(
     """
     features()  # refuses a processor that LLVM does not know
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
-    return Compiled(lower(function, *examples, most=most, single=single), differs)
+    return Compiled(lower(function, *examples, most=most or 2 * LONGEST, single=single), differs)
 
 
 def compile_one(

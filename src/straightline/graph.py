@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from typing import Any
 
 from straightline.folding import COMMUTATIVE, DTYPES, folded
-from straightline.limits import MADE
+from straightline.limits import LONGEST
 from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, Unsupported
 
 
 class Graph:
     """A program under construction, of `most` nodes. Nodes are made in `current`, the innermost open block."""
 
-    def __init__(self, most: int = MADE) -> None:
+    def __init__(self, most: int = 2 * LONGEST) -> None:
         self.most = most
         self.top = Block(None)
         self.current = self.top

@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from jaxtyping import PyTree
 
 from straightline.graph import Graph
-from straightline.limits import MADE, TABLE
+from straightline.limits import LONGEST, TABLE
 from straightline.memory import InMemory
 from straightline.nodes import TYPES, Buffer, Key, Node, Type, Unsupported
 
@@ -35,7 +35,7 @@ IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in me
 class Lowering:
     """Lowering of operations one after another into a graph."""
 
-    def __init__(self, most: int = MADE) -> None:
+    def __init__(self, most: int = 2 * LONGEST) -> None:
         self.graph = Graph(most)
         self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
         self.sizes: dict[Jaxpr, int] = {}  # of programs within loops and branches

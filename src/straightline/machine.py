@@ -9,7 +9,7 @@ from threading import Lock, current_thread, main_thread
 import jax
 import llvmlite.binding as llvm
 
-from straightline.limits import LARGE, OFTEN, SMALL
+from straightline.limits import OFTEN
 from straightline.llvm.module import Source
 from straightline.lowering import refusing, say
 from straightline.nodes import Unsupported
@@ -63,11 +63,6 @@ class Machine:
         self.engine.add_object_file(code)
         self.engine.finalize_object()
         self.run: Function = SIGNATURE(self.engine.get_function_address("run"))
-
-
-def often(operations: int) -> float:
-    """Return the executions after which care pays for a program of so many operations."""
-    return OFTEN * min(max(operations, SMALL), LARGE) / LARGE
 
 
 def narrow(width: int) -> int:
@@ -139,7 +134,7 @@ class Tiers:
             machine = self._first(self._executions)
             if machine.level < self._level(self._executions):
                 self._careful = self._careful or background().submit(_with_care, self._source, self._widths[1], machine)
-                if executions >= often(self._source.operations) or self._careful.done():
+                if executions >= OFTEN or self._careful.done():
                     self._machine = machine = self._careful.result()
             return machine
 
@@ -154,5 +149,5 @@ class Tiers:
         return blocks * self._source.work / max(self._source.operations, 1)
 
     def _level(self, executions: float) -> int:
-        pays = executions >= often(self._source.operations)
+        pays = executions >= OFTEN
         return int(pays and not jax.config.values["jax_disable_most_optimizations"])

@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
 from straightline.graph import Graph
-from straightline.limits import MADE, TABLE
+from straightline.limits import LONGEST, TABLE
 from straightline.lowering import Lowering, Value, array_of, keys_of, traced, type_of
 from straightline.memory import InMemory
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store
@@ -57,7 +57,7 @@ Known = Mapping[int, tuple[np.ndarray, np.ndarray]]  # number of a leaf -> which
 def lower(
     function: Callable[..., PyTree],
     *examples: PyTree,
-    most: int = MADE,
+    most: int = 2 * LONGEST,
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
@@ -68,7 +68,7 @@ def lower(
 def lower_traced(
     traced: ClosedJaxpr,
     tree: Any,
-    most: int = MADE,
+    most: int = 2 * LONGEST,
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:

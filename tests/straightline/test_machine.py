@@ -14,8 +14,8 @@ import pytest
 
 from straightline import compiled
 from straightline.compiled import Alone, compile
-from straightline.limits import LARGE, OFTEN, SMALL
-from straightline.machine import background, often
+from straightline.limits import OFTEN
+from straightline.machine import background
 from straightline.nodes import Node
 from straightline.program import lower
 
@@ -55,7 +55,7 @@ def level(code):
 def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code):
     """Two blocks of 500 steps a call; the numbers are the same bits before and after."""
     source = code.code.blocks
-    count = -(-often(source.operations) // (2 * source.work / source.operations))
+    count = -(-OFTEN // (2 * source.work / source.operations))
     calls = [code(STARTS) for _ in range(int(count) - 1)]
     assert level(code) == 0
     calls.append(code(STARTS))
@@ -70,7 +70,7 @@ def test_calls_go_on_in_haste_while_care_is_taken(code):
     released, source = Event(), code.code.blocks
     background().submit(released.wait, 60)
     code(STARTS)
-    enough = often(source.operations) * source.operations / source.work  # blocks
+    enough = OFTEN * source.operations / source.work  # blocks
     hasty = code.blocks.machine(enough / 2)
     assert code.blocks.machine(enough / 2) is hasty and hasty.level == 0
     released.set()
@@ -89,16 +89,6 @@ def test_code_in_haste_goes_on_where_care_fails_and_it_is_said_once(code, monkey
         again = code(STARTS)
     for a, b in zip(*map(jax.tree.leaves, (before, again)), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_small_programs_wait_less_for_care():
-    assert [OFTEN / often(n) for n in (1, SMALL, LARGE // 2, LARGE, 10 * LARGE)] == [
-        LARGE / SMALL,
-        LARGE / SMALL,
-        2,
-        1,
-        1,
-    ]
 
 
 def test_a_call_that_executes_its_code_often_waits_for_care(code):

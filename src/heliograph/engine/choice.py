@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from heliograph.engine.limits import LONG, SHORT
+from heliograph.engine.limits import SHORT
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.process.collector import no_collector
@@ -79,20 +79,20 @@ def refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     if setting() == "xla":
         return ""
     with jax.enable_x64(True):
-        return _find_code(function, arguments, [False] * len(arguments), LONG).why
+        return _find_code(function, arguments, [False] * len(arguments)).why
 
 
 def chosen(
-    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int = LONG
+    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
 ) -> Choice:
     """Return the code of a function of one run for arguments like these, compiled once; or why there is none.
 
-    XLA computes a program of more than `most` operations, unless native code is forced.
+    XLA computes a program of more than `most` operations, where it is said, unless native code is forced.
     """
     engine = setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
-    choice = _find_code(function, arguments, differs, LONG if engine == "native" else most)
+    choice = _find_code(function, arguments, differs, None if engine == "native" else most)
     if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
         choice = Choice(None, why)
     if choice.code is None and engine == "native":
@@ -101,7 +101,7 @@ def chosen(
 
 
 def compute_once(
-    function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree], most: int = LONG
+    function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree], most: int | None = None
 ) -> PyTree:
     """Compute a function once, in double precision, as NumPy arrays: by native code where it supports the function.
 
@@ -109,7 +109,7 @@ def compute_once(
         function: a function of trees of arrays.
         by_xla: the same function compiled by XLA, which computes it elsewhere.
         arguments: its arguments.
-        most: operations above which XLA computes.
+        most: operations above which XLA computes; those that native code takes by default.
     """
     with jax.enable_x64(True):
         choice = chosen(function, arguments, [False] * len(arguments), most)
@@ -165,7 +165,7 @@ def try_native(make: Callable[[], Code]) -> Code | None:
 
 
 def _find_code(
-    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int
+    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
 ) -> Choice:
     """Return code for the structure of a function and its arguments, which may be objects with arrays."""
     # Arrays become arguments; all other leaves are part of the cached key.
@@ -199,7 +199,7 @@ class _Array(NamedTuple):
 @lru_cache(COMPILED)
 @make_room
 @no_collector()
-def _compile_structure(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Any, str]:
+def _compile_structure(form: Any, kinds: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
     """Compile code for one structure, and the shapes and types of its arrays."""
     arrays = [k for k in kinds if isinstance(k, _Array)]
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.limits import DEAR, SHARE
+from straightline.limits import DEAR
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, array_of
 from straightline.nodes import Block, Guard, Key, Node
 from straightline.rules.elementwise import select
@@ -70,8 +70,7 @@ def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     sizes = [size_of(lowering, branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}
     for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
-        cheap = SHARE * sizes[k] <= max(sizes)
-        results[k] = _branch(lowering, conditions[k], branches[k], inputs[1:], cheap)
+        results[k] = _branch(lowering, conditions[k], branches[k], inputs[1:])
     # Select the results of the branch that is taken.
     chosen = results[len(branches) - 1]
     for k in reversed(range(len(branches) - 1)):
@@ -91,7 +90,7 @@ def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
     return [below[0], *between, graph.node("not", "bool", below[-1])]
 
 
-def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value], cheap: bool) -> list[np.ndarray]:
+def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
     """Compute a branch in the open block if it has few nodes, else in a guarded one."""
     graph, outer = lowering.graph, lowering.graph.current
     graph.current = block = Block(outer, pinned=True)
@@ -99,7 +98,7 @@ def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value
         results = [lowering.nodes(x) for x in lowering.inline(branch, inputs)]
     finally:
         graph.current = outer
-    if cheap or _size(block) <= DEAR:
+    if _size(block) <= DEAR:
         _dissolve(block, outer)
         return results
     guard = Guard(block, condition)

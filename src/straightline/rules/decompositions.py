@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from straightline.limits import ROWS
+from straightline.limits import FEW
 from straightline.lowering import IN_MEMORY, Lowering, Value, array_of, like, result_shape
 from straightline.nodes import Unsupported
 
@@ -122,7 +122,7 @@ def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -
 def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
-    if shape[-1] > ROWS or equation.params.get("subset_by_index") is not None:
+    if shape[-1] > FEW or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
     return _of_each(lowering, _program(shape[-1], avals[0].dtype), equation, inputs[0])
 
@@ -190,7 +190,7 @@ def permutation(pivots: jax.Array, size: int) -> jax.Array:
 def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
-    if shape[-2] != shape[-1] or shape[-1] > ROWS:
+    if shape[-2] != shape[-1] or shape[-1] > FEW:
         raise Unsupported(f"factors of a matrix of shape {shape[-2:]}")
     return _of_each(lowering, _lu_program(shape[-1], avals[0].dtype), equation, inputs[0])
 

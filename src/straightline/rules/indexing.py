@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.limits import PLACES
+from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, known_integers
 from straightline.memory import contiguous
 from straightline.nodes import Unsupported
@@ -65,7 +65,7 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
     column = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
     axis = numbers.start_index_map[column]
     last = x.shape[axis] - sizes[axis]
-    if last >= PLACES:
+    if last >= FEW:
         return _from_memory(lowering, equation, x, indices, column)
     cases = [_clipped(equation, lowering, x, _with(lowering, indices, column, n)) for n in range(last + 1)]
     selected = cases[-1].copy()

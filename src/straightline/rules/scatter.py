@@ -10,7 +10,7 @@ from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
 from straightline.graph import Graph
-from straightline.limits import CHANGED
+from straightline.limits import WRITTEN_OUT
 from straightline.lowering import RULES, Lowering, Rule, known_integers
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
@@ -72,7 +72,7 @@ def _by_cases(
     for row in np.ndindex(*indices.shape[:-1]):
         for start, here in _starts(graph, equation, x.shape, sizes, row, indices[row]):
             count += math.prod(sizes)
-            if count > CHANGED:
+            if count > WRITTEN_OUT:
                 raise Unsupported(f"{equation.primitive.name} at one of many places that data decide")
             for entry in np.ndindex(*windows.shape[len(row) :]):
                 place = list(start)

@@ -7,7 +7,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.limits import PLACES
+from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, Rule, array_of, result_shape
 from straightline.nodes import Node, Unsupported
 
@@ -93,7 +93,7 @@ def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[n
     for axis, start in enumerate(starts):
         last = x.shape[axis] - update.shape[axis]
         if last and start.op != "constant":
-            if last >= PLACES:
+            if last >= FEW:
                 raise Unsupported(f"one of {last + 1} places that data decide")
             known = [s if a != axis else None for a, s in enumerate(starts)]
             cases = [_updated(lowering, x, update, known, first) for first in range(last + 1)]

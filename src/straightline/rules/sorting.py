@@ -4,7 +4,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.limits import ROWS
+from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, type_of
 from straightline.nodes import REAL, Node, Unsupported
 from straightline.rules.elementwise import select
@@ -14,7 +14,7 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     """Sort along an axis by the first array, and what comes with it; equal numbers keep their order, NaN is last."""
     axis, graph = equation.params["dimension"], lowering.graph
     count, kind = inputs[0].shape[axis], type_of(equation.invars[0].aval)
-    if equation.params["num_keys"] != 1 or kind == "bool" or count > ROWS:
+    if equation.params["num_keys"] != 1 or kind == "bool" or count > FEW:
         raise Unsupported("sort")
     moved = [np.moveaxis(x, axis, -1).copy() for x in inputs]
     for index in np.ndindex(*moved[0].shape[:-1]):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.limits import LOADED, PLACES, TABLE
+from straightline.limits import FEW, LOADED, TABLE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, result_shape
 from straightline.memory import InMemory, contiguous
 from straightline.nodes import Buffer, Key, Node
@@ -85,7 +85,7 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
     x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.scalar(x) for x in inputs[1:]]
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last = x.shape[axis] - size
-        if start.op != "constant" and last >= PLACES:
+        if start.op != "constant" and last >= FEW:
             return _dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
         x = _window(lowering, x, axis, start, size) if last else x
     return [x]
@@ -106,7 +106,7 @@ def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
     if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
         return x
     flat = x.ravel().tolist()
-    if any(isinstance(n, Key) for n in flat) or not (len(flat) > PLACES or all(n.op == "constant" for n in flat)):
+    if any(isinstance(n, Key) for n in flat) or not (len(flat) > FEW or all(n.op == "constant" for n in flat)):
         return x
     return in_memory(lowering, x)
 

@@ -45,7 +45,7 @@ def test_both_engines_have_the_same_numbers(monkeypatch):
 
 @pytest.mark.parametrize(
     ("rule", "nodes", "long"),
-    [(TraceIntersection(), 240, False), (TraceIntersection(), 260, True), (MatrixWeights(), 20, False),
+    [(TraceIntersection(), 240, False), (TraceIntersection(), 267, True), (MatrixWeights(), 20, False),
      (MatrixWeights(), 21, True)],
 )  # fmt: skip
 def test_graphs_by_the_hundred_are_left_to_xla(rule, nodes, long):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.limits import MESH_NUMBERS, MESH_ROWS
+from heliograph.engine.limits import MESH
 from heliograph.fusion.cross_covariance import Motion, Observation, propagate_state
 from heliograph.fusion.intersection import invert
 from heliograph.fusion.mesh.gains import (
@@ -115,8 +115,9 @@ class Mesh(Module):
     def is_long(self) -> bool:
         """Return whether a step has too many operations for native code, in which they are written one by one."""
         n = len(first(self.plant).states)
-        sent = self.edges.rounds * np.count_nonzero(self.edges.present) * n * n
-        return bool(sent > MESH_NUMBERS or (self.needs_joint and len(self.senders) * n > MESH_ROWS))
+        sent = self.edges.rounds * int(np.count_nonzero(self.edges.present)) * n * n
+        rows = len(self.senders) * n if self.needs_joint else 0
+        return max(sent, 2 * rows**2) > MESH
 
     def init(self) -> MeshState:
         """Return the state before the first step: the plant's mean and covariance at every node."""
