@@ -8,12 +8,13 @@ import numpy as np
 
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.sensor import AnySensor
+from heliograph.model.over_time import OverTime, at_each_step
+from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.components import Branches
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Independent
@@ -94,19 +95,16 @@ def separate_outlier_noise(
     Raises:
         ValueError: components of the noise that are correlated or mixed by the channel, no noise that could be weighed.
     """
-    steps = max((model.steps for model in (sensor, channel) if isinstance(model, OverTime)), default=None)
-    if steps is None:
-        left, noise = first(channel).detach_outliers()
-        plain = Polytope().describe(left)
-        return plain, describe_outlier_noise(first(sensor).noise, noise, plain, apart)
-    channels = unstack(channel) if isinstance(channel, OverTime) else [channel] * steps
-    pieces = [step.detach_outliers() for step in channels]
-    plains = [Polytope().describe(left) for left, _ in pieces]
-    noises = [
-        describe_outlier_noise(at(sensor, k).noise, noise, plain, apart)
-        for k, ((_, noise), plain) in enumerate(zip(pieces, plains, strict=True))
-    ]
-    return over_time(plains) if isinstance(channel, OverTime) else plains[0], over_time(noises)
+
+    def describe(step: AbstractRandomAffine) -> SecondOrder:
+        return Polytope().describe(step.detach_outliers()[0])
+
+    def arriving(sensor: AbstractSensor, step: AbstractRandomAffine, plain: SecondOrder) -> ReceivedNoise:
+        return describe_outlier_noise(sensor.noise, step.detach_outliers()[1], plain, apart)
+
+    plain: SecondOrder | OverTime = at_each_step(describe, channel)
+    noise: ReceivedNoise | OverTime = at_each_step(arriving, sensor, channel, plain)
+    return plain, noise
 
 
 def describe_outlier_noise(

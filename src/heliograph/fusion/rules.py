@@ -24,7 +24,7 @@ from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
 from heliograph.fusion.report_link import ReportLink, ReportLinks, check_reports
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
-from heliograph.model.over_time import OverTime, first, stack
+from heliograph.model.over_time import first, stack, stacked
 from heliograph.model.plant import AnyPlant, angles_among
 from heliograph.numerics.angle import nearest, wrap_angles
 from heliograph.numerics.check import (
@@ -390,7 +390,7 @@ class Fusion(Module):
         if self.quantizer is None:
             return self.rule.claim(claims)
         quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
-        kind = quantizer.values if isinstance(quantizer, OverTime) else quantizer
+        kind = stacked(quantizer)
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.linear.system import LinearSystem, Steps, repeat_last
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.over_time import OverTime, first, unstack
+from heliograph.model.over_time import OverTime, first, list_steps, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
@@ -371,10 +371,8 @@ def _maps_of_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
 def each_step(model: T | OverTime, horizon: int) -> list[T]:
     """A plant, sensor or channel at each of `horizon` steps."""
     check_horizon(horizon)
-    if not isinstance(model, OverTime):
-        return [model] * horizon
-    check_horizon(horizon, model.steps)
-    return unstack(model)[:horizon]
+    check_horizon(horizon, steps_covered(model))
+    return list_steps(model, horizon)
 
 
 def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int = 1) -> None:

@@ -10,7 +10,6 @@ from heliograph.model.over_time import first
 from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import check_maps
-from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.memory import memories
@@ -55,7 +54,7 @@ def modal_system(
     for name, size in sizes.items():
         if size != n:
             raise fail(name, f"{n}, the move's inputs", size)
-    if not all(isinstance(m, MarkovChain) for m in memories(move).values()):
+    if any(memory.drifts for memory in memories(move).values()):
         raise fail("move", "chains as its memories", "a gain that drifts")
     # Homogeneous coordinates y~ = (y, 1).
     mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)

@@ -308,7 +308,7 @@ def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
     start, senses = first(plant), first(sensor)
     check_turns("sensor of a plant", senses.measure, start.initial_mean, start.angles, senses.angles)
-    steps = unstack(channel) if isinstance(channel, OverTime) and senses.circular else [first(channel)]
+    steps = unstack(channel) if senses.circular else [first(channel)]
     results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
     if len(results) > 1:
         raise fail("channel", "the same angles at every step", sorted(results))

@@ -229,4 +229,4 @@ def memory_matters(channel: Channel) -> bool:
 
 def uncertain_chain(channel: Channel) -> bool:
     """Return whether a chain in the channel is known only within a radius."""
-    return any(np.any(m.radius > 0) for m in memories(channel).values() if isinstance(m, MarkovChain))
+    return any(memory.is_uncertain for memory in memories(channel).values())

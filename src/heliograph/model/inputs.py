@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, OfInputs, matrix_of
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
 from heliograph.numerics.linalg import rounding
@@ -97,7 +97,7 @@ def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
     """Yield what a model object holds of a class of models, constant or over time."""
 
     def is_part(part: object) -> bool:
-        return isinstance(part.values if isinstance(part, OverTime) else part, kind)
+        return isinstance(stacked(part), kind)
 
     yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
 

@@ -128,6 +128,21 @@ def unstack(model: object) -> list[PyTree]:
     return [at(model, i) for i in range(model.steps)] if isinstance(model, OverTime) else [model]
 
 
+def restack(steps: Sequence[T], *models: object) -> T | OverTime:
+    """Return an object for each step as one that varies over time; the first alone where none of the models varies."""
+    return steps[0] if steps_covered(models) is None else over_time(steps)
+
+
+def list_steps(model: PyTree, count: int) -> list[PyTree]:
+    """List the objects of the first `count` steps, the same one at each where it does not vary."""
+    return unstack(model)[:count] if isinstance(model, OverTime) else [model] * count
+
+
+def stacked(model: PyTree) -> PyTree:
+    """Return what varies over time as one object whose arrays have a first axis of time; another as it is."""
+    return model.values if isinstance(model, OverTime) else model
+
+
 def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
     """function(*items), or an `OverTime` of its results where some item varies."""
     steps = steps_covered(items)

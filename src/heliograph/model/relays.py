@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import OverTime, at, first, steps_covered
+from heliograph.model.over_time import at, first, stacked, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
@@ -203,7 +203,7 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
 
 def _tile(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
     """One array of a plant or sensor for each step."""
-    value = np.asarray(read(model.values if isinstance(model, OverTime) else model), dtype=np.float64)
+    value = np.asarray(read(stacked(model)), dtype=np.float64)
     if value.ndim == dimensions + 1:
         return value[:horizon]
     return np.broadcast_to(value, (horizon, *value.shape))

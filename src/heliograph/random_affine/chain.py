@@ -59,6 +59,16 @@ class AbstractMemory(Module):
     name: eqx.AbstractVar[str | None]
     identity: eqx.AbstractVar[str]
 
+    @property
+    def drifts(self) -> bool:
+        """True if the state is a number that drifts, False if it is one of finitely many modes."""
+        return False
+
+    @property
+    def is_uncertain(self) -> bool:
+        """True if its law is known only within a radius."""
+        return False
+
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw the initial state."""
         raise unwritten(self, "begin")
@@ -135,6 +145,11 @@ class MarkovChain(AbstractMemory):
         self.initial = stationary(rows) if initial is None else probabilities("initial law", initial, len(rows))
         self.name, self.identity = name, _identify_memory(name)
 
+    @property
+    def is_uncertain(self) -> bool:
+        """True if some transition has a radius."""
+        return bool(np.any(self.radius > 0))
+
     def covers(self, own: "MarkovChain") -> bool:
         """Test whether another chain is this memory, its transition within the radius."""
         if own.identity != self.identity or not equal_to_rounding(self.initial, own.initial):
@@ -186,6 +201,11 @@ class Autoregression(AbstractMemory):
     def __init__(self, correlation: "Float[ArrayLike, '']", name: str | None = None):
         self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
         self.name, self.identity = name, _identify_memory(name)
+
+    @property
+    def drifts(self) -> bool:
+        """Always True."""
+        return True
 
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw N(0, 1)."""

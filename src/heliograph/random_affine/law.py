@@ -11,11 +11,13 @@ from math import gamma
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import special
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics import check
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, radii, scalar
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable, same, unwritten
 from heliograph.numerics.traced import equal_to_rounding, is_traced, library, plain, scipy_for, stack_parts, within
 from heliograph.numerics.types import ArrayLike, Float
@@ -23,6 +25,7 @@ from heliograph.numerics.types import ArrayLike, Float
 Scalar = Float[jax.Array | np.ndarray, ""]
 Vector = Float[jax.Array | np.ndarray, " n"]
 
+DRAWS = 2**14  # of a law that nobody knows but by its samples
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
@@ -66,6 +69,19 @@ class AbstractLaw(Module):
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
         """List probability and value of each of finitely many gains; by default a refusal."""
         raise fail("mixture filter", "gains of finitely many values", type(self).__name__)
+
+    def quantile(self, probability: Vector) -> np.ndarray:
+        """Gains below which these probabilities lie; by default those of DRAWS samples.
+
+        Raises:
+            ValueError: a law that cannot be sampled.
+        """
+        return np.asarray(np.quantile(self._draw_values(), probability))
+
+    @in_float64
+    def _draw_values(self) -> np.ndarray:
+        values: np.ndarray = np.asarray(jax.vmap(self.sample)(jax.random.split(jax.random.key(0), DRAWS)))
+        return values
 
     def mean_law(self) -> "Constant":
         """Return the constant law at E[g], for a filter that takes the mean gain as the true one."""
@@ -217,6 +233,10 @@ class Rayleigh(AbstractLaw):
         """Return scale^k 2^(k/2) Gamma(1 + k/2)."""
         return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2))
 
+    def quantile(self, probability: Vector) -> np.ndarray:
+        """Return scale sqrt(-2 log(1 - p))."""
+        return np.asarray(np.sqrt(-2 * np.log1p(-probability)) * float(self.scale))
+
 
 class Rician(AbstractLaw):
     """Rician fading: a line of sight of amplitude `sight` plus scatter of standard deviation `scale` per part."""
@@ -237,6 +257,12 @@ class Rician(AbstractLaw):
         """Return scale^k 2^(k/2) Gamma(1 + k/2) L_(k/2)(-sight^2 / (2 scale^2)), L the Laguerre function."""
         shape = _laguerre(order, ((self.sight / self.scale) ** 2) / 2)
         return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2) * shape)
+
+    def quantile(self, probability: Vector) -> np.ndarray:
+        """Return scale sqrt of the quantile of the noncentral chi-squared law of 2 degrees."""
+        return np.asarray(
+            np.sqrt(special.chndtrix(probability, 2, (float(self.sight) / float(self.scale)) ** 2)) * float(self.scale)
+        )
 
 
 def _laguerre(order: int, x: Scalar) -> Scalar:
@@ -278,6 +304,12 @@ class Nakagami(AbstractLaw):
         ratio = library(self.shape).exp(gammaln(self.shape + order / 2) - gammaln(self.shape))
         return plain(ratio * (self.power / self.shape) ** (order / 2))
 
+    def quantile(self, probability: Vector) -> np.ndarray:
+        """Return the root of the quantile of the gamma law of g^2."""
+        return np.asarray(
+            np.sqrt(special.gammaincinv(float(self.shape), probability) * float(self.power) / float(self.shape))
+        )
+
 
 class LogNormal(AbstractLaw):
     """Shadowing: log g is Gaussian with `log_mean` and `log_deviation`."""
@@ -297,6 +329,10 @@ class LogNormal(AbstractLaw):
         """Return exp(k mu + k^2 sigma^2 / 2)."""
         exponent = order * self.log_mean + (order * self.log_deviation) ** 2 / 2
         return plain(library(exponent).exp(exponent))
+
+    def quantile(self, probability: Vector) -> np.ndarray:
+        """Return exp(log_mean + log_deviation t) with t the normal quantile."""
+        return np.asarray(np.exp(float(self.log_mean) + float(self.log_deviation) * special.ndtri(probability)))
 
 
 class GivenMoments(AbstractLaw):

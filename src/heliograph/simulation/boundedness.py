@@ -24,7 +24,6 @@ from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, Outcome
-from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes, long_run_law
@@ -119,7 +118,7 @@ def _links(network: Network, states: int) -> JointLinks:
     # Channels in parallel, as one chain of modes.
     joint = parallel(channels) if len(channels) > 1 else channels[0]
     for memory in memories(joint).values():
-        if isinstance(memory, MarkovChain) and np.any(memory.radius > 0):
+        if memory.is_uncertain:
             raise fail("boundedness", "chains of known transition", "one whose probabilities are uncertain")
     modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)

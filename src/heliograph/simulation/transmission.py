@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import OverTime, at, first, steps_covered
+from heliograph.model.over_time import at, first, steps_covered
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance, rank
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -103,7 +103,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
 def _separate_delays(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values (steps, m), and the delay of each (steps,)."""
     channel = node.channel if isinstance(node, Node) else None
-    link = at(channel, 0) if isinstance(channel, OverTime) else channel
+    link = first(channel)
     if link is None or not link.past:
         return z, np.zeros(len(z))
     if isinstance(link, Delayed) and link.timestamped:

@@ -25,9 +25,9 @@ from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.modes.uncertain import UncertainModalFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
-from heliograph.model.over_time import OverTime, first, over_time, unstack
-from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs, Plant
-from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
+from heliograph.model.over_time import OverTime, at_each_step, first, stacked
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, OfInputs, Plant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -133,8 +133,11 @@ def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNois
 
 def rescaled_plant(plant: AnyPlant, units: Units) -> AnyPlant:
     """Return the plant of S x, with inputs U u."""
-    if isinstance(plant, OverTime):
-        return over_time([rescaled_plant(single, units) for single in unstack(plant)])
+    rescaled: AnyPlant = at_each_step(lambda step: _rescale_plant(step, units), plant)
+    return rescaled
+
+
+def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
     s, u = units.states, units.inputs
     law = _noise(plant.deviation, s) if plant.deviation is not None else np.outer(s, s) * plant.initial_covariance
     center = s * (plant.initial_mean - (plant.deviation.mean if plant.deviation is not None else 0.0))
@@ -152,8 +155,11 @@ def rescaled_plant(plant: AnyPlant, units: Units) -> AnyPlant:
 
 def rescaled_sensor(sensor: AnySensor, units: Units) -> AnySensor:
     """Return the sensor that measures R y of S x."""
-    if isinstance(sensor, OverTime):
-        return over_time([rescaled_sensor(single, units) for single in unstack(sensor)])
+    rescaled: AnySensor = at_each_step(lambda step: _rescale_sensor(step, units), sensor)
+    return rescaled
+
+
+def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
     s, r = units.states, units.outputs
     if isinstance(sensor, LinearSensor):
         return LinearSensor(r[:, None] * sensor.matrix / s, _noise(sensor.noise, r), sensor.outputs, sensor.circular)
@@ -161,9 +167,8 @@ def rescaled_sensor(sensor: AnySensor, units: Units) -> AnySensor:
 
 
 def _channel(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
-    if isinstance(channel, OverTime):
-        return over_time([rescaled_channel(single, units) for single in unstack(channel)])
-    return rescaled_channel(channel, units)
+    rescaled: SecondOrder | OverTime = at_each_step(lambda step: rescaled_channel(step, units), channel)
+    return rescaled
 
 
 def rescaled_channel(channel: SecondOrder, units: Units) -> SecondOrder:
@@ -187,7 +192,7 @@ def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.nd
 
 def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
     """Return the description of z = Q G R^-1 y + Q n for each mode."""
-    values: Modes = channel.values if isinstance(channel, OverTime) else channel
+    values: Modes = stacked(channel)
     of_mean, of_spread = _scale_channel(units)
     noise = Columns(units.received[:, None] * values.noise.matrix, values.noise.weights)
     gains = of_spread * values.gain_spread
@@ -196,7 +201,7 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
 
 
 def _components(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
-    values = components.values if isinstance(components, OverTime) else components
+    values = stacked(components)
     q = units.received
     scaled = AtomCombinations(
         values.weight,

@@ -14,14 +14,13 @@ from heliograph.filters.modes.patterns import SideInformation, describe_by_patte
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, lower_to_upper
 from heliograph.model.fading import uncertain_chain
-from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.over_time import OverTime, first, restack, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
@@ -105,12 +104,12 @@ def event_filter(
 
 def _describe_channel(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:
     """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities."""
-    drifting = [memory for memory in memories(first(channel)).values() if not isinstance(memory, MarkovChain)]
+    drifting = [memory for memory in memories(first(channel)).values() if memory.drifts]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
     steps = [joint_modes(step) for step in unstack(channel)]
     parts = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
-    return over_time(parts) if isinstance(channel, OverTime) else parts[0], np.asarray(steps[0].initial)
+    return restack(parts, channel), np.asarray(steps[0].initial)
 
 
 def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:

@@ -32,13 +32,15 @@ from heliograph.filters.gaussian.scores import (
 )
 from heliograph.filters.robust_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, over_time
+from heliograph.model.over_time import OverTime, at, at_each_step
 from heliograph.model.premises.premise import believing
+from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.density import log_density
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.moments.second_moments import SecondOrder
 
 ITERATIONS = 5
 PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: as much as six noises of the filter's own variance say
@@ -255,12 +257,9 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
 
 def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
     """Find the sensor's noise as it arrives behind the filter's channel."""
-    steps = [model.steps for model in (filter.sensor, filter.channel) if isinstance(model, OverTime)]
-    if not steps:
-        return describe_outlier_noise(at(filter.sensor, 0).noise, None, at(filter.channel, 0), True)
-    return over_time(
-        [
-            describe_outlier_noise(at(filter.sensor, k).noise, None, at(filter.channel, k), True)
-            for k in range(max(steps))
-        ]
-    )
+
+    def arriving(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
+        return describe_outlier_noise(sensor.noise, None, channel, True)
+
+    noise: ReceivedNoise | OverTime = at_each_step(arriving, filter.sensor, filter.channel)
+    return noise

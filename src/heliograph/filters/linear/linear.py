@@ -23,7 +23,7 @@ from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
-from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
@@ -178,7 +178,7 @@ def linear_filter(
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
-    whole = described.values if isinstance(described, OverTime) else described
+    whole = stacked(described)
     start = first(plant)
     return LinearFilter(
         plant=plant,

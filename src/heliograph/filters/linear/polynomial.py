@@ -19,7 +19,7 @@ from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import uncertain_chain
-from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered, unstack
+from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
@@ -68,8 +68,11 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> MeanBefor
 
 def centre_plant(plant: AnyPlant) -> AnyPlant:
     """Return the plant of the centred state x_k - E[x_k]."""
-    if isinstance(plant, OverTime):
-        return over_time([centre_plant(step) for step in unstack(plant)])
+    centred: AnyPlant = at_each_step(_centre_plant, plant)
+    return centred
+
+
+def _centre_plant(plant: AbstractPlant) -> LinearPlant:
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     n = len(plant.states)

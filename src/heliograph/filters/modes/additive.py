@@ -40,7 +40,7 @@ from heliograph.filters.modes.modal import (
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, first, restack, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
@@ -260,4 +260,4 @@ def independent_terms(channel: Channel) -> list[Channel]:
     steps = [terms_without_common_memory(step) for step in unstack(channel)]
     if len({len(terms) for terms in steps}) > 1 or len(steps[0]) == 1:
         return [channel]
-    return [over_time(list(parts)) if isinstance(channel, OverTime) else parts[0] for parts in zip(*steps, strict=True)]
+    return [restack(parts, channel) for parts in zip(*steps, strict=True)]

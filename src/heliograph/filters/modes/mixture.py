@@ -29,7 +29,7 @@ from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, first, list_steps, restack, steps_covered
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
@@ -40,7 +40,6 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import Autoregression
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.components import COMPONENT_LIMIT
 from heliograph.random_affine.hop import GainAndNoise
@@ -216,15 +215,10 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     # All combinations of atoms, mode by mode, for each step where they vary.
     angles = find_received_angles(plant, sensor, channel)
     floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
-    if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):
-        modes = [_joint_modes_of(channel)]
-        components: AtomCombinations | OverTime = _list_combinations(sensor, modes[0], modes[0], floor)
-    else:
-        steps = min(model.steps for model in (sensor, channel) if isinstance(model, OverTime))
-        sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
-        modes = [_joint_modes_of(c) for c in channels if isinstance(c, AbstractRandomAffine)]
-        items = zip(sensors, modes, [modes[0], *modes[:-1]], strict=True)
-        components = over_time([_list_combinations(s, now, before, floor) for s, now, before in items])
+    steps = steps_covered((sensor, channel)) or 1
+    modes = [_joint_modes_of(now) for now in list_steps(channel, steps)]
+    items = zip(list_steps(sensor, steps), modes, [modes[0], *modes[:-1]], strict=True)
+    components = restack([_list_combinations(*item, floor) for item in items], sensor, channel)
     return MixtureFilter(
         plant=plant,
         components=components,
@@ -236,7 +230,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
 
 def _joint_modes_of(channel: AbstractRandomAffine) -> JointModes:
     """Combine a channel's memories in one chain; raise ValueError for a gain that drifts."""
-    if any(isinstance(memory, Autoregression) for memory in memories(channel).values()):
+    if any(memory.drifts for memory in memories(channel).values()):
         raise fail("mixture filter", "gains of finitely many values", "one that drifts")
     return joint_modes(channel)
 

@@ -32,7 +32,7 @@ from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, first, restack, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
@@ -384,12 +384,9 @@ def build_from_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel:
 
 def channels_by_mode(channel: Channel) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
     """Law of the modes at the first step, and the observation model of each; links without memory have one mode."""
-    if not isinstance(channel, OverTime):
-        modes = joint_modes(channel)
-        return modes.initial, channel_by_mode(modes, modes)
     steps = [joint_modes(c) for c in unstack(channel)]
     models = [channel_by_mode(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    return steps[0].initial, over_time(models)
+    return steps[0].initial, restack(models, channel)
 
 
 def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:

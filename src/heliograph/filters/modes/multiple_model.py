@@ -44,7 +44,7 @@ from heliograph.filters.modes.patterns import SideInformation, describe_by_patte
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, first, restack, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
@@ -103,7 +103,7 @@ def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], Si
     parts = describe_by_pattern(steps, no_flags)
     for step in parts if len(no_flags) > 1 else []:
         _check_random(step)
-    return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]
+    return steps[0].initial, restack(parts, channel)
 
 
 def _check_random(channel: SideInformation) -> None:

@@ -38,7 +38,7 @@ from heliograph.filters.modes.patterns import SideInformation, append_flag, desc
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import uncertain_chain, with_flag
-from heliograph.model.over_time import OverTime, at, at_each_step, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, at_each_step, first, restack, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
@@ -348,7 +348,7 @@ def side_information_filter(
     filter = SideInformationFilter(
         plant=plant,
         sensor=sensor,
-        channel=over_time(steps) if isinstance(channel, OverTime) else steps[0],
+        channel=restack(steps, channel),
         initial=initial,
         flagged=flags is not None,
         **make_sizes(claim, first(plant), first(channel).outputs + (flags is not None)),

@@ -24,7 +24,7 @@ from heliograph.model.centred import predict_signal
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters
-from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
@@ -202,7 +202,7 @@ def fed_back_filter(
     """
     base = gaussian_filter(plant, sensor, channel, Cubature() if transform is None else transform, update)
     refuse_angles("filter that is fed back", plant, sensor)
-    described = base.channel.values if isinstance(base.channel, OverTime) else base.channel
+    described = stacked(base.channel)
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None
     claim = lower_to_upper("exact" if exact else "nominal", plant, sensor, channel)
     return FedBackFilter(base=base, claim=claim, states=base.states, inputs=base.inputs, received=base.received)

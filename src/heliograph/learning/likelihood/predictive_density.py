@@ -13,17 +13,15 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.row_times import judge_dates
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.components import Component
-from heliograph.random_affine.law import AbstractLaw, Constant, Discrete, LogNormal, Nakagami, Rayleigh, Rician
+from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond
-DRAWS = 2**14  # of a law that nobody knows but by its samples
 Map = TypeVar("Map", bound=AbstractRandomAffine)
 
 
@@ -32,7 +30,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
 
     int f(g) dF(g) = int f(F^-1(Phi(t))) phi(t) dt by the trapezoidal rule on |t| <= REACH, Phi the normal distribution
     function: its error falls as exp(-2 pi^2 / h^2) with the distance h of the nodes. A law of finitely many values is
-    itself. Of a user's law, which has no F^-1, the nodes are quantiles of DRAWS samples.
+    itself. Of a user's law, which has no F^-1, the nodes are quantiles of samples (`AbstractLaw.quantile`).
 
     Raises:
         ValueError: fewer than 2 nodes, a law that cannot be sampled.
@@ -44,18 +42,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
         return Discrete([float(law.value)], [1.0])
     # F^-1(Phi(t)) at the nodes
     points, weights = _normal_nodes(count)
-    match law:
-        case Rayleigh():
-            gains = scipy.stats.rayleigh.ppf(points, scale=float(law.scale))
-        case LogNormal():
-            gains = np.exp(float(law.log_mean) + float(law.log_deviation) * scipy.stats.norm.ppf(points))
-        case Rician():
-            gains = scipy.stats.rice.ppf(points, float(law.sight) / float(law.scale), scale=float(law.scale))
-        case Nakagami():
-            gains = np.sqrt(scipy.stats.gamma.ppf(points, float(law.shape)) * float(law.power) / float(law.shape))
-        case _:
-            gains = np.quantile(_draw_values(law), points)
-    return Discrete(gains, weights)
+    return Discrete(law.quantile(points), weights)
 
 
 def discretise_laws(channel: Map, count: int) -> Map:
@@ -77,13 +64,6 @@ def _normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
     return np.asarray(ndtr(t)), weights / weights.sum()
-
-
-@in_float64
-def _draw_values(law: AbstractLaw) -> np.ndarray:
-    """Draw values of a law, whose quantiles stand for it."""
-    samples: np.ndarray = np.asarray(jax.vmap(law.sample)(jax.random.split(jax.random.key(0), DRAWS)))
-    return samples
 
 
 NODES = 64  # values of each law: a hop's density to three digits where its noise is a tenth of its spread

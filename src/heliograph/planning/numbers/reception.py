@@ -27,7 +27,7 @@ from heliograph.planning.moments import check_design_plant, measurement_moment, 
 from heliograph.planning.numbers.mode_riccati import ModeSystem
 from heliograph.planning.transmitters import powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import MarkovChain, stationary
+from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
@@ -203,8 +203,7 @@ def _flag_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     parts = channel.maps if isinstance(channel, Stack) else ()
     rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
     chains = memories(channel)
-    markov = all(isinstance(memory, MarkovChain) for memory in chains.values())
-    if not markov or len(parts) - len(rest) != len(chains):
+    if any(memory.drifts for memory in chains.values()) or len(parts) - len(rest) != len(chains):
         raise fail(f"channel of {name!r}", "chains whose modes are observed (hg.model.with_flag)", "one with memory")
     return joint_modes(rest[0] if len(rest) == 1 else Stack(rest), order=2)
 

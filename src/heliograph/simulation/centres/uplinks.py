@@ -13,7 +13,7 @@ from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, perfect
-from heliograph.model.over_time import OverTime, at, over_time, stack
+from heliograph.model.over_time import OverTime, at, at_each_step, stack
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
@@ -205,10 +205,8 @@ def _model_links(
     known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
     """Model of the uplinks for a centre, at each step if any varies."""
-    varying = [link.steps for link in known if isinstance(link, OverTime)]
-    if not varying:
-        return _links(known, received, error)
-    return over_time([_links([at(link, k) for link in known], received, error) for k in range(min(varying))])
+    model: ReportModel | OverTime = at_each_step(lambda *links: _links(links, received, error), *known)
+    return model
 
 
 def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
