@@ -32,5 +32,6 @@ MANY_TERMS = LONGEST // 4
 # Rows of a matrix whose eigenvalues are written out, numbers that are sorted, and places that data choose among, by
 # comparing each with each: of 20 rows the library's method is as fast.
 FEW = 20
-# Operations of a branch: one that has fewer is computed in any case, a jump past it would take as long.
+# Operations of a branch: one that has fewer is computed in any case, a jump past it would take as long. Of an event
+# filter all from 0 to 1,000 take the same time to 5 %.
 DEAR = 100
