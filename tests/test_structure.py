@@ -167,6 +167,13 @@ def test_no_public_function_is_without_a_docstring():
                     assert not public or ast.get_docstring(member), f"{path.name}: {node.name}.{member.name}"
 
 
+def test_no_file_is_longer_than_four_hundred_lines():
+    """One idea a file: what is longer has two."""
+    packages = SOURCE, SOURCE.parent / "straightline", SOURCE.parents[1] / "studies"
+    lengths = {path: len(path.read_text().splitlines()) for package in packages for path in package.rglob("*.py")}
+    assert lengths and not {str(path): length for path, length in lengths.items() if length > 400}
+
+
 def test_the_library_knows_no_study():
     for path in SOURCE.rglob("*.py"):
         assert "heliograph_studies" not in path.read_text(), path.name

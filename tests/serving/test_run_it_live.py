@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from heliograph import cli
 from heliograph.serving.message import Message
 from heliograph.serving.output import AnyOutput, Estimates
-from heliograph.serving.running import store_of
+from heliograph.serving.settings import store_of
 from tests.serving.worlds import lines, messages
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
-    from heliograph.serving.running import ServiceSettings
+    from heliograph.serving.settings import ServiceSettings
 
 
 @Parameter(name="*")
@@ -62,7 +62,7 @@ class ServeOptions:
         from heliograph.live.fleet import Options
         from heliograph.numerics.times.dates import horizons_in
         from heliograph.serving.brokers.url import parse_address
-        from heliograph.serving.running import ServiceSettings, name_of, settings_of_node, store_of
+        from heliograph.serving.settings import ServiceSettings, name_of, settings_of_node, store_of
 
         broker = None if self.broker is None else parse_address(self.broker)
         options = Options(self.window, self.ahead, self.leap)

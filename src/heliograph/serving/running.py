@@ -4,28 +4,24 @@ import asyncio
 import contextlib
 import logging
 import sys
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Protocol
 
-from heliograph.files.json_field import Source
-from heliograph.live.event import INPUTS
-from heliograph.live.fleet import Fleet, Options
+from heliograph.live.fleet import Fleet
 from heliograph.live.lanes import NetworkProgram
-from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
-from heliograph.serving.ahead import Spans
+from heliograph.numerics.check import fail, instance
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, encode_name
+from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.loop import AbandonedError, Ending, Takes, serve_until, signals
 from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
+from heliograph.serving.settings import NOTHING, SHORTEST, ServiceSettings
 from heliograph.serving.storage.store_protocol import AwayError, InMemoryStore, StoreProtocol, identity, report_damage
 from heliograph.serving.words import LastWordsService
-from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
 
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
@@ -134,124 +130,6 @@ async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None
     for number in sorted(expected - parts.keys()):
         ending = asyncio.Event()
         parts[number] = _Part(asyncio.ensure_future(serve(number, ending)), ending)
-
-
-NOTHING = "none"  # the store that keeps nothing
-SHORTEST = 1.0  # seconds without messages after which their silence is used
-
-
-@dataclass(frozen=True)
-class ServiceSettings:
-    """Settings of a service.
-
-    Args:
-        network: the network to run.
-        options: limits of events and memory.
-        store: path or URL of the database; None keeps no state.
-        process: name of this process among several.
-        snapshot: store whose plants a new store begins from, a file or a PostgreSQL URL.
-        broker: the broker; None reads standard input.
-        parts: number of parts of the plants that several processes share.
-        page: port, or address and port, of the page.
-        hosts: names by which others ask for the page, such as a proxy's.
-        anew: names of plants that begin anew.
-        sources: sources of messages that others make, by topic; None reads messages in our own form alone.
-        others: nodes that other processes are, whose messages are left out.
-        name: name of the network on the page.
-        accept_changes: whether the plants of a store whose network has changed go on with what fits.
-        every: seconds after which the estimate of a plant whose senders are silent is published again although it has
-            hardly changed; None for never.
-        forecast: how far ahead forecasts are published beside provisional estimates; None for not at all.
-
-    Raises:
-        ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
-    """
-
-    network: Network
-    options: Options
-    store: str | None = None
-    process: str = ""
-    snapshot: str | None = None
-    broker: Address | None = None
-    parts: int | None = None
-    page: str | None = None
-    hosts: tuple[str, ...] = ()
-    anew: tuple[str, ...] = ()
-    sources: object = None
-    others: tuple[str, ...] = ()
-    name: str = ""
-    accept_changes: bool = False
-    every: float | None = None
-    forecast: Spans | None = None
-
-    def __post_init__(self) -> None:
-        if self.hosts and self.page is None:
-            raise fail("--host", "a page for this host name (--page PORT)", "none")
-        if self.every is not None:
-            scalar("--every", self.every, TINY)
-        if self.snapshot is not None:
-            if self.store is None:
-                raise fail("--from-snapshot", "a store to begin in (--store FILE)", "none")
-            if "://" not in self.snapshot and not Path(self.snapshot).is_file():
-                raise fail(f"snapshot {self.snapshot}", "a store's file", "nothing of that name")
-        if self.anew and self.store is None:
-            raise fail("--anew", "a store that has the plants (--store FILE)", "none")
-        if self.parts is not None:
-            check_count("--parts", self.parts)
-            if self.store is None or self.broker is None:
-                raise fail("--parts", "a store and a broker that all processes share", "not both")
-            if self.sources is not None:
-                raise fail(
-                    "--parts", "messages in our own form, which name their part", "sources in the network's file"
-                )
-
-
-def store_of(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
-    """Return the place of the store as requested, else a file in this folder named after the network and its node.
-
-    None keeps no state. Processes that share parts must all name the store.
-    """
-    if given is not None or parts is not None:
-        return None if given == NOTHING else given
-    return f"{name_of(network)}{'' if node is None else f'-{encode_name(node)}'}.db"
-
-
-def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
-    """Return the settings of one node of a fusion between neighbours, at the topic of its name below the broker's.
-
-    Raises:
-        ValueError: no such node, no broker between the nodes, parts that processes share.
-    """
-    if settings.broker is None or settings.parts is not None:
-        raise fail("--node", "a broker between the nodes (--broker URL), and no --parts",
-                   "none" if settings.broker is None else "--parts")  # fmt: skip
-    # Messages of its own sensor, where they are of topics of others; the seconds of a step are those of all nodes.
-    table, step = settings.sources, settings.options.step
-    if isinstance(table, Mapping):
-        items = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in table.items()}
-        step = next((row.step for rows in items.values() for row in rows if isinstance(row, Source)), step)
-        measures = node in settings.network.nodes and settings.network.nodes[node].received > 0
-        mine = {topic: [row for row in rows if not isinstance(row, Source) or row.node in (node, INPUTS)
-                        or (measures and not isinstance(row.node, str))]
-                for topic, rows in items.items()}  # fmt: skip
-        table = {topic: rows for topic, rows in mine.items() if rows} or None
-    return replace(
-        settings,
-        network=node_network(settings.network, node),
-        options=settings.options._replace(step=step),
-        broker=replace(settings.broker, topic=f"{settings.broker.topic}/{encode_name(node)}"),
-        sources=table,
-        others=tuple(name for name in settings.network.names if name != node),
-        name=f"{settings.name} {node}",
-    )
-
-
-def name_of(network: str) -> str:
-    """Return the name of a network: of `my_network.py` or of a module, and of the one among several there."""
-    prefix, _, name = network.rpartition(":")
-    file, name = (prefix, f"-{name}") if name.isidentifier() and prefix else (network, "")
-    stem = Path(file).stem if file.endswith(".py") else file.rpartition(".")[2]
-    return f"{stem}{name}"
 
 
 async def run(settings: ServiceSettings) -> None:

@@ -6,7 +6,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from time import monotonic
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from prometheus_client import CollectorRegistry, Histogram
 from pydantic_core import from_json
@@ -18,12 +18,11 @@ from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
 from heliograph.report.outputs import RecentOutputs, output_row
-from heliograph.serving.loop import Takes
-from heliograph.serving.message import Payload
+from heliograph.serving.observed_service import ObservedService, Serves, Taken, WatchedPlant
 from heliograph.serving.output import Output
 from heliograph.serving.overview import Overview, Wrong
 from heliograph.serving.running_nis import MEMORY, RunningNis, read_nis
-from heliograph.serving.totals import LinkTotals, Totals
+from heliograph.serving.totals import Totals
 from heliograph.simulation.network import Network
 
 T = TypeVar("T")
@@ -44,49 +43,6 @@ COUNTED = {  # of a node's messages
     "dropped": "values are beyond its limits, or codes, and count as not arrived",
     "conflict": "came again with other values; the first stayed",
 }
-
-
-class WatchedPlant(Protocol):
-    """A plant as the page needs it."""
-
-    @property
-    def links(self) -> Mapping[str, LinkTotals]:
-        """Return the counts of the plant's links, by node."""
-
-
-class Taken(Protocol):
-    """Statistics of the last batch."""
-
-    @property
-    def took(self) -> float:
-        """Return the seconds of the whole batch."""
-
-    @property
-    def committed(self) -> float:
-        """Return the seconds of the commit."""
-
-    @property
-    def lag(self) -> float:
-        """Return the age of the oldest message in seconds, where it is dated; else the seconds of the batch."""
-
-
-class Serves(Takes, Protocol):
-    """A service as the page needs it."""
-
-    @property
-    def plants(self) -> Mapping[str, WatchedPlant]:
-        """Return the plants in memory, by name."""
-
-    @property
-    def malformed(self) -> int:
-        """Return the number of messages that could not be read."""
-
-    @property
-    def last(self) -> Taken:
-        """Return the statistics of the last batch."""
-
-    def dead_senders(self) -> Mapping[str, int]:
-        """Return how many plants have a dead sender, by node with a trigger."""
 
 
 class Point(NamedTuple):
@@ -315,33 +271,6 @@ class Watch:
                 f"{join_names(nodes)}: {sum(links[node][name] for node in nodes):,} {words}"
                 for nodes in ([of] if len(of) > APART else [[node] for node in of])
             )
-
-
-class ObservedService:
-    """A service whose batches are observed; the loop uses it like the service."""
-
-    def __init__(self, service: Serves, watch: Watch):
-        self.service, self.watch = service, watch
-
-    def unpublished(self) -> list[Output]:
-        """Return the service's unpublished outputs."""
-        return self.service.unpublished()
-
-    def take(self, payloads: Sequence[Payload]) -> list[Output]:
-        """Let the service take a batch, and record its outputs."""
-        with self.watch.taking():
-            outputs = self.service.take(payloads)
-            self.watch.note(outputs, self.service.last if payloads else None)
-        return outputs
-
-    def published(self, outputs: Sequence[Output]) -> None:
-        """Pass on that outputs were published."""
-        self.service.published(outputs)
-
-    def finish(self, ended: bool) -> list[Output]:
-        """Let the service commit everything."""
-        with self.watch.lock:
-            return self.service.finish(ended)
 
 
 def _move_to_newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T], most: int = PLANTS) -> T:

@@ -32,7 +32,8 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.monomials import exponents
-from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, describe_second_moments
+from heliograph.random_affine.moments.quadratic_map import QuadraticMap
+from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 
 Modes = TypeVar("Modes", SideInformation, ChannelByMode)  # a channel at one step, mode by mode

@@ -18,7 +18,8 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import known
-from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, second_order
+from heliograph.random_affine.moments.quadratic_map import QuadraticMap
+from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run

@@ -6,7 +6,7 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph.engine.choice import compute_once
-from heliograph.filters.modes.multiple_model import normalise_columns
+from heliograph.filters.modes.mixing import normalise_columns
 from heliograph.testing import check_filter
 from tests.follow import follow
 

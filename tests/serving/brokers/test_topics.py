@@ -142,7 +142,7 @@ def test_lines_without_a_topic_are_of_the_only_one(file):
 def test_sources_and_parts_exclude_each_other():
     from heliograph.live.fleet import Options
     from heliograph.serving.brokers.url import parse_address
-    from heliograph.serving.running import ServiceSettings
+    from heliograph.serving.settings import ServiceSettings
 
     plant, sensor = hg.LinearPlant([[1.0]], [[1.0]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 1.0)
     network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {})})

@@ -12,7 +12,6 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian, append_rows, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.event.ball import truncate_to_ball
 from heliograph.filters.event.belief import EventBelief
 from heliograph.filters.event.gaussian_sum import (
     FLOOR,
@@ -21,8 +20,6 @@ from heliograph.filters.event.gaussian_sum import (
     log_total,
     merge_groups,
     reduce_parts,
-    truncate_between,
-    truncate_outside,
 )
 from heliograph.filters.event.joint_gaussian import (
     LinkMoments,
@@ -32,6 +29,7 @@ from heliograph.filters.event.joint_gaussian import (
     predict_received,
     set_known_components,
 )
+from heliograph.filters.event.silent_region import SilentRegion
 from heliograph.filters.gaussian.belief import second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.patterns import SideInformation, pattern_of
@@ -115,19 +113,16 @@ class EventFilter(AbstractSizedFilter):
         return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
 
     @property
+    def region(self) -> SilentRegion:
+        """Where y - r lies as long as a sender is silent."""
+        return SilentRegion(len(self.states), self.trigger, self.outputs, self.known)
+
+    @property
     def _count_known_references(self) -> int:
         """Count the Gaussians of known reference: pieces of the interval, and of the outside if it may be silent."""
-        return self.known + (self._count_outside_parts if self.loses and not self.reference_may_be_lost else 0)
-
-    @property
-    def _count_outside_parts(self) -> int:
-        """Count the pieces that what is outside of a sender's region is cut into."""
-        return 2 * len(range(self.outputs)[self.senders[0]]) + self.has_ball_region
-
-    @property
-    def has_ball_region(self) -> bool:
-        """True if the region is a ball of several components."""
-        return self.trigger.region == "ball" and self.outputs > 1
+        return self.known + (
+            self.region.outside_parts(self.senders[0]) if self.loses and not self.reference_may_be_lost else 0
+        )
 
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
@@ -213,18 +208,19 @@ class EventFilter(AbstractSizedFilter):
         # Known reference: every Gaussian cut to each part of the line, and joined part by part.
         if not self.reference_may_be_lost:
             inside = augmented.relabel_sender(s, waiting + forced if self.loses else waiting)
-            slots, _ = self._truncate_inside(inside, inside.take(0, 0), sender)
+            slots, _ = self.region.truncate_inside(inside, inside.take(0, 0), sender)
             if self.loses:
-                outside = self._truncate_outside(augmented.relabel_sender(s, dropped + forced), sender, 1.0)
-                slots = concatenate([slots, merge_groups(outside, self._count_outside_parts)])
+                outside = self.region.truncate_outside(augmented.relabel_sender(s, dropped + forced), sender, 1.0)
+                slots = concatenate([slots, merge_groups(outside, self.region.outside_parts(sender))])
             return self._keep_if_impossible(slots.select_components(as_it_was), augmented)
 
         # Reference that may be a value that was lost: not sent, with the reference as it was ...
         unsent = augmented.relabel_sender(s, waiting)
-        slots, others = self._truncate_inside(unsent.take(0, self.known), unsent.take(self.known), sender)
+        slots, others = self.region.truncate_inside(unsent.take(0, self.known), unsent.take(self.known), sender)
         # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
         outside = merge_groups(
-            self._truncate_outside(augmented.relabel_sender(s, dropped), sender, 1.0), self._count_outside_parts
+            self.region.truncate_outside(augmented.relabel_sender(s, dropped), sender, 1.0),
+            self.region.outside_parts(sender),
         )
         fresh = concatenate([outside, merge_groups(augmented.relabel_sender(s, forced))]).select_components(
             self._find_new_reference(sender)
@@ -282,8 +278,8 @@ class EventFilter(AbstractSizedFilter):
         """
         waiting, due = self._label_sending(used.label[:, s], begun)
         event = used.relabel_sender(s, waiting)
-        outside = self._truncate_outside(event, self.senders[s], 1 - RIM)
-        mass = jnp.max(outside.log_weight.reshape(self._count_outside_parts, -1), axis=0)
+        outside = self.region.truncate_outside(event, self.senders[s], 1 - RIM)
+        mass = jnp.max(outside.log_weight.reshape(self.region.outside_parts(self.senders[s]), -1), axis=0)
         lowest = event.log_weight + np.log(FLOOR)
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
         return concatenate([outside, floor, used.relabel_sender(s, due)])
@@ -308,54 +304,6 @@ class EventFilter(AbstractSizedFilter):
         if self.trigger.needs_reference:
             places[n + sender.start : n + sender.stop] = n + m + np.r_[sender]
         return places
-
-    def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
-        """For each component of a sender, the row d with d'(x, r, y) = y - r, and its threshold delta."""
-        n, m = len(self.states), self.outputs
-        delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
-        unit = jnp.eye(n + 2 * m)
-        return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
-
-    def _truncate_inside(
-        self, known: GaussianSum, unknown: GaussianSum, sender: slice
-    ) -> tuple[GaussianSum, GaussianSum]:
-        """Truncate to |y - r| <= delta: `known` piece by piece of the interval, then merged; `unknown` as a whole."""
-        (direction, delta), *rest = self._error_directions(sender)
-        size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
-        low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
-        every = concatenate([known] * self.known)
-        if self.has_ball_region:
-            every = truncate_between(every, direction, low * delta, high * delta) if self.known > 1 else every
-            every = self._truncate_to_ball(concatenate([every, unknown]), sender, 1.0, True)
-        else:
-            whole = np.ones(len(unknown.log_weight))
-            low, high = np.append(low, -whole), np.append(high, whole)
-            every = truncate_between(concatenate([every, unknown]), direction, low * delta, high * delta)
-            for direction, delta in rest:
-                every = truncate_between(every, direction, -delta, delta)
-        count = size * self.known
-        return merge_groups(every.take(0, count), self.known), every.take(count)
-
-    def _truncate_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
-        """Truncate each Gaussian to |y - r| > delta, as `_count_outside_parts` pieces, one after the other.
-
-        The first component that is, above or below, those before it inside; of a ball these are what is outside of the
-        box around it, and then what the ball leaves of the box.
-        """
-        outside, errors = [], self._error_directions(sender)
-        for i, (direction, delta) in enumerate(errors, 1):
-            edge = scale * delta
-            outside.append(truncate_outside(parts, direction, edge))
-            if i < len(errors) or self.has_ball_region:
-                parts = truncate_between(parts, direction, -edge, edge)
-        return concatenate(
-            [*outside, self._truncate_to_ball(parts, sender, scale, False)] if self.has_ball_region else outside
-        )
-
-    def _truncate_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
-        """Truncate each Gaussian to |y - r| <= scale delta (`inside`), or to where it is more."""
-        directions, deltas = zip(*self._error_directions(sender), strict=True)
-        return truncate_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
 
     def _keep_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
         """Return the updated sum; where all its weights are 0, the sum `before`, with FLOOR as likelihood."""

@@ -373,13 +373,8 @@ def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalF
 def build_from_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> M:
     """Build a filter of this kind with the channel's observation models."""
     start, (initial, described) = first(plant), channels_by_mode(channel)
-    return kind(
-        plant=plant,
-        sensor=sensor,
-        channel=described,
-        initial=initial,
-        **make_sizes(claim, start, first(channel).outputs),
-    )
+    sizes = make_sizes(claim, start, first(channel).outputs)
+    return kind(plant=plant, sensor=sensor, channel=described, initial=initial, **sizes)
 
 
 def channels_by_mode(channel: Channel) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:

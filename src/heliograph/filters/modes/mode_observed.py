@@ -29,12 +29,8 @@ from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memory import condition_on_memories, memories
 from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.moments.second_moments import (
-    QuadraticMap,
-    SecondOrder,
-    describe_second_moments,
-    nominal_spread,
-)
+from heliograph.random_affine.moments.quadratic_map import QuadraticMap
+from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments, nominal_spread
 
 
 class ModeObservedBelief(NamedTuple):

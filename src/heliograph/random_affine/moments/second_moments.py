@@ -1,17 +1,14 @@
 """Second moments of a channel, bounded under every possible law."""
 
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of
 from heliograph.numerics.caching import cache_by_object
-from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, is_zero, library, stack_parts
 from heliograph.numerics.types import Float
@@ -19,6 +16,15 @@ from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, c
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.moments.intervals import CORNERS
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, Moments
+from heliograph.random_affine.moments.quadratic_map import (
+    QuadraticMap,
+    add_maps,
+    map_of_known_law,
+    place_on_diagonal,
+    scale_map,
+    signal_of_map,
+    size_of_map,
+)
 from heliograph.random_affine.moments.tensors import (
     Matrix,
     Tensor,
@@ -26,35 +32,13 @@ from heliograph.random_affine.moments.tensors import (
     second_moment_tensor,
     symmetric_product,
 )
+from heliograph.random_affine.moments.uncertain_law import (
+    PROPORTIONAL_TOLERANCE,
+    bound_from_intervals,
+    dominate,
+    tensors_of_law,
+)
 from heliograph.random_affine.superposed import Superposed
-
-PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
-
-
-class QuadraticMap(Module):
-    """A map from second moments W of (y, 1) to a matrix that dominates T_v(W) for every possible law v.
-
-    Value: C:W + diag_i(sum_j R_ij:|W| d_i / d_j). The second term is zero where one law dominates all others; otherwise
-    T_v(W) - C:W has entries within R:|W|, and a matrix with these row sums on the diagonal dominates it (Gershgorin,
-    in units d of each component's own, d_i^2 = |C_ii:W| + R_ii:|W|).
-
-    Shapes: center, radius (m, m, p + 1, p + 1).
-    """
-
-    center: Tensor
-    radius: Tensor
-
-    def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
-        """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
-        mask = present[:, None] & present[None, :]
-        center = self.middle(second_moment, present)
-        entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        unit = jnp.sqrt(_or_one(jnp.abs(jnp.diagonal(center)) + jnp.diagonal(entries)))
-        return center + jnp.diag(unit * jnp.sum(entries / unit, axis=1))
-
-    def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
-        """C:W alone, which is all where the law is known."""
-        return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 
 
 class SecondOrder(Module):
@@ -111,10 +95,6 @@ def join_gain_and_noise(gain: Tensor, noise: Columns) -> Tensor:
     return whole
 
 
-def _or_one(value: jax.Array) -> jax.Array:
-    return jnp.where(value > 0, value, 1.0)
-
-
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
     """Return whether z depends on y through more than a known gain; a law with traced parameters counts as random."""
     if described.uncertain or is_traced(described.spread):
@@ -168,17 +148,17 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     # A sum of maps: of known laws its spread is the sum of theirs; else bounded part by part.
     if isinstance(channel, Superposed) and corners == 1:
         mean, tensor = _mean_and_spread(channel)
-        own = _map_of_known_law(tensor)
-        of_mean = _map_of_known_law(drop_constant(symmetric_product(mean, mean)))
-        return MomentBounds(mean, own, _scale_map(own, 0.0), _add_maps(_signal(own), of_mean), own)
+        own = map_of_known_law(tensor)
+        of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
+        return MomentBounds(mean, own, scale_map(own, 0.0), add_maps(signal_of_map(own), of_mean), own)
     if isinstance(channel, Superposed) and not listed:
         return _bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
     # Known law: the moments themselves.
     if corners == 1:
-        spread, shift, power = (_map_of_known_law(tensor) for tensor in _tensors(nominal, mean))
-        spread = _map_of_known_law(_drop_known_gain(channel, spread.center))
+        spread, shift, power = (map_of_known_law(tensor) for tensor in tensors_of_law(nominal, mean))
+        spread = map_of_known_law(_drop_known_gain(channel, spread.center))
         return MomentBounds(mean, spread, shift, power, spread)
     # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
     if isinstance(channel, Stack):
@@ -187,23 +167,18 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
         laws = (
             Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
         )
-        stacks = zip(*(_tensors(corner, mean) for corner in laws), strict=True)
-        parts = [_dominate(stack_parts(tensors), mean) for tensors in stacks]
+        stacks = zip(*(tensors_of_law(corner, mean) for corner in laws), strict=True)
+        parts = [dominate(stack_parts(tensors), mean) for tensors in stacks]
     else:
-        parts = _bound_from_intervals(channel, nominal, mean)
+        parts = bound_from_intervals(channel, nominal, mean)
     spread, shift, power = parts
     return MomentBounds(mean, spread, shift, power, nominal_spread(channel))
-
-
-def _map_of_known_law(tensor: Tensor) -> QuadraticMap:
-    """Map W -> T:W of a law that is known, without an uncertain part."""
-    return QuadraticMap(tensor, np.zeros(tensor.shape))
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
     """Cov(z | y) under the nominal law."""
     nominal = channel.moments(2)
-    return _map_of_known_law(_drop_known_gain(channel, _tensors(nominal, nominal.mean[:-1])[0]))
+    return map_of_known_law(_drop_known_gain(channel, tensors_of_law(nominal, nominal.mean[:-1])[0]))
 
 
 def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
@@ -212,60 +187,6 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
     varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
     own: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
     return own
-
-
-def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
-    """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
-    raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
-    law_mean = moments.mean[:-1]
-    spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
-    return spread, symmetric_product(law_mean - mean, law_mean - mean), drop_constant(raw)
-
-
-def _dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
-    """One map above all of the (law, m, m, p + 1, p + 1) tensors.
-
-    Where y enters as s_v M y y' M' and the noise part has a largest matrix, that of the largest s_v and the largest
-    noise; else the middle of the range of each entry, with its half as radius.
-    """
-    xp = library(tensors)
-    low, high = tensors.min(axis=0), tensors.max(axis=0)
-    exact, holds = _common_gain(tensors, mean)
-    return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
-
-
-def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
-    """Return the tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
-    xp = library(tensors, mean)
-    shape = symmetric_product(mean[:, :-1], mean[:, :-1])
-    gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
-    mean_size: Matrix = xp.abs(mean[:, :-1])
-    # Sizes of the entries, for relative tolerances.
-    scale = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
-    loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
-    reach = xp.sqrt(xp.einsum("iiaa->ia", scale))[:, None, :] * loud[:, None]
-    size = xp.sum(shape**2)
-    # Least squares for s_v in gains_v = s_v M y y' M'.
-    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
-    residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
-    # Largest noise matrix: N_max - N_v >= 0 for all v, judged of correlations.
-    largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
-    unit = xp.sqrt(xp.diagonal(largest))
-    unit = _stop_gradient(xp.where(unit > 0, unit, 1.0))
-    gaps = xp.linalg.eigvalsh(_stop_gradient(largest - noises) / (unit[:, None] * unit))
-    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * scale)
-    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
-    corner = np.zeros((mean.shape[1], mean.shape[1]))
-    corner[-1, -1] = 1.0
-    # max_v s_v M y y' M' + N_max.
-    widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
-    exact = widened + largest[:, :, None, None] * corner
-    return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
-
-
-def _stop_gradient(value: Matrix) -> Matrix:
-    """Stop the gradient of a number on which a decision depends."""
-    return jax.lax.stop_gradient(value) if is_traced(value) else value
 
 
 def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
@@ -283,7 +204,7 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
         low, high = affine.moment_interval(1)
         xp = library(low, high, mean)
         reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
-        blocks.append([_place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
+        blocks.append([place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
     label = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
     apart = (label[:, None] != label[None, :])[:, :, None, None]
@@ -323,80 +244,31 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     every = range(len(parts))
     mean = channel.in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
-    noise = _map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
-    of_mean = _map_of_known_law(drop_constant(symmetric_product(mean, mean)))
-    own = _add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
-    sizes = [_size(bounds.shift) for bounds in parts]
+    noise = map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
+    of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
+    own = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
+    sizes = [size_of_map(bounds.shift) for bounds in parts]
     total = sum(sizes)
     if is_zero(total):
-        return MomentBounds(mean, own, _scale_map(noise, 0.0), _add_maps(_signal(own), of_mean), own)
+        return MomentBounds(mean, own, scale_map(noise, 0.0), add_maps(signal_of_map(own), of_mean), own)
     inverse = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
     shift = _sum_maps(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
     cross = _sum_maps(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
     # Power of the mean, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
-    sure = _size(of_mean)
+    sure = size_of_map(of_mean)
     ratio = total / library(sure).where(sure > 0, sure, 1.0)
-    power = _add_maps(_signal(own), _scale_map(of_mean, 1 + ratio), _scale_map(_signal(shift), 1 + 1 / ratio))
-    nominal = _add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
-    return MomentBounds(mean, _add_maps(own, cross), shift, power, nominal)
-
-
-def _signal(bound: QuadraticMap) -> QuadraticMap:
-    return QuadraticMap(drop_constant(bound.center), drop_constant(bound.radius))
-
-
-def _size(shift: QuadraticMap) -> Any:
-    """Root of the power that the map gives of unit signals; it weighs bounds, and has no derivative."""
-    tensor = _stop_gradient(shift.center + shift.radius)
-    return library(tensor).sqrt(library(tensor).einsum("iiaa->", tensor))
+    power = add_maps(signal_of_map(own), scale_map(of_mean, 1 + ratio), scale_map(signal_of_map(shift), 1 + 1 / ratio))
+    nominal = add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
+    return MomentBounds(mean, add_maps(own, cross), shift, power, nominal)
 
 
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
     """Weighted sum of the maps of parts, each at the places of what its part takes."""
-    parts = {i: _scale_map(part, weight) for i, (part, weight) in weighted.items()}
+    parts = {i: scale_map(part, weight) for i, (part, weight) in weighted.items()}
     center = channel.in_places({i: part.center for i, part in parts.items()}, 2)
     return QuadraticMap(center, channel.in_places({i: part.radius for i, part in parts.items()}, 2))
-
-
-def _add_maps(*maps: QuadraticMap) -> QuadraticMap:
-    """Add maps of second moments."""
-    return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
-
-
-def _scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
-    """Multiply a map of second moments by a number."""
-    return QuadraticMap(factor * part.center, factor * part.radius)
 
 
 def _constant_power(size: int) -> np.ndarray:
     """Matrix of zeros, but 1 as its last entry: W of the constant 1 alone."""
     return np.outer(np.eye(size)[-1], np.eye(size)[-1])
-
-
-def _place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
-    """The map of outputs start, start + 1, ... among all of them, zero elsewhere."""
-    margin = (start, outputs - start - block.center.shape[0])
-    widths = [margin, margin, (0, 0), (0, 0)]
-    return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))
-
-
-def _bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
-    """Bound spread, shift and power from the interval of each moment: raw - H0 m' - m H0' + H0 H0'."""
-    low, high = channel.moment_interval(2)
-    xp = library(low, high, mean)
-    # Middle and half width of each moment.
-    middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
-    half = Moments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
-    raw_radius = xp.abs(second_moment_tensor(half.matrix, half.outputs, half.inputs))
-    mean_radius = half.mean[:-1]
-    spread, _, power = _tensors(middle, mean)
-    reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
-    # Radii add up by the triangle inequality.
-    spread_radius = (
-        raw_radius + symmetric_product(xp.abs(mean), mean_radius) + symmetric_product(mean_radius, xp.abs(mean))
-    )
-    return [
-        QuadraticMap(spread, spread_radius),
-        QuadraticMap(np.zeros(spread.shape), symmetric_product(reach, reach)),
-        QuadraticMap(power, drop_constant(raw_radius)),
-    ]

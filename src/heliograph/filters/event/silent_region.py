@@ -1,0 +1,85 @@
+"""What silence says: the region in which the error of a sender's reference lies as long as it does not send."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.event.ball import truncate_to_ball
+from heliograph.filters.event.gaussian_sum import (
+    GaussianSum,
+    concatenate,
+    merge_groups,
+    truncate_between,
+    truncate_outside,
+)
+from heliograph.model.trigger import AbstractThreshold
+
+
+class SilentRegion(NamedTuple):
+    """The region |y - r| <= delta of a threshold, of each component, of all in a box, or in a ball.
+
+    states, outputs: lengths n of x and m of y, of Gaussians over (x, r, y); known: pieces into which the interval of
+    the first component is cut. A sender is a slice of the components of y.
+    """
+
+    states: int
+    trigger: AbstractThreshold
+    outputs: int
+    known: int
+
+    @property
+    def is_ball(self) -> bool:
+        """True if the region is a ball of several components."""
+        return self.trigger.region == "ball" and self.outputs > 1
+
+    def outside_parts(self, sender: slice) -> int:
+        """Count the pieces that what is outside of a sender's region is cut into."""
+        return 2 * len(range(self.outputs)[sender]) + self.is_ball
+
+    def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
+        """For each component of a sender, the row d with d'(x, r, y) = y - r, and its threshold delta."""
+        n, m = self.states, self.outputs
+        delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
+        unit = jnp.eye(n + 2 * m)
+        return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
+
+    def truncate_inside(
+        self, known: GaussianSum, unknown: GaussianSum, sender: slice
+    ) -> tuple[GaussianSum, GaussianSum]:
+        """Truncate to |y - r| <= delta: `known` piece by piece of the interval, then merged; `unknown` as a whole."""
+        (direction, delta), *rest = self._error_directions(sender)
+        size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
+        low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
+        every = concatenate([known] * self.known)
+        if self.is_ball:
+            every = truncate_between(every, direction, low * delta, high * delta) if self.known > 1 else every
+            every = self._truncate_to_ball(concatenate([every, unknown]), sender, 1.0, True)
+        else:
+            whole = np.ones(len(unknown.log_weight))
+            low, high = np.append(low, -whole), np.append(high, whole)
+            every = truncate_between(concatenate([every, unknown]), direction, low * delta, high * delta)
+            for direction, delta in rest:
+                every = truncate_between(every, direction, -delta, delta)
+        count = size * self.known
+        return merge_groups(every.take(0, count), self.known), every.take(count)
+
+    def truncate_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
+        """Truncate each Gaussian to |y - r| > delta, as `outside_parts` pieces, one after the other.
+
+        The first component that is, above or below, those before it inside; of a ball these are what is outside of the
+        box around it, and then what the ball leaves of the box.
+        """
+        outside, errors = [], self._error_directions(sender)
+        for i, (direction, delta) in enumerate(errors, 1):
+            edge = scale * delta
+            outside.append(truncate_outside(parts, direction, edge))
+            if i < len(errors) or self.is_ball:
+                parts = truncate_between(parts, direction, -edge, edge)
+        return concatenate([*outside, self._truncate_to_ball(parts, sender, scale, False)] if self.is_ball else outside)
+
+    def _truncate_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
+        """Truncate each Gaussian to |y - r| <= scale delta (`inside`), or to where it is more."""
+        directions, deltas = zip(*self._error_directions(sender), strict=True)
+        return truncate_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)

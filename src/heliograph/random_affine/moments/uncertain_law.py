@@ -1,0 +1,89 @@
+"""Bounds of a channel's second moments where probabilities are known up to a radius: over corner laws, by intervals."""
+
+import jax
+import numpy as np
+
+from heliograph.numerics.traced import library
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.quadratic_map import QuadraticMap, stop_gradient
+from heliograph.random_affine.moments.tensors import (
+    Matrix,
+    Tensor,
+    drop_constant,
+    second_moment_tensor,
+    symmetric_product,
+)
+
+PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
+
+
+def tensors_of_law(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
+    """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
+    raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    law_mean = moments.mean[:-1]
+    spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
+    return spread, symmetric_product(law_mean - mean, law_mean - mean), drop_constant(raw)
+
+
+def dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
+    """One map above all of the (law, m, m, p + 1, p + 1) tensors.
+
+    Where y enters as s_v M y y' M' and the noise part has a largest matrix, that of the largest s_v and the largest
+    noise; else the middle of the range of each entry, with its half as radius.
+    """
+    xp = library(tensors)
+    low, high = tensors.min(axis=0), tensors.max(axis=0)
+    exact, holds = _common_gain(tensors, mean)
+    return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
+
+
+def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
+    """Return the tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
+    xp = library(tensors, mean)
+    shape = symmetric_product(mean[:, :-1], mean[:, :-1])
+    gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
+    mean_size: Matrix = xp.abs(mean[:, :-1])
+    # Sizes of the entries, for relative tolerances.
+    scale = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
+    loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
+    reach = xp.sqrt(xp.einsum("iiaa->ia", scale))[:, None, :] * loud[:, None]
+    size = xp.sum(shape**2)
+    # Least squares for s_v in gains_v = s_v M y y' M'.
+    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
+    residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
+    # Largest noise matrix: N_max - N_v >= 0 for all v, judged of correlations.
+    largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
+    unit = xp.sqrt(xp.diagonal(largest))
+    unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
+    gaps = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
+    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * scale)
+    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
+    corner = np.zeros((mean.shape[1], mean.shape[1]))
+    corner[-1, -1] = 1.0
+    # max_v s_v M y y' M' + N_max.
+    widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
+    exact = widened + largest[:, :, None, None] * corner
+    return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
+
+
+def bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
+    """Bound spread, shift and power from the interval of each moment: raw - H0 m' - m H0' + H0 H0'."""
+    low, high = channel.moment_interval(2)
+    xp = library(low, high, mean)
+    # Middle and half width of each moment.
+    middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
+    half = Moments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
+    raw_radius = xp.abs(second_moment_tensor(half.matrix, half.outputs, half.inputs))
+    mean_radius = half.mean[:-1]
+    spread, _, power = tensors_of_law(middle, mean)
+    reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
+    # Radii add up by the triangle inequality.
+    spread_radius = (
+        raw_radius + symmetric_product(xp.abs(mean), mean_radius) + symmetric_product(mean_radius, xp.abs(mean))
+    )
+    return [
+        QuadraticMap(spread, spread_radius),
+        QuadraticMap(np.zeros(spread.shape), symmetric_product(reach, reach)),
+        QuadraticMap(power, drop_constant(raw_radius)),
+    ]

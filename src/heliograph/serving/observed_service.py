@@ -1,0 +1,93 @@
+"""A service whose batches are observed, and what its observer needs of it."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from threading import Lock
+from typing import Protocol
+
+from heliograph.serving.loop import Takes
+from heliograph.serving.message import Payload
+from heliograph.serving.output import Output
+from heliograph.serving.totals import LinkTotals
+
+
+class WatchedPlant(Protocol):
+    """A plant as the page needs it."""
+
+    @property
+    def links(self) -> Mapping[str, LinkTotals]:
+        """Return the counts of the plant's links, by node."""
+
+
+class Taken(Protocol):
+    """Statistics of the last batch."""
+
+    @property
+    def took(self) -> float:
+        """Return the seconds of the whole batch."""
+
+    @property
+    def committed(self) -> float:
+        """Return the seconds of the commit."""
+
+    @property
+    def lag(self) -> float:
+        """Return the age of the oldest message in seconds, where it is dated; else the seconds of the batch."""
+
+
+class Serves(Takes, Protocol):
+    """A service as the page needs it."""
+
+    @property
+    def plants(self) -> Mapping[str, WatchedPlant]:
+        """Return the plants in memory, by name."""
+
+    @property
+    def malformed(self) -> int:
+        """Return the number of messages that could not be read."""
+
+    @property
+    def last(self) -> Taken:
+        """Return the statistics of the last batch."""
+
+    def dead_senders(self) -> Mapping[str, int]:
+        """Return how many plants have a dead sender, by node with a trigger."""
+
+
+class Watches(Protocol):
+    """The observer of a service."""
+
+    lock: Lock
+
+    def taking(self) -> AbstractContextManager[None]:
+        """Hold the lock for a batch."""
+
+    def note(self, outputs: Sequence[Output], last: Taken | None) -> None:
+        """Record the outputs and statistics of a batch."""
+
+
+class ObservedService:
+    """A service whose batches are observed; the loop uses it like the service."""
+
+    def __init__(self, service: Serves, watch: Watches):
+        self.service, self.watch = service, watch
+
+    def unpublished(self) -> list[Output]:
+        """Return the service's unpublished outputs."""
+        return self.service.unpublished()
+
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
+        """Let the service take a batch, and record its outputs."""
+        with self.watch.taking():
+            outputs = self.service.take(payloads)
+            self.watch.note(outputs, self.service.last if payloads else None)
+        return outputs
+
+    def published(self, outputs: Sequence[Output]) -> None:
+        """Pass on that outputs were published."""
+        self.service.published(outputs)
+
+    def finish(self, ended: bool) -> list[Output]:
+        """Let the service commit everything."""
+        with self.watch.lock:
+            return self.service.finish(ended)
