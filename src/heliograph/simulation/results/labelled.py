@@ -1,6 +1,7 @@
 """Labelled arrays and wide tables: the common parts of records and of statistics."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -174,37 +175,112 @@ def check_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, st
     return {name: unit for name, unit in by_name.items() if unit}
 
 
-def place_filters(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) -> tuple[list[str], list[Placed[T]]]:
-    """Return the names of all filters, and each filter's value with its place (node, filter) in an array."""
-    filters = list(dict.fromkeys(name for by_filter in by_node.values() for name in by_filter))
-    places: list[Placed[T]] = [((nodes.index(node), filters.index(name)), value)
-              for node, by_filter in by_node.items() for name, value in by_filter.items()]  # fmt: skip
-    return filters, places
+@dataclass(frozen=True)
+class FilterLabels:
+    """Labels of results by node and filter, which fill the fields of a dataset at their places.
 
-
-def fill_field(
-    name: str, lead: Sequence[str], sizes: Mapping[str, int], parts: Iterable[Placed[ArrayLike]]
-) -> np.ndarray:
-    """Fill a field with parts at their places along node, or node and filter; NaN where there is none.
-
-    A part that is shorter than its axis, as measurements of a node may be, fills the beginning.
+    Args:
+        nodes: names of all nodes.
+        by_node: results by node and filter, each with a claim.
+        states: names of the plant's states.
+        rows: lengths of the axes of rows, (run, time) or (time), by name.
+        lengths: of other axes by name.
+        uplinks: quantizers by fusion.
     """
-    axes = axes_of(name, lead)
-    whole, begin = np.full([sizes[axis] for axis in axes], np.nan), axes.index("node")
-    for place, part in parts:
-        lengths = np.shape(part)[begin:]
-        where: Any = (*(slice(None),) * begin, *place, *map(slice, lengths))
-        whole[where] = part
-    return whole
 
+    nodes: Sequence[str]
+    by_node: Mapping[str, Mapping[str, Any]]
+    states: Sequence[str]
+    rows: Mapping[str, int]
+    lengths: Mapping[str, int]
+    uplinks: Mapping[str, Uplink]
 
-def claims_of(sizes: Mapping[str, int], outcome: Iterable[Placed[Any]]) -> np.ndarray:
-    """Return the claim of each filter, at its place; empty elsewhere."""
-    claims = np.full((sizes["node"], sizes["filter"]), "", dtype="U7")
-    for position, estimate in outcome:
-        claim: Claim = estimate.claim
-        claims[position] = claim
-    return claims
+    @property
+    def filters(self) -> list[str]:
+        """Names of all filters."""
+        return list(dict.fromkeys(name for by_filter in self.by_node.values() for name in by_filter))
+
+    @property
+    def senders(self) -> list[str]:
+        """Names of all nodes that send through a quantizer."""
+        return list(dict.fromkeys(node for uplink in self.uplinks.values() for node in uplink.nodes))
+
+    def place(self, value: Callable[[Any], T]) -> list[Placed[T]]:
+        """Return a value of each result, with its place (node, filter)."""
+        filters = self.filters
+        return [((self.nodes.index(node), filters.index(name)), value(result))
+                for node, by_filter in self.by_node.items() for name, result in by_filter.items()]  # fmt: skip
+
+    def fill(self, name: str, parts: Iterable[Placed[ArrayLike]]) -> np.ndarray:
+        """Fill a field with parts at their places along node, or node and filter; NaN where there is none.
+
+        A part that is shorter than its axis, as measurements of a node may be, fills the beginning.
+        """
+        sizes = {"node": len(self.nodes), "filter": len(self.filters), "state": len(self.states)}
+        sizes |= {"other": len(self.states), **self.rows, **self.lengths}
+        axes = axes_of(name, list(self.rows))
+        whole, begin = np.full([sizes[axis] for axis in axes], np.nan), axes.index("node")
+        for place, part in parts:
+            lengths = np.shape(part)[begin:]
+            where: Any = (*(slice(None),) * begin, *place, *map(slice, lengths))
+            whole[where] = part
+        return whole
+
+    def of_filters(self, name: str, value: Callable[[Any], ArrayLike]) -> np.ndarray:
+        """Fill a field with a value of each result at its place."""
+        return self.fill(name, self.place(value))
+
+    def claims(self) -> np.ndarray:
+        """Return the claim of each filter, at its place; empty elsewhere."""
+        claims = np.full((len(self.nodes), len(self.filters)), "", dtype="U7")
+        for position, claim in self.place(lambda result: result.claim):
+            claims[position] = claim
+        return claims
+
+    def sent(self) -> dict[str, np.ndarray]:
+        """Return the fields of the quantizers, by fusion and sender, with integers and booleans as they are."""
+        if not self.uplinks:
+            return {}
+        # Places of the senders in each fusion, -1 for none.
+        senders, n, first = self.senders, len(self.states), next(iter(self.uplinks.values()))
+        positions = np.full((len(self.uplinks), len(senders)), -1, dtype=np.int64)
+        leads = {name: getattr(first, name) for name in SENT}
+        parts = {name: np.zeros((*values.shape[: len(self.rows)], *positions.shape, n), values.dtype)
+                 for name, values in leads.items()}  # fmt: skip
+        # Values by fusion and sender.
+        for i, uplink in enumerate(self.uplinks.values()):
+            for j, node in enumerate(uplink.nodes):
+                positions[i, senders.index(node)] = j
+                for name, values in parts.items():
+                    values[..., i, senders.index(node), :] = getattr(uplink, name)[..., j, :]
+        return {"place": positions, **parts}
+
+    def dataset(
+        self, title: str, fields: Mapping[str, np.ndarray], time: np.ndarray, units: Mapping[str, str]
+    ) -> "xr.Dataset":
+        """Return a dataset with a title, these fields, and names, times and units as coordinates."""
+        import xarray as xr
+
+        # Fields, with their meaning in words.
+        lead = list(self.rows)
+        data = {name: (axes_of(name, lead), values, {"long_name": FIELDS[name].meaning})
+                for name, values in fields.items()}  # fmt: skip
+        # Coordinates: names, time, units.
+        labels = {"node": self.nodes, "filter": self.filters, "state": self.states, "other": self.states}
+        labels |= {"fusion": list(self.uplinks), "sender": self.senders} if self.uplinks else {}
+        coordinates: dict[str, object] = {axis: ([axis], text(names)) for axis, names in labels.items()}
+        coordinates[TIME] = ([TIME], time, {"units": units[TIME]} if TIME in units and time.dtype.kind == "f" else {})
+        if any(state in units for state in self.states):
+            coordinates["unit"] = (["state"], text([units.get(state, "") for state in self.states]))
+        # Attributes for people; the claims are a variable too.
+        claims = [f"{node}/{name}: {result.claim}" for node, of in self.by_node.items() for name, result in of.items()]
+        attributes = {
+            "title": title,
+            "heliograph": heliograph.__version__,
+            "states": visible(", ".join(self.states)),
+            "claims": visible(", ".join(claims)),
+        }
+        return xr.Dataset(data, coordinates, attributes)
 
 
 def each_filter(
@@ -219,30 +295,6 @@ def each_filter(
         yield nodes[i], filters[j], cast(Claim, str(claim[i, j])), values
 
 
-def uplink_fields(
-    uplinks: "Mapping[str, Uplink]", rows: int, n: int
-) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
-    """Fields of the quantizers, by fusion and sender, with integers and booleans as they are; and these labels.
-
-    The first `rows` axes of what an uplink holds are those of rows.
-    """
-    if not uplinks:
-        return {}, {}
-    # Places of the senders in each fusion, -1 for none.
-    senders = list(dict.fromkeys(node for uplink in uplinks.values() for node in uplink.nodes))
-    fusions, first = list(uplinks), next(iter(uplinks.values()))
-    positions = np.full((len(fusions), len(senders)), -1, dtype=np.int64)
-    parts = {name: np.zeros((*getattr(first, name).shape[:rows], *positions.shape, n), getattr(first, name).dtype)
-             for name in SENT}  # fmt: skip
-    # Values by fusion and sender.
-    for i, uplink in enumerate(uplinks.values()):
-        for j, node in enumerate(uplink.nodes):
-            positions[i, senders.index(node)] = j
-            for name, values in parts.items():
-                values[..., i, senders.index(node), :] = getattr(uplink, name)[..., j, :]
-    return {"place": positions, **parts}, {"fusion": fusions, "sender": senders}
-
-
 def uplinks_from(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
     """Uplinks of a dataset, by the fusion's name."""
     if "place" not in dataset:
@@ -255,43 +307,6 @@ def uplinks_from(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplin
         nodes = tuple(senders[j] for j in order)
         uplinks[name] = Uplink(nodes, saturated[..., i, order, :], symbols[..., i, order, :])
     return uplinks
-
-
-def dataset_of(
-    title: str,
-    fields: Mapping[str, np.ndarray],
-    lead: Sequence[str],
-    labels: Mapping[str, Sequence[str]],
-    time: np.ndarray,
-    units: Mapping[str, str],
-    claims: str,
-) -> "xr.Dataset":
-    """Dataset with a title, fields whose rows have the axes `lead`, and names, times and units as coordinates."""
-    import xarray as xr
-
-    # Fields, with their meaning in words.
-    data = {name: (axes_of(name, lead), values, {"long_name": FIELDS[name].meaning}) for name, values in fields.items()}
-    # Coordinates: names, time, units.
-    coordinates: dict[str, object] = {axis: ([axis], text(names)) for axis, names in labels.items()}
-    coordinates[TIME] = ([TIME], time, {"units": units[TIME]} if TIME in units and time.dtype.kind == "f" else {})
-    states = labels["state"]
-    if any(state in units for state in states):
-        coordinates["unit"] = (["state"], text([units.get(state, "") for state in states]))
-    # Attributes for people; the claims are a variable too.
-    attributes = {
-        "title": title,
-        "heliograph": heliograph.__version__,
-        "states": visible(", ".join(states)),
-        "claims": claims,
-    }
-    return xr.Dataset(data, coordinates, attributes)
-
-
-def claims_text(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """Claims for people: `node/filter: claim`."""
-    return visible(
-        ", ".join(f"{node}/{name}: {single.claim}" for node, of in results.items() for name, single in of.items())
-    )
 
 
 def text(names: Sequence[str]) -> np.ndarray:

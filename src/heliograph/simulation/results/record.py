@@ -22,18 +22,13 @@ from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.consistency import nees
 from heliograph.simulation.results.labelled import (
     TIME,
+    FilterLabels,
     check_title,
-    claims_of,
-    claims_text,
-    dataset_of,
     each_filter,
-    fill_field,
     names_of,
-    place_filters,
     record_fields,
     record_frame,
     units_of,
-    uplink_fields,
     uplinks_from,
     values_of,
 )
@@ -211,27 +206,24 @@ class Record(Saved):
             ModuleNotFoundError: without xarray (extra "results").
         """
         nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
-        filters, every = place_filters(nodes, self.estimates)
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
-        n, lead = len(self.states), [TIME] if self.runs is None else ["run", TIME]
-        sizes = {"run": self.runs or 0, TIME: len(self.time), "node": len(nodes), "filter": len(filters), "state": n}
-        sizes |= {"other": n, "received": max((z.shape[-1] for _, z in received), default=0)}
+        rows = {TIME: len(self.time)} if self.runs is None else {"run": self.runs, TIME: len(self.time)}
+        longest = max((z.shape[-1] for _, z in received), default=0)
+        labels = FilterLabels(nodes, self.estimates, self.states, rows, {"received": longest}, self.uplinks)
         # Fields, NaN where a node has no such filter or component.
         lengths = {node: z.shape[-1] for node, z in self.measurements.items()}
-        sent, senders = uplink_fields(self.uplinks, len(lead), n)
         fields = {
-            "measurement": fill_field("measurement", lead, sizes, received),
+            "measurement": labels.fill("measurement", received),
             "length": np.array([lengths.get(node, -1) for node in nodes], dtype=np.int64),
             "estimated": np.array([node in self.estimates for node in nodes], dtype=bool),
-            "claim": claims_of(sizes, every),
-            "mean": fill_field("mean", lead, sizes, [(place, e.mean) for place, e in every]),
-            "covariance": fill_field("covariance", lead, sizes, [(place, e.covariance) for place, e in every]),
-            **sent,
+            "claim": labels.claims(),
+            "mean": labels.of_filters("mean", lambda estimate: estimate.mean),
+            "covariance": labels.of_filters("covariance", lambda estimate: estimate.covariance),
+            **labels.sent(),
         }
         if self.truth is not None:
             fields["truth"] = self.truth
-        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states, **senders}
-        return dataset_of(RECORD, fields, lead, labels, self.time, self.units, claims_text(self.estimates))
+        return labels.dataset(RECORD, fields, self.time, self.units)
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "Record":

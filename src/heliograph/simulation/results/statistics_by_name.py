@@ -1,7 +1,7 @@
 """Error statistics by node and filter."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,20 +9,15 @@ import numpy as np
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import ArrayLike, units_in
+from heliograph.numerics.types import units_in
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.labelled import (
     TIME,
+    FilterLabels,
     check_title,
-    claims_of,
-    claims_text,
-    dataset_of,
     each_filter,
-    fill_field,
     names_of,
-    place_filters,
     units_of,
-    uplink_fields,
     uplinks_from,
     values_of,
 )
@@ -74,42 +69,33 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
         """
-        nodes = list(self)
-        filters, every = place_filters(nodes, self)
-        if not every:
+        first = next((score for filters in self.values() for score in filters.values()), None)
+        if first is None:
             raise fail("statistics", "those of one filter at least", "none")
-        n, first, lead = len(self.states), every[0][1], [TIME]
-        sizes = {"batch": len(first.count), TIME: first.nees.shape[1], "node": len(nodes), "filter": len(filters)}
-        sizes |= {"state": n, "other": n}
-
-        def fill(name: str, value: Callable[[ErrorStatistics], ArrayLike]) -> np.ndarray:
-            """Return a field with a value of each filter's statistics at its place."""
-            return fill_field(name, lead, sizes, [(place, value(score)) for place, score in every])
+        n, rows, batches = len(self.states), {TIME: first.nees.shape[1]}, {"batch": len(first.count)}
+        uplinks = {name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink}
+        labels = FilterLabels(list(self), self, self.states, rows, batches, uplinks)
 
         def variances(matrices: np.ndarray) -> np.ndarray:
             return np.diagonal(matrices, axis1=-2, axis2=-1)
 
-        nothing = np.full(sizes[TIME], np.nan)
+        fill, nothing = labels.of_filters, np.full(rows[TIME], np.nan)
         claimed = fill("deviation", lambda s: variances(s.claimed()))
-        sent, senders = uplink_fields({f: s.uplink for f, s in self.get(FUSED, {}).items() if s.uplink}, 1, n)
         # Sums by batch, from which the statistics can be restored, then figures.
         fields = {
             "runs": first.count,
             "errors": fill("errors", lambda s: matrices(s.pairs)),
             "claimed": fill("claimed", lambda s: matrices(s.claimed_pairs)),
             "nees": fill("nees", lambda s: s.nees),
-            "claim": claims_of(sizes, every),
+            "claim": labels.claims(),
             "failed": fill("failed", lambda s: nothing if s.failed is None else s.failed),
             "failed_runs": fill("failed_runs", lambda s: s.failed_runs),
             "rmse": np.sqrt(fill("rmse", lambda s: variances(s.actual()))),
             "deviation": np.sqrt(np.where(claimed >= 0, claimed, np.nan)),
             "nees_per_dimension": fill("nees_per_dimension", lambda s: s.nees.sum(axis=0) / s.runs / n),
-            **sent,
+            **labels.sent(),
         }
-        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states, **senders}
-        return dataset_of(
-            STATISTICS, fields, lead, labels, np.arange(1.0, sizes[TIME] + 1), self.units, claims_text(self)
-        )
+        return labels.dataset(STATISTICS, fields, np.arange(1.0, rows[TIME] + 1), self.units)
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
