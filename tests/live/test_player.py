@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.lanes import NetworkProgram
-from heliograph.simulation.side_by_side import StackedFilters
+from heliograph.simulation.runs.side_by_side import StackedFilters
 from tests.live import worlds
 
 SEEN = 1  # program, of the test: the filters begin by native code; there were 136

@@ -14,11 +14,11 @@ import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import NetworkProgram
 from heliograph.live.plant import LinkCounts
+from heliograph.serving.observation.page import Tallies
+from heliograph.serving.observation.watch import watch_of
 from heliograph.serving.output import AnyOutput
-from heliograph.serving.page import Tallies
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
-from heliograph.serving.watch import watch_of
 from tests.losing import Losing
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 

@@ -178,8 +178,8 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
         yield lambda service: service
         return
     from heliograph.files.sources import Sources
-    from heliograph.serving.page import parse_page_address, shown
-    from heliograph.serving.watch import watch_of
+    from heliograph.serving.observation.page import parse_page_address, shown
+    from heliograph.serving.observation.watch import watch_of
 
     table = settings.sources
     uncounted = set() if table is None else Sources(table, settings.network).uncounted

@@ -26,8 +26,8 @@ from heliograph.random_affine.memory import drop_names
 from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.runs.side_by_side import map_all
 from heliograph.simulation.shared_fading import deliver, memory_places, start
-from heliograph.simulation.side_by_side import map_all
 
 ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
 

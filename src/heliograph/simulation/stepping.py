@@ -33,7 +33,7 @@ from heliograph.simulation.centres.mesh import Mesh, meshes_of
 from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.side_by_side import StackedFilters, filter_step, initial_state, map_all
+from heliograph.simulation.runs.side_by_side import StackedFilters, filter_step, initial_state, map_all
 from heliograph.smoothing.backward_pass import plan_with_past
 
 

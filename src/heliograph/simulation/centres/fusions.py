@@ -28,7 +28,7 @@ from heliograph.simulation.centres.linearised import LinearisedCentre
 from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.side_by_side import initial_state, map_all
+from heliograph.simulation.runs.side_by_side import initial_state, map_all
 
 
 class StackedFusions(Module):

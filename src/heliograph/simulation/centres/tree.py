@@ -23,7 +23,7 @@ from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, describe_channel
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.side_by_side import StackedFilters
+from heliograph.simulation.runs.side_by_side import StackedFilters
 
 BLOCK = 1000  # nodes that are followed together
 

@@ -27,8 +27,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from heliograph.live.event import VERDICTS
 from heliograph.numerics.check import fail
 from heliograph.report.outputs import output_numbers
-from heliograph.serving.overview import page_of
-from heliograph.serving.watch import LISTED, Watch
+from heliograph.serving.observation.overview import page_of
+from heliograph.serving.observation.watch import LISTED, Watch
 
 
 class Tallies(Collector):
@@ -266,7 +266,7 @@ def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: 
 
 def _read_page_file(name: str) -> str:
     """Return a file of the page as text."""
-    return (files("heliograph.serving") / "browser" / name).read_text("utf-8")
+    return (files("heliograph.serving.observation") / "browser" / name).read_text("utf-8")
 
 
 def file(request: Request) -> Response:

@@ -6,7 +6,7 @@ from html import escape
 from typing import NamedTuple
 from urllib.parse import quote
 
-from heliograph.serving.running_nis import FEWEST, RunningNis
+from heliograph.serving.observation.running_nis import FEWEST, RunningNis
 
 Name = tuple[str, str]  # of a filter: node and filter
 NEAR = 2.0  # deviations of a ratio within which no band ends

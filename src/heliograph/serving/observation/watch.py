@@ -18,10 +18,10 @@ from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
 from heliograph.report.outputs import RecentOutputs, output_row
+from heliograph.serving.observation.overview import Overview, Wrong
+from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observed_service import ObservedService, Serves, Taken, WatchedPlant
 from heliograph.serving.output import Output
-from heliograph.serving.overview import Overview, Wrong
-from heliograph.serving.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.totals import Totals
 from heliograph.simulation.network import Network
 

@@ -8,11 +8,11 @@ import pytest
 from pydantic_core import to_json
 
 from heliograph.live.plant import LinkCounts
+from heliograph.serving.observation.page import PageAddress, parse_page_address, shown
+from heliograph.serving.observation.running_nis import read_nis
+from heliograph.serving.observation.watch import Watch
 from heliograph.serving.output import Output
-from heliograph.serving.page import PageAddress, parse_page_address, shown
-from heliograph.serving.running_nis import read_nis
-from heliograph.serving.watch import Watch
-from tests.serving.test_page import TOKEN, got
+from tests.serving.observation.test_page import TOKEN, got
 from tests.serving.watched import Scripted
 
 
@@ -91,11 +91,11 @@ def test_health_is_said_to_everybody_and_metrics_are_there_while_a_batch_is_long
         assert (await got(f"{url}/metrics"))[0] == 401
         bearer = {"Authorization": f"Bearer {TOKEN}"}
         before = (await got(f"{url}/metrics", **bearer))[1]
-        monkeypatch.setattr("heliograph.serving.page.PATIENCE", 0.01)
+        monkeypatch.setattr("heliograph.serving.observation.page.PATIENCE", 0.01)
         with watch.taking():
             assert (await got(f"{url}/metrics", **bearer))[1] == before
             assert (await got(f"{url}/healthz"))[0] == 200
-            monkeypatch.setattr("heliograph.serving.page.STUCK", 0.0)
+            monkeypatch.setattr("heliograph.serving.observation.page.STUCK", 0.0)
             status, text, _ = await got(f"{url}/healthz")
             assert status == 503 and "a batch has been taken for" in text
 

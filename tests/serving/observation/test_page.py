@@ -17,9 +17,9 @@ import heliograph as hg
 pytest.importorskip("uvicorn")
 from heliograph.files.sources import Sources
 from heliograph.live.plant import LinkCounts
-from heliograph.serving.page import PageAddress, Tallies, parse_page_address, shown
-from heliograph.serving.running_nis import RunningNis
-from heliograph.serving.watch import Watch, watch_of
+from heliograph.serving.observation.page import PageAddress, Tallies, parse_page_address, shown
+from heliograph.serving.observation.running_nis import RunningNis
+from heliograph.serving.observation.watch import Watch, watch_of
 from tests.serving.watched import Scripted
 from tests.serving.worlds import stepping
 from tests.widths import program
