@@ -1,7 +1,7 @@
 """One million runs of the strong scenario: time, how honest the estimate of it was, peak memory, both precisions.
 
 Run: python benchmarks/million.py [RUNS]. Four nodes, 40 steps, the zero-mean filter at each node and their equal
-intersection; running statistics only. Prints, and writes benchmarks/million.json.
+intersection; running statistics only. Prints.
 """
 
 import json
@@ -9,7 +9,6 @@ import resource
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import heliograph as hg
@@ -75,14 +74,11 @@ def main() -> None:
         print(json.dumps(measure(int(sys.argv[1]), sys.argv[2])))
         return
     runs = sys.argv[1] if len(sys.argv) > 1 else str(RUNS)
-    results = []
     for precision in ("float64", "float32"):  # a process each, so that each has a peak of its own
         said = subprocess.run(
             [sys.executable, __file__, runs, precision], stdout=subprocess.PIPE, text=True, check=True
         )
-        results.append(json.loads(said.stdout))
-        print(json.dumps(results[-1], indent=2), flush=True)
-    Path(__file__).with_name("million.json").write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+        print(json.dumps(json.loads(said.stdout), indent=2), flush=True)
 
 
 if __name__ == "__main__":

@@ -223,7 +223,7 @@ def natively(
     # Smoothing, few nodes, or nodes that share something: one program.
     whole = smoothing is not None or len(network.names) <= NODES or not _is_apart(network)
     if whole or type(reducer).joined is AbstractReducer.joined:
-        code = try_native(lambda: _code(network, inputs, key, reducer, runs, smoothing, precision=precision))
+        code = try_native(lambda: code_of_network(network, inputs, key, reducer, runs, smoothing, precision=precision))
         return (
             None
             if code is None
@@ -232,7 +232,9 @@ def natively(
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts, memory = [], list(_parts(network)), list[list[np.ndarray]]()
     for number, some in enumerate(parts):
-        code = try_native(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts), precision=precision))  # noqa: B023
+        code = try_native(
+            lambda: code_of_network(some, inputs, key, reducer, runs, parts=len(parts), precision=precision)
+        )  # noqa: B023
         if code is None:
             return None
 
@@ -258,7 +260,7 @@ def _parts(network: Network) -> Iterator[Network]:
             yield Network(network.plant, {name: network.nodes[name] for name in names[start : start + NODES]})
 
 
-def _code(
+def code_of_network(
     network: Network,
     inputs: np.ndarray,
     key: jax.Array,
@@ -268,6 +270,7 @@ def _code(
     parts: int = 1,
     precision: Precision = "float64",
 ) -> Native:
+    """Make the native code of a network's runs, as `native` of its world; a part of it may be smoothed."""
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), filters)
     return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, precision)
