@@ -42,6 +42,9 @@ class AbstractRandomAffine(Module):
     which the next draw depends: it defines `init` and `draw`, and says so by `remembers`. A map that holds others
     remembers where one of them does, and then must pass their states on; but not those of modes (`AbstractModal`),
     which are known here: a map is drawn given the states of the memories inside, one for each however often it is held.
+
+    A class says its sizes, how it is drawn, and its moments. Whatever else may be asked of it is a method below, with
+    an answer that holds for any map, or a refusal in one line; a class says more where it knows more.
     """
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -127,6 +130,8 @@ class AbstractRandomAffine(Module):
         check_forgets("moments of a map", self)
         raise unwritten(self, "moments")
 
+    # The laws that are possible where probabilities are known within a radius.
+
     def extremes(self) -> tuple["AbstractRandomAffine", ...]:
         """Return the maps at the corners of the set of possible laws; the map itself when probabilities are known."""
         return (self,)
@@ -160,6 +165,8 @@ class AbstractRandomAffine(Module):
         """Return the map whose gains are constant at their means; noises stay."""
         raise unwritten(self, "mean_gain")
 
+    # What comes through, from what goes in.
+
     @property
     def known_gains(self) -> KnownGains:
         """Which components of z = G y + n have a constant row of G (m,)."""
@@ -183,6 +190,18 @@ class AbstractRandomAffine(Module):
         if sent:
             raise refuse_gain_on_angles(type(self).__name__)
         return ()
+
+    def carry_signal(self, signal: Signal) -> Signal:
+        """Return E (z, 1)(z, 1)' of what arrives behind the map, and the probability that it does.
+
+        Raises:
+            ValueError: by default, of a map that erases: it must say itself with which probability.
+        """
+        if self.erases:
+            raise fail("transmitter behind a loss", "a chain that erases", type(self).__name__)
+        return carry_by_moments(signal, self.moments(2))
+
+    # What it is made of: memories, losses, atoms, noises.
 
     def degree_in(self, identity: str) -> int:
         """Return the degree of H as a polynomial in the state of a memory: one for each map in series that it fades."""
@@ -224,13 +243,15 @@ class AbstractRandomAffine(Module):
         """
         raise fail("channel", "hops, series, mixtures, stacks and sums of them", type(self).__name__)
 
-    def in_words(self) -> str:
-        """Return the map in words, such as "Rician hop → hop of gain 1.1"; nothing for one that only selects."""
-        return type(self).__name__
-
     def detach_outliers(self) -> tuple["AbstractRandomAffine", AbstractNoise | None]:
         """Replace the last noise by its mean where its law has outliers; return the map left, and that noise if any."""
         return self, None
+
+    # How it is written: words, series, hops, and another map beside it.
+
+    def in_words(self) -> str:
+        """Return the map in words, such as "Rician hop → hop of gain 1.1"; nothing for one that only selects."""
+        return type(self).__name__
 
     @property
     def in_series(self) -> list["AbstractRandomAffine"]:
@@ -264,23 +285,15 @@ class AbstractRandomAffine(Module):
     def visit_hops(self, visit: Visit, position: Position) -> tuple["AbstractRandomAffine", Position]:
         """Return the map with each hop replaced by visit(name, hop, signal), and the position behind it.
 
-        The signal behind it is not set: a series does so by `carry_signal`.
+        Args:
+            visit: function of a hop's name, the hop and what it receives, which returns a hop.
+            position: prefix of names, number of hops before, and the signal, which a series sets by `carry_signal`.
 
         Raises:
             ValueError: a map whose transmitters are not known; by default all.
         """
         expected = "hops in series, stacks, sums, mixtures, modes, losses and delays"
         raise fail("transmitters of a channel", expected, type(self).__name__)
-
-    def carry_signal(self, signal: Signal) -> Signal:
-        """Return E (z, 1)(z, 1)' of what arrives behind the map, and the probability that it does.
-
-        Raises:
-            ValueError: by default, of a map that erases: it must say itself with which probability.
-        """
-        if self.erases:
-            raise fail("transmitter behind a loss", "a chain that erases", type(self).__name__)
-        return carry_by_moments(signal, self.moments(2))
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """Return a point at which moments can be compared with samples (a lifted map takes only lifted points)."""

@@ -35,7 +35,6 @@ from heliograph.random_affine.moments.monomials import (
     position,
     refuse_if_too_large,
 )
-from heliograph.random_affine.moments.tensors import second_moment_tensor
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.route import Position, Signal, Visit
 
@@ -194,8 +193,7 @@ class Series(AbstractCombination):
 
 def _join_in_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     received = known(np.diag(x.arrived.astype(float)))
-    second = y.map.moments(2)
-    power = np.asarray(second_moment_tensor(second.matrix, second.outputs, second.inputs))[..., :-1, :-1]
+    power = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
     uses = np.einsum("iiaa->ia", power) > 0  # E[G_ia^2]
     return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
 

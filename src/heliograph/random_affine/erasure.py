@@ -12,7 +12,6 @@ from heliograph.random_affine.base import AbstractRandomAffine, Outcome, check_m
 from heliograph.random_affine.composite import DIRECT, AbstractWrapper, percent_in_words
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments
-from heliograph.random_affine.moments.tensors import second_moment_tensor
 from heliograph.random_affine.route import Position, Signal, Visit
 
 
@@ -76,5 +75,5 @@ def second_moments(
 ) -> tuple[Float[np.ndarray, "m p+1"], Float[np.ndarray, "m m p+1 p+1"]]:
     """Return E[(G, n)] and the tensor of E[z z' | y] on (y, 1)(y, 1)', under the nominal law."""
     moments = channel.moments(2)
-    tensor = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    tensor = moments.second
     return np.asarray(moments.mean[:-1]), np.asarray(tensor)

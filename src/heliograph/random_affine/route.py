@@ -10,7 +10,6 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.moments.monomials import Moments
-from heliograph.random_affine.moments.tensors import second_moment_tensor
 
 T = TypeVar("T")
 Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
@@ -60,7 +59,7 @@ class Position(NamedTuple):
 
 def carry_by_moments(signal: Signal, moments: Moments) -> Signal:
     """E h Y h' behind a random map h, by its second moments, and its mean."""
-    second, tensor = signal.second, second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    second, tensor = signal.second, moments.second
     mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
     behind = xp.block([[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]])
     return signal._replace(second=behind)

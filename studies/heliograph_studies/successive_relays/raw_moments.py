@@ -13,7 +13,6 @@ from heliograph.model.relays import SENSOR, RelayNetwork
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.tensors import second_moment_tensor
 from heliograph.relays.design import GainsByFilter
 
 
@@ -140,7 +139,7 @@ def _receive(network: RelayNetwork, name: str, k: int, sent: int) -> _Observatio
         columns = np.append((SENSOR, *network.relays).index(sender) * item.inputs + np.arange(item.inputs), sent - 1)
         mean = np.zeros((size, sent))
         mean[:, columns] = moments.mean[:-1]
-        separate = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+        separate = moments.second
         rows = np.arange(size)
         raw[np.ix_(rows, rows, columns, columns)] += separate
         raw += np.einsum("ia,jb->ijab", total, mean) + np.einsum("ia,jb->ijab", mean, total)

@@ -94,7 +94,7 @@ def described(channel):
 def test_the_second_order_description_is_that_of_the_moments(name):
     channel = SUMS[name]()
     nominal, seen = channel.moments(2), described(channel)
-    tensor = tensors.second_moment_tensor(nominal.matrix, nominal.outputs, nominal.inputs)
+    tensor = nominal.second
     mean = nominal.mean[:-1]
     spread = tensor - tensors.symmetric_product(mean, mean)
     np.testing.assert_allclose(np.column_stack([seen.mean_gain, seen.offset]), mean, rtol=1e-12, atol=1e-14)
@@ -106,7 +106,7 @@ def true_bounds(channel, laws, second):
     mean = channel.moments(1).mean[:-1]
     for law in laws:
         moments = law.moments(2)
-        tensor = tensors.second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+        tensor = moments.second
         of_law = moments.mean[:-1]
         raw, cross = np.einsum("ijab,ab->ij", tensor, second), mean @ second @ of_law.T
         signal = second.copy()

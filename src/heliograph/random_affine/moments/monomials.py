@@ -193,6 +193,15 @@ class Moments(Module):
         """E[H] of shape (outputs + 1, inputs + 1), read off the monomials z_i 1^(k-1)."""
         return self.lower(1)
 
+    @property
+    def second(self) -> Float[jax.Array | np.ndarray, "m m p+1 p+1"]:
+        """T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and (a, b); of order 2."""
+        rows = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
+        columns = product_table(self.inputs + 1, 1, 1)
+        shares = np.where(np.eye(self.inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b is at (a, b) and (b, a)
+        tensor: jax.Array | np.ndarray = self.matrix[rows[:, :, None, None], columns] / shares
+        return tensor
+
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
         """E[Sym^order(H)] of a lower order, whose monomials are among these."""
         matrix: jax.Array | np.ndarray = self.matrix[_among(self.outputs, self.inputs, self.order, order)]

@@ -29,7 +29,6 @@ from heliograph.random_affine.moments.tensors import (
     Matrix,
     Tensor,
     drop_constant,
-    second_moment_tensor,
     symmetric_product,
 )
 from heliograph.random_affine.moments.uncertain_law import (
@@ -226,7 +225,7 @@ def _mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
     if not isinstance(channel, Superposed):
         moments = channel.moments(2)
         mean = moments.mean[:-1]
-        raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+        raw = moments.second
         return mean, raw - symmetric_product(mean, mean)
     means, spreads = zip(*(_mean_and_spread(affine) for affine in channel.maps), strict=True)
     whole, size = channel.in_places(dict(enumerate(means)), 1), channel.inputs + 1

@@ -11,7 +11,6 @@ from heliograph.random_affine.moments.tensors import (
     Matrix,
     Tensor,
     drop_constant,
-    second_moment_tensor,
     symmetric_product,
 )
 
@@ -20,7 +19,7 @@ PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from di
 
 def tensors_of_law(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
     """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
-    raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    raw = moments.second
     law_mean = moments.mean[:-1]
     spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
     return spread, symmetric_product(law_mean - mean, law_mean - mean), drop_constant(raw)
@@ -74,7 +73,7 @@ def bound_from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: 
     # Middle and half width of each moment.
     middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
     half = Moments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
-    raw_radius = xp.abs(second_moment_tensor(half.matrix, half.outputs, half.inputs))
+    raw_radius = xp.abs(half.second)
     mean_radius = half.mean[:-1]
     spread, _, power = tensors_of_law(middle, mean)
     reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
