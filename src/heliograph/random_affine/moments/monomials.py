@@ -195,7 +195,7 @@ class Moments(Module):
 
     @property
     def second(self) -> Float[jax.Array | np.ndarray, "m m p+1 p+1"]:
-        """T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and (a, b); of order 2."""
+        """T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and (a, b); order 2."""
         rows = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
         columns = product_table(self.inputs + 1, 1, 1)
         shares = np.where(np.eye(self.inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b is at (a, b) and (b, a)
