@@ -75,8 +75,8 @@ def of_networks() -> list[Row]:
 def _of_node(network: hg.Network) -> int:
     """Count the operations that differ between runs and that these share, of a step and node."""
     code = code_of_network(network, np.zeros((STEPS, 0)), key_of(0), hg.Statistics(), 64).begun.program.code
-    work = code.blocks.work + (0 if code.once is None else code.once.work)
-    return int(round(work / STEPS / len(network.names)))
+    work: float = code.blocks.work + (0 if code.once is None else code.once.work)
+    return round(work / STEPS / len(network.names))
 
 
 def table() -> list[Row]:

@@ -6,7 +6,7 @@ Their zeros and ones are known when the program is made, to save operations.
 
 import os
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -232,9 +232,8 @@ def natively(
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts, memory = [], list(_parts(network)), list[list[np.ndarray]]()
     for number, some in enumerate(parts):
-        code = try_native(
-            lambda: code_of_network(some, inputs, key, reducer, runs, parts=len(parts), precision=precision)
-        )  # noqa: B023
+        make = partial(code_of_network, some, inputs, key, reducer, runs, parts=len(parts), precision=precision)
+        code = try_native(make)
         if code is None:
             return None
 
