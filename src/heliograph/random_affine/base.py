@@ -258,6 +258,11 @@ class AbstractRandomAffine(Module):
         """The maps that this one is a series of, at any depth; itself alone where it is none."""
         return [self]
 
+    @property
+    def in_parallel(self) -> list["AbstractRandomAffine"]:
+        """The maps whose outputs stand one after another in this one, at any depth; itself alone if it is no stack."""
+        return [self]
+
     def covers(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
         """Test whether another map is written like this one, its laws within what this one believes possible.
 

@@ -247,6 +247,11 @@ class Stack(AbstractCombination):
         rows = stack_parts(stack_rows(self, order, tables, multiply_rows))
         return rows[:, 0], rows[:, 1]
 
+    @property
+    def in_parallel(self) -> list[AbstractRandomAffine]:
+        """Its maps, those of stacks within it too."""
+        return [m for affine in self.maps for m in affine.in_parallel]
+
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
         """A stack of maps that are covered one by one."""
         return self.covers_maps(own, same_noise)

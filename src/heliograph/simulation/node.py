@@ -1,6 +1,6 @@
 """Nodes of a network: a sensor, the channel of its signal, and the filters that receive it."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import equinox as eqx
@@ -27,7 +27,6 @@ from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.modes import ModeOutput, OneStepLate
 
 FUSED = "fused"  # the name under which results of several nodes stand
@@ -40,7 +39,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
     Raises:
         ValueError: a flag of another step; no flag where a filter uses the mode.
     """
-    rows = [row for channel in channels for row in _rows(channel)]
+    rows = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
     # Flags stand after the measurement; each comes from one row of the channels.
     for reader in _readers(filter):
         if isinstance(reader, ModeObservedFilter):
@@ -64,15 +63,6 @@ def _readers(filter: AbstractFilter) -> list[SideInformationFilter | ModeObserve
         for leaf in leaves
         if isinstance(leaf, ModeObservedFilter) or (isinstance(leaf, SideInformationFilter) and leaf.flagged)
     ]
-
-
-def _rows(channel: AbstractRandomAffine) -> Iterator[AbstractRandomAffine]:
-    """Yield for each output the map that it comes from."""
-    if isinstance(channel, Stack):
-        for affine in channel.maps:
-            yield from _rows(affine)
-    else:
-        yield from [channel] * channel.outputs
 
 
 def _reveals(affine: AbstractRandomAffine, late: bool) -> bool:

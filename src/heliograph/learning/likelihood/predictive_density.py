@@ -17,7 +17,6 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.components import Component
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 
@@ -156,7 +155,7 @@ class StackDensities(tuple[StackDensity, ...]):
     @staticmethod
     def of(channel: AbstractRandomAffine, nodes: int) -> "StackDensities":
         """Combinations of each part of a stack, of everything else as a whole."""
-        parts = channel.maps if isinstance(channel, Stack) else (channel,)
+        parts = channel.in_parallel
         return StackDensities(_part(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
 
 

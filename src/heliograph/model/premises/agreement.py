@@ -20,7 +20,7 @@ from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.module import same
 from heliograph.numerics.traced import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.combine import Series
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Constant
@@ -206,8 +206,9 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
         return False
     if a.covers(b, lambda x, y: _same_noise(x, y, order)):
         return True
-    if isinstance(a, Stack) and isinstance(b, Stack) and [m.outputs for m in a.maps] == [m.outputs for m in b.maps]:
-        return all(_same_map(x, y, order, loses) for x, y in zip(a.maps, b.maps, strict=True))
+    parts, others = a.in_parallel, b.in_parallel
+    if len(parts) > 1 and [m.outputs for m in parts] == [m.outputs for m in others]:
+        return all(_same_map(x, y, order, loses) for x, y in zip(parts, others, strict=True))
     if not loses:
         return False
     try:

@@ -200,10 +200,10 @@ def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
 
 def _flag_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     """Modes of a channel all of whose modes are observed, with the map in each."""
-    parts = channel.maps if isinstance(channel, Stack) else ()
+    parts = channel.in_parallel
     rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
     chains = memories(channel)
-    if any(memory.drifts for memory in chains.values()) or len(parts) - len(rest) != len(chains):
+    if any(memory.drifts for memory in chains.values()) or not rest or len(parts) - len(rest) != len(chains):
         raise fail(f"channel of {name!r}", "chains whose modes are observed (hg.model.with_flag)", "one with memory")
     return joint_modes(rest[0] if len(rest) == 1 else Stack(rest), order=2)
 
