@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.route import apply
+from heliograph.random_affine.moments.route import apply
 from tests.planning.published import one_hop, two_hops
 
 PLANT = hg.LinearPlant([[0.9]], [[0.19]], [2.0], [[1.0]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.route import apply
+from heliograph.random_affine.moments.route import apply
 
 DRAWS = 2000
 LIMIT = 4.5 / np.sqrt(DRAWS)  # of a share's deviation, at most .5 standard deviations each: 9 sigma of the widest

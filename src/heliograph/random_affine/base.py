@@ -13,18 +13,18 @@ from heliograph.numerics.check import array, fail, items, show_value
 from heliograph.numerics.module import Module, readable, same, unwritten
 from heliograph.numerics.traced import is_traced, stack_parts
 from heliograph.numerics.types import Bool, Float, PyTree
-from heliograph.random_affine.components import Component
 from heliograph.random_affine.memory import (
     AbstractWithMemory,
     draw_with_shared_memories,
     init_with_shared_memories,
     memories,
 )
+from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import CORNERS, Interval
 from heliograph.random_affine.moments.monomials import Moments, count_monomials
+from heliograph.random_affine.moments.route import Position, Signal, Visit, carry_by_moments, refuse_gain_on_angles
 from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.route import Position, Signal, Visit, carry_by_moments, refuse_gain_on_angles
 
 T = TypeVar("T")
 KnownGains = Bool[np.ndarray, " m"]

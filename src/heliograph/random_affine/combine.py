@@ -22,9 +22,9 @@ from heliograph.random_affine.base import (
     check_forgets,
     check_maps,
 )
-from heliograph.random_affine.components import Component, combine
 from heliograph.random_affine.composite import ARROW, AbstractComposite, list_in_words
 from heliograph.random_affine.hop import known
+from heliograph.random_affine.moments.components import Component, combine
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, stack_gains
 from heliograph.random_affine.moments.intervals import Interval, multiply_matrices, multiply_rows
 from heliograph.random_affine.moments.monomials import (
@@ -35,8 +35,8 @@ from heliograph.random_affine.moments.monomials import (
     position,
     refuse_if_too_large,
 )
+from heliograph.random_affine.moments.route import Position, Signal, Visit
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
-from heliograph.random_affine.route import Position, Signal, Visit
 
 OUTCOME_LIMIT = 1024  # sets of losses that are listed
 Corners = Float[jax.Array | np.ndarray, "corner rows columns"]

@@ -12,7 +12,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, Outcome, check_m
 from heliograph.random_affine.composite import DIRECT, AbstractWrapper, percent_in_words
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import Moments
-from heliograph.random_affine.route import Position, Signal, Visit
+from heliograph.random_affine.moments.route import Position, Signal, Visit
 
 
 class Erasure(AbstractWrapper):

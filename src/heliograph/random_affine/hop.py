@@ -11,8 +11,8 @@ from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.traced import equal_to_rounding, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise
-from heliograph.random_affine.components import Component
 from heliograph.random_affine.law import AbstractLaw, Constant
+from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, disturb_hop, noise_gain
 from heliograph.random_affine.moments.intervals import Interval
 from heliograph.random_affine.moments.monomials import (
@@ -23,8 +23,8 @@ from heliograph.random_affine.moments.monomials import (
     sum_plan,
     symmetric_power,
 )
+from heliograph.random_affine.moments.route import Position, Visit, refuse_gain_on_angles
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_vector
-from heliograph.random_affine.route import Position, Visit, refuse_gain_on_angles
 
 NOTHING_SENT = "nothing sent"  # in words
 ROUNDING = 1e-12  # of a gain of 1 that was computed

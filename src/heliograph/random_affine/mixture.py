@@ -12,14 +12,14 @@ from heliograph.numerics.traced import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.combine import AbstractCombination, Corners
-from heliograph.random_affine.components import Component
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
 from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, mix_gains
 from heliograph.random_affine.moments.monomials import Moments, product_table
+from heliograph.random_affine.moments.route import Position, Visit
 from heliograph.random_affine.noise import Gaussian, Matrix
-from heliograph.random_affine.route import Position, Visit
 
 
 class Mixture(AbstractUniform, AbstractCombination):

@@ -23,8 +23,8 @@ from heliograph.random_affine.law import Constant
 from heliograph.random_affine.memory import condition_on_memories, memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.route import Position, Visit
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
-from heliograph.random_affine.route import Position, Visit
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
 

@@ -14,11 +14,11 @@ from heliograph.numerics.traced import library, scatter
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.combine import AbstractCombination, Corners, Series, Stack
-from heliograph.random_affine.components import Component
 from heliograph.random_affine.composite import list_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.memory import memories
+from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
 from heliograph.random_affine.moments.intervals import Interval
 from heliograph.random_affine.moments.monomials import (
@@ -32,8 +32,8 @@ from heliograph.random_affine.moments.monomials import (
     sum_plan,
     times_one,
 )
+from heliograph.random_affine.moments.route import Position, Visit
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_vector
-from heliograph.random_affine.route import Position, Visit
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y
 

@@ -17,8 +17,8 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.components import Component
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.moments.components import Component
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond
 Map = TypeVar("Map", bound=AbstractRandomAffine)

@@ -1,1 +1,1 @@
-"""Joint moments of random affine maps and of noises."""
+"""Joint moments of random affine maps and of noises, their atoms, and what becomes of a signal that passes."""
