@@ -14,7 +14,7 @@ from heliograph.numerics.check import check_count, check_seed, fail, instance, s
 from heliograph.numerics.module import readable, same
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.law import AbstractLaw, Constant
+from heliograph.random_affine.law import AbstractLaw
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo
@@ -99,11 +99,8 @@ def _only_node(network: Network) -> tuple[str, Node]:
 def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
     """Channel with `law` in the place of the gain in question."""
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
-    laws = [
-        leaf
-        for leaf in jax.tree.leaves(single, is_leaf=_is_law_leaf)
-        if _is_law_leaf(leaf) and not isinstance(leaf, Constant)
-    ]
+    leaves = jax.tree.leaves(single, is_leaf=_is_law_leaf)
+    laws = [leaf for leaf in leaves if _is_law_leaf(leaf) and leaf.constant is None]
     of_pair = [leaf for leaf in laws if any(same(leaf, law) for law in pair)]
     chosen = of_pair or [leaf for leaf in laws if same(leaf, laws[0])]
     if not of_pair and not 0 < len(chosen) == len(laws):

@@ -152,7 +152,7 @@ class GainAndNoise(AbstractHop):
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Those that take nothing but known inputs, by a constant gain."""
         takes = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
-        rows: KnownGains = isinstance(self.law, Constant) & ~np.any(takes & ~known, axis=1)
+        rows: KnownGains = (self.law.constant is not None) & ~np.any(takes & ~known, axis=1)
         return rows
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -164,9 +164,10 @@ class GainAndNoise(AbstractHop):
         touched = np.flatnonzero(np.any(np.asarray(self.matrix)[:, list(sent)] != 0, axis=1))
         if not touched.size:
             return ()
-        if not isinstance(self.law, Constant) or is_traced(self.law.value):
+        gain = self.law.constant
+        if gain is None or is_traced(gain):
             raise refuse_gain_on_angles(f"a gain that is {type(self.law).__name__}")
-        rows = float(self.law.value) * np.asarray(self.matrix)[touched]
+        rows = float(gain) * np.asarray(self.matrix)[touched]
         whole = np.abs(rows - np.round(rows)) <= ROUNDING
         if not np.all(whole & (np.round(rows) >= 0)) or np.any(np.round(rows).sum(axis=1) != 1):
             raise refuse_gain_on_angles(f"the gains {rows[rows != 0].tolist()}")
@@ -189,10 +190,10 @@ class GainAndNoise(AbstractHop):
         if not matrix.any():
             return NOTHING_SENT
         diagonal = matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
-        if not isinstance(self.law, Constant):
+        if self.law.constant is None:
             return f"{type(self.law).__name__} hop"
-        gain = float(self.law.value) * matrix[0, 0] if diagonal else np.nan
-        selects = float(self.law.value) == 1 and np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
+        gain = float(self.law.constant) * matrix[0, 0] if diagonal else np.nan
+        selects = float(self.law.constant) == 1 and np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
         if silent and (gain == 1 or selects):
             return ""
         kind = "known gain" if silent else "hop"
@@ -213,7 +214,8 @@ class GainAndNoise(AbstractHop):
     @property
     def _gain_is_one(self) -> bool:
         """True of a gain that is known to be one."""
-        return isinstance(self.law, Constant) and not is_traced(self.law.value) and float(self.law.value) == 1.0
+        gain = self.law.constant
+        return gain is not None and not is_traced(gain) and float(gain) == 1.0
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Return the map E[g] A y + n."""

@@ -41,6 +41,11 @@ class AbstractLaw(Module):
     Its parameters are numbers, or traced by JAX: then so are its moments.
     """
 
+    @property
+    def constant(self) -> Scalar | None:
+        """The gain where it is one number; None where it is random."""
+        return None
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw one gain; shape ()."""
         raise unwritten(self, "sample")
@@ -98,6 +103,11 @@ class Constant(AbstractLaw):
 
     def __init__(self, value: "Float[ArrayLike, '']"):
         self.value = scalar("constant gain", value)
+
+    @property
+    def constant(self) -> Scalar:
+        """The value."""
+        return self.value
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Return the value; the key is unused."""

@@ -17,7 +17,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.law import AbstractLaw, Discrete
 from heliograph.random_affine.moments.components import Component
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond
@@ -37,8 +37,8 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
     check_count("nodes of a law", count, 2)
     if isinstance(law, Discrete):
         return Discrete(law.values, law.probabilities)
-    if isinstance(law, Constant):
-        return Discrete([float(law.value)], [1.0])
+    if law.constant is not None:
+        return Discrete([float(law.constant)], [1.0])
     # F^-1(Phi(t)) at the nodes
     points, weights = _normal_nodes(count)
     return Discrete(law.quantile(points), weights)
@@ -51,7 +51,7 @@ def discretise_laws(channel: Map, count: int) -> Map:
         return isinstance(leaf, AbstractLaw)
 
     def chosen(leaf: object) -> object:
-        return law_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and not isinstance(leaf, Constant) else leaf
+        return law_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and leaf.constant is None else leaf
 
     discrete: Map = jax.tree.map(chosen, channel, is_leaf=is_law)
     return discrete
