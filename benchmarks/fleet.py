@@ -20,7 +20,7 @@ from alone import show
 from timeline import readme_network
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.message import read_messages
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
@@ -53,13 +53,13 @@ def rounds(plants: int, stored: bool) -> Taken:
     """Least seconds of all messages, of each kind."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        lanes = NetworkProgram(readme_network())
+        program = NetworkProgram(readme_network())
     sent = lines(plants)
-    Service(Fleet(lanes, Options(WINDOW)), InMemoryStore()).take(sent[:1])  # compiled
+    Service(Fleet(program, Options(WINDOW)), InMemoryStore()).take(sent[:1])  # compiled
     results = []
     for _ in range(ROUNDS):
         with tempfile.TemporaryDirectory(dir=Path(__file__).parent) as folder:  # on a disk, not in memory
-            fleet = Fleet(lanes, Options(WINDOW))
+            fleet = Fleet(program, Options(WINDOW))
             service = Service(fleet, Store(f"{folder}/fleet.db", identity(fleet)) if stored else InMemoryStore())
             begun, worked, committed = time.perf_counter(), time.process_time(), 0.0
             for begin in range(0, len(sent), BATCH):

@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore

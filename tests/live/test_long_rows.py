@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 
 
 @pytest.mark.slow

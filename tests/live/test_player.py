@@ -6,7 +6,7 @@ import jax
 import pytest
 
 import heliograph as hg
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.simulation.runs.side_by_side import StackedFilters
 from tests.live import worlds
 

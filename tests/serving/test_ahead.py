@@ -21,16 +21,16 @@ def network():
 
 
 @pytest.fixture(scope="module")
-def lanes():
+def program():
     return NetworkProgram(network())
 
 
-def service(lanes, forecast):
-    return Service(Fleet(lanes, Options(window=5.0, step=2.0)), InMemoryStore(), forecast=horizons_in(forecast))
+def service(program, forecast):
+    return Service(Fleet(program, Options(window=5.0, step=2.0)), InMemoryStore(), forecast=horizons_in(forecast))
 
 
-def test_a_service_publishes_what_a_timeline_forecasts(lanes):
-    served, timeline = service(lanes, "2s,1min"), hg.Timeline(network(), 5.0)
+def test_a_service_publishes_what_a_timeline_forecasts(program):
+    served, timeline = service(program, "2s,1min"), hg.Timeline(network(), 5.0)
     for k, value in enumerate((1.0, -0.5, 0.7)):
         time = (BEGUN + timedelta(seconds=2 * k)).isoformat()
         body = {"plant": "p", "node": "a", "sequence": k, "time": time, "values": [value]}
@@ -47,6 +47,6 @@ def test_a_service_publishes_what_a_timeline_forecasts(lanes):
 
 
 @pytest.mark.parametrize("text", ["3s", "2026-12-01", "4s,2s", "0s"])
-def test_horizons_that_a_service_cannot_keep_are_refused(lanes, text):
+def test_horizons_that_a_service_cannot_keep_are_refused(program, text):
     with pytest.raises(ValueError, match="--forecast: expected"):
-        service(lanes, text)
+        service(program, text)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.estimate_writer import HEAD, EstimateWriter, line
 from tests.losing import Losing
 from tests.serving.worlds import fleet, stepping
 
 
 def stepped() -> NetworkProgram:
-    return fleet(stepping()).lanes
+    return fleet(stepping()).program
 
 
 def weighed() -> NetworkProgram:
@@ -27,18 +27,18 @@ def weighed() -> NetworkProgram:
     )
 
 
-@pytest.mark.parametrize("lanes", [stepped, pytest.param(weighed, marks=pytest.mark.slow)])
-def test_a_line_from_the_template_is_that_of_its_row(lanes):
+@pytest.mark.parametrize("program", [stepped, pytest.param(weighed, marks=pytest.mark.slow)])
+def test_a_line_from_the_template_is_that_of_its_row(program):
     generator = np.random.default_rng(0)
-    lanes = lanes()
-    writer, size = EstimateWriter(lanes), lanes.step_rows.outputs.size
+    program = program()
+    writer, size = EstimateWriter(program), program.step_rows.outputs.size
     # Plain rows, rows with a number that is none, and rows with one that is negative or raises a flag.
     outputs = np.abs(generator.normal(size=(300, size))) * 10.0 ** generator.integers(-30, 30, (300, size))
     for row in outputs[100:]:
         row[generator.integers(size)] = generator.choice([np.nan, np.inf, -1.0])
-    counts = [i for columns in lanes.places for i in (columns.judgement or columns.tested or ())[1:2]]
+    counts = [i for columns in program.places for i in (columns.judgement or columns.tested or ())[1:2]]
     outputs[:, counts] = generator.integers(0, 3, (300, len(counts)))
-    reasons = [columns.judgement.reason for columns in lanes.places if columns.judgement is not None]
+    reasons = [columns.judgement.reason for columns in program.places if columns.judgement is not None]
     outputs[:, reasons] = 2 * generator.integers(0, 2, (300, len(reasons))) * (np.arange(300)[:, None] >= 200)
     rows = [(f'p{i}, "%b"', float(i) if i % 3 else "2026-11-26T00:00:00+00:00") for i in range(300)]
     written = writer.lines(b"final", rows, outputs)

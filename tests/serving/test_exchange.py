@@ -16,7 +16,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.url import parse_address
 from heliograph.serving.message import Message

@@ -75,7 +75,7 @@ def test_limits_hold_here_too_and_it_is_said_once():
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, {"f": item}, limits=(-5, 5), invalid=-999)})
     said = []
     from heliograph.live.fleet import Fleet, Options
-    from heliograph.live.lanes import NetworkProgram
+    from heliograph.live.network_program import NetworkProgram
 
     service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore(), said.append)
     sent = [{"node": "a", "sequence": k, "time": k, "values": [v]} for k, v in enumerate([0.3, -999, 6.0, 1e20, 0.4])]
@@ -86,7 +86,7 @@ def test_limits_hold_here_too_and_it_is_said_once():
     assert (link.used, link.implausible, link.dropped, link.lost) == (2, 3, 3, 0)
     assert len(said) == 1 and said[0].startswith("warning: message 1 of 'a' is implausible: y0 -999 is a code; ")
     hidden = fleet(stepping())  # the identity of a store knows the limits
-    assert hidden.lanes.network is not network
+    assert hidden.program.network is not network
 
 
 @pytest.mark.slow
@@ -98,7 +98,7 @@ def test_a_filter_that_alone_leaves_a_value_out_says_so():
     filters = {"lost": lost, "fine": hg.linear_filter(plant, SENSOR, HOP)}
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, filters)})
     from heliograph.live.fleet import Fleet, Options
-    from heliograph.live.lanes import NetworkProgram
+    from heliograph.live.network_program import NetworkProgram
 
     service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore())
     (known,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import LinkCounts
 from heliograph.serving.observation.page import Tallies
 from heliograph.serving.observation.watch import watch_of

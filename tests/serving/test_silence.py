@@ -27,7 +27,7 @@ class Clock(datetime):
 
 
 @pytest.fixture(scope="module")
-def lanes():
+def program():
     plant, sensor = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
     trigger = hg.SendOnDelta(0.6, heartbeat=600)
     filters = {"event": hg.event_filter(plant, sensor, hg.perfect(), trigger, known=1, lost=1)}
@@ -41,8 +41,8 @@ def clock(monkeypatch):
     return Clock
 
 
-def begun(lanes, path, every=None):
-    fleet = Fleet(lanes, Options(window=5.0, step=1.0))
+def begun(program, path, every=None):
+    fleet = Fleet(program, Options(window=5.0, step=1.0))
     return Service(fleet, Store(str(path), identity(fleet)), every=every)
 
 
@@ -61,9 +61,9 @@ def wait(service, clock, until):
     return results
 
 
-def test_four_silent_thermometers_write_and_tell_next_to_nothing(lanes, clock, tmp_path):
+def test_four_silent_thermometers_write_and_tell_next_to_nothing(program, clock, tmp_path):
     """Ten minutes from the last value on, as a share of 10 MB a day; the database and its log, and what is told."""
-    service = begun(lanes, tmp_path / "a.db")
+    service = begun(program, tmp_path / "a.db")
     for i in range(4):
         send(service, 0.0, 0.2, 0, f"p{i}")
         send(service, 1.0, 0.9, 1, f"p{i}")
@@ -84,9 +84,9 @@ def test_four_silent_thermometers_write_and_tell_next_to_nothing(lanes, clock, t
         assert set(plant.links) == {"a"} and (link.used, link.lost) == (2, 0)
 
 
-def test_four_thermometers_that_only_say_that_they_live_write_less_than_ten_megabytes_a_day(lanes, clock, tmp_path):
+def test_four_thermometers_that_only_say_that_they_live_write_less_than_ten_megabytes_a_day(program, clock, tmp_path):
     """A heartbeat of each in ten minutes, in commits of their own: pages of 16 kB and the states' zeros made it 67."""
-    service = begun(lanes, tmp_path / "a.db")
+    service = begun(program, tmp_path / "a.db")
 
     def beat(sequence):
         for i in range(4):
@@ -108,16 +108,16 @@ def test_four_thermometers_that_only_say_that_they_live_write_less_than_ten_mega
     assert service.fleet.pool.table[again.slot].tobytes() == numbers.tobytes()
 
 
-def test_what_was_received_becomes_final_in_silence_and_once(lanes, clock, tmp_path):
-    service = begun(lanes, tmp_path / "a.db")
+def test_what_was_received_becomes_final_in_silence_and_once(program, clock, tmp_path):
+    service = begun(program, tmp_path / "a.db")
     send(service, 0.0, 0.2, 0)
     send(service, 1.0, 0.9, 1)
     told = wait(service, clock, 30)
     assert [json.loads(output.body)["time"][17:19] for output in told if output.kind == "final"] == ["00", "01"]
 
 
-def test_silence_is_that_of_a_timeline_and_a_value_ends_it(lanes, clock, tmp_path):
-    service, line = begun(lanes, tmp_path / "a.db", every=1.0), hg.Timeline(lanes.network, window=5.0)
+def test_silence_is_that_of_a_timeline_and_a_value_ends_it(program, clock, tmp_path):
+    service, line = begun(program, tmp_path / "a.db", every=1.0), hg.Timeline(program.network, window=5.0)
     send(service, 0.0, 0.2, 0)
     line.push("a", 0, 0, [0.2])
     last = json.loads(wait(service, clock, 20)[-1].body)
@@ -129,8 +129,8 @@ def test_silence_is_that_of_a_timeline_and_a_value_ends_it(lanes, clock, tmp_pat
         line.push("a", 1, 21, [1.1])
 
 
-def test_every_so_many_seconds_it_is_told_if_asked_for(lanes, clock, tmp_path):
-    quiet, often = begun(lanes, tmp_path / "a.db"), begun(lanes, tmp_path / "b.db", every=10.0)
+def test_every_so_many_seconds_it_is_told_if_asked_for(program, clock, tmp_path):
+    quiet, often = begun(program, tmp_path / "a.db"), begun(program, tmp_path / "b.db", every=10.0)
     for service in (quiet, often):
         clock.seconds = 0.0
         send(service, 0.0, 0.2, 0)
@@ -141,12 +141,12 @@ def test_every_so_many_seconds_it_is_told_if_asked_for(lanes, clock, tmp_path):
     assert len(wait(often, clock, 300)) == 10
 
 
-def test_a_dead_sender_is_dead_after_a_restart_too(lanes, clock, tmp_path, monkeypatch):
-    service = begun(lanes, tmp_path / "a.db")
+def test_a_dead_sender_is_dead_after_a_restart_too(program, clock, tmp_path, monkeypatch):
+    service = begun(program, tmp_path / "a.db")
     send(service, 0.0, 0.2, 0)
     wait(service, clock, 620)
     assert service.dead_senders() == {"a": 1} and service.dead_by_plant() == {"p0": ["a"]}
-    again = begun(lanes, tmp_path / "a.db")
+    again = begun(program, tmp_path / "a.db")
     again.resume()
     assert list(again.plants) == ["p0"]
     clock.seconds = 621.0

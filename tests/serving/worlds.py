@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
 HOP = hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), 0.05)
@@ -32,7 +32,7 @@ def stepping() -> hg.Network:
 
 
 def fleet(network: hg.Network, window: float = WINDOW, **options: float) -> Fleet:
-    """A fleet of its own, of lanes that all share."""
+    """A fleet of its own, of a program that all share."""
     return Fleet(_lanes(id(network)), Options(window, **options))
 
 

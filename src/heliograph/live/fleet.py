@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
-from heliograph.live.lanes import NetworkProgram
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
+from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
@@ -60,20 +60,20 @@ class Fleet:
     Which plants share a fleet, and how events are cut into batches, changes no bit of an estimate.
 
     Args:
-        lanes: the compiled step of the network.
+        program: the compiled step of the network.
         options: the limits of events and of memory.
         alone: single rows are stepped, not those of many plants at once.
     """
 
-    def __init__(self, lanes: NetworkProgram, options: Options, alone: bool = False):
-        instance("lanes", lanes, NetworkProgram, "NetworkProgram")
+    def __init__(self, program: NetworkProgram, options: Options, alone: bool = False):
+        instance("program", program, NetworkProgram, "NetworkProgram")
         instance("options", options, Options, "Options")
-        network = self.network = lanes.network
-        self.options, self.lanes = _check_options(options), lanes
-        self.pool = Pool(lanes, alone)
+        network = self.network = program.network
+        self.options, self.program = _check_options(options), program
+        self.pool = Pool(program, alone)
         # Index and size of each node's measurement, and of the inputs; their columns in a row, in this order.
         self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
-        self.sizes[INPUTS] = -1, self.lanes.given
+        self.sizes[INPUTS] = -1, self.program.given
         sizes = [size for _, size in self.sizes.values()]
         self._places = [slice(int(end) - size, int(end)) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
         self.width = self._places[-1].stop
@@ -81,7 +81,7 @@ class Fleet:
         covered = steps_covered(network)
         self.end_step = np.inf if covered is None else covered - 1
         self._names = [*network.names, INPUTS]
-        self._joint = self.lanes.dt is None or network.common is not None
+        self._joint = self.program.dt is None or network.common is not None
         self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
         # Nodes whose sender decides when to send.
         nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
@@ -107,12 +107,12 @@ class Fleet:
 
     def begin(self, name: str, time: float, origin: datetime | None) -> PlantState:
         """Add a plant, whose continuous time starts at `time`."""
-        begun = -1.0 if self.lanes.dt is None else time
+        begun = -1.0 if self.program.dt is None else time
         slot = self.pool.take()
         self.pool.start(slot, begun)
         base = HeldRow((begun, BEFORE, 0), slot, self.width)
         base.numbers[-1] = begun
-        return PlantState(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
+        return PlantState(name, self.rows(base), time if self.program.dt is not None else 0.0, origin)
 
     def end(self, plant: PlantState) -> None:
         """Remove a plant and free its slots."""
@@ -192,7 +192,7 @@ class Fleet:
 
     def check_step(self, name: str, time: float) -> None:
         """Refuse a time that is no step of the network, where time counts steps."""
-        if self.lanes.dt is None and not (0 <= time <= self.end_step and time == int(time)):
+        if self.program.dt is None and not (0 <= time <= self.end_step and time == int(time)):
             end = "" if self.end_step == np.inf else f" to {self.end_step:g}"
             raise fail(name, f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
 
@@ -221,7 +221,7 @@ class Fleet:
             wall: time by the clock on the wall, if it is known.
             clock: name of the node by whose clock it is dated (None: its own).
         """
-        if self.lanes.dt is None and event.time > LAST_STEP:
+        if self.program.dt is None and event.time > LAST_STEP:
             return "future"
         leap, said = self.options.leap, event.arrival if given else event.time
         clock = ARRIVAL if given else clock or self._names[event.node_index]
@@ -273,7 +273,7 @@ class Fleet:
 
     def _run(self, chains: Sequence[list[HeldRow]]) -> None:
         """Step along chains of rows, whose numbers stand in the table, from the first of each."""
-        walks = [cut_into_legs(chain, self.lanes.dt is None, self.end_step == np.inf) for chain in chains]
+        walks = [cut_into_legs(chain, self.program.dt is None, self.end_step == np.inf) for chain in chains]
         # All chains up to their first long gap at once, over these one by one, and so on.
         while walks:
             for steps in group_by_turn(legs[0].steps for legs in walks):

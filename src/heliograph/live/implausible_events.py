@@ -32,7 +32,7 @@ class Judges:
     """Reader of the filters' judgements of the rows that were just stepped."""
 
     def __init__(self, fleet: Fleet):
-        self.fleet, places = fleet, fleet.lanes.places
+        self.fleet, places = fleet, fleet.program.places
         central = _judgement_columns([output for output in places if output.node == Network.FUSED])
         self._judgement_columns, self._central = {}, set[int]()  # nodes without a filter of their own
         for index, name in enumerate(fleet.network.names):
@@ -106,7 +106,7 @@ class Judges:
         pool, index = self.fleet.pool, plant.rows.index(row.key)
         before, after = plant.rows.held[index - 1], pool.table[row.slot, pool.outputs]
         known = pool.table[before.slot, pool.outputs]
-        for place in self.fleet.lanes.places:
+        for place in self.fleet.program.places:
             filter = filter_of(self.fleet, place)
             judged = place.judgement is not None and Judgement.is_spoilt(after[place.judgement.reason])
             concerned = event.node_index < 0 or place.node in (
@@ -180,7 +180,7 @@ class FleetAngles:
 
     def __init__(self, fleet: Fleet):
         self._pool, self._watched = fleet.pool, list[tuple[str, np.ndarray, WideAngles]]()
-        for place in fleet.lanes.places:
+        for place in fleet.program.places:
             filter = filter_of(fleet, place)
             if filter is not None and (angles := WideAngles(filter)).states:
                 n = len(filter.states)

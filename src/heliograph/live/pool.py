@@ -6,8 +6,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from heliograph.live.lanes import NetworkProgram
 from heliograph.live.long_gap import LONG, TAIL, factors_in, states_after
+from heliograph.live.network_program import NetworkProgram
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
 from heliograph.simulation.rows.row_smoother import RowHistory
@@ -23,10 +23,10 @@ class Pool:
     last three, as in the rows of a timeline. `alone`: single rows are stepped, not many at once.
     """
 
-    def __init__(self, lanes: NetworkProgram, alone: bool = False):
-        self.lanes, self.step_rows, self._alone = lanes, lanes.step_rows, alone
+    def __init__(self, program: NetworkProgram, alone: bool = False):
+        self.program, self.step_rows, self._alone = program, program.step_rows, alone
         sizes = self.step_rows.state.size, self.step_rows.outputs.size
-        ends = np.cumsum([*sizes, lanes.given, 1, lanes.received + lanes.given + 1])
+        ends = np.cumsum([*sizes, program.given, 1, program.received + program.given + 1])
         self.state, self.outputs, self.held, self.at, self.numbers = (
             slice(int(begin), int(end)) for begin, end in zip([0, *ends], ends, strict=False)
         )
@@ -63,11 +63,11 @@ class Pool:
         The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
         number is at most `last`.
         """
-        dt, table = self.lanes.dt, self.table
+        dt, table = self.program.dt, self.table
         u = np.where(np.isnan(given), table[before, self.held], given)
         u = u if dt is None else _insert_time_step(u, dt, np.ones(len(u)))
         k = np.minimum(table[before, self.at.start] + 1, last)
-        nothing = np.full((len(before), self.lanes.received), np.nan)
+        nothing = np.full((len(before), self.program.received), np.nan)
         done = self.step_rows(np.concatenate([table[before, self.state], nothing, u, k[:, None]], axis=1), self._alone)
         return done[:, self.step_rows.state.size :]
 
@@ -77,9 +77,9 @@ class Pool:
         In discrete time a row is reached by as many steps as lie between it and the row before; its measurement is
         received at the last of these.
         """
-        dt, table = self.lanes.dt, self.table
+        dt, table = self.program.dt, self.table
         numbers, held = table[after, self.numbers], table[before, self.held]
-        received, given = numbers[:, : self.lanes.received], numbers[:, self.lanes.received : -1]
+        received, given = numbers[:, : self.program.received], numbers[:, self.program.received : -1]
         now_held = np.where(np.isnan(given), held, given)
         if dt is None:
             there = (at == numbers[:, -1])[:, None]
@@ -94,7 +94,7 @@ class Pool:
 
     def led(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
         """Return the inputs that led from the row in one slot to that in another, and the number of the step there."""
-        dt, table = self.lanes.dt, self.table
+        dt, table = self.program.dt, self.table
         u = table[after if dt is None else before, self.held]
         if dt is not None:
             u = _insert_time_step(u[None], dt, table[[after], self.numbers.stop - 1] - table[[before], -1])[0]
@@ -104,7 +104,7 @@ class Pool:
         """Take the row in a slot, in place, to step number `to` without measurements, in bounded work."""
         row = self.table[slot]
         at, held = int(row[self.at.start]), row[self.held]
-        nothing = np.full(self.lanes.received, np.nan)
+        nothing = np.full(self.program.received, np.nan)
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
             rest = np.broadcast_to(np.concatenate([nothing, held, [k]]), (len(states), len(nothing) + len(held) + 1))

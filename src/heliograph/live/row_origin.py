@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.model.estimate import Estimate, lower_unsound_claim
 from heliograph.model.origin import Origin
 
@@ -16,19 +16,19 @@ def row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
         slot: of the row.
         time: of the row, in steps or in the unit of dt.
     """
-    pool, lanes = fleet.pool, fleet.lanes
+    pool, program = fleet.pool, fleet.program
     row = pool.table[slot].copy()
-    inputs = row[pool.held] if lanes.dt is None else np.insert(row[pool.held], lanes.dt, np.nan)
-    spacing = float("nan") if lanes.dt is not None else 1.0
-    state, estimates = lanes.step_rows.state.tree(row[pool.state]), estimates_by_name(lanes, row[pool.outputs])
-    return Origin(lanes.network, state, int(row[pool.at.start]) + 1, inputs, time, spacing, estimates)
+    inputs = row[pool.held] if program.dt is None else np.insert(row[pool.held], program.dt, np.nan)
+    spacing = float("nan") if program.dt is not None else 1.0
+    state, estimates = program.step_rows.state.tree(row[pool.state]), estimates_by_name(program, row[pool.outputs])
+    return Origin(program.network, state, int(row[pool.at.start]) + 1, inputs, time, spacing, estimates)
 
 
-def estimates_by_name(lanes: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
     """Arrange the outputs of a row, or of rows, by node and filter."""
-    n = len(lanes.network.states)
-    estimates: dict[str, dict[str, Estimate]] = {node: {} for node in lanes.claims}
-    for place in lanes.places:
+    n = len(program.network.states)
+    estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}
+    for place in program.places:
         mean = outputs[..., place.mean : place.mean + n]
         covariance = outputs[..., place.covariance : place.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
         estimates[place.node][place.filter] = lower_unsound_claim(Estimate(mean, covariance, place.claim))

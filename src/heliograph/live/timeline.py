@@ -12,7 +12,7 @@ from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, moment, numbers
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.implausible_events import FleetAngles, Judges
-from heliograph.live.lanes import shared_lanes
+from heliograph.live.network_program import shared_program
 from heliograph.live.plant import LinkCounts
 from heliograph.live.row_origin import estimates_by_name, row_origin
 from heliograph.live.rows import BEFORE, HeldRow
@@ -98,7 +98,7 @@ class Timeline:
         if INPUTS in network.nodes:
             names = list(network.nodes)
             raise fail("node names", f"none called {INPUTS!r}, which stands for the plant's inputs", names)
-        self._lanes = shared_lanes(network)
+        self._lanes = shared_program(network)
         if self._lanes.dt is None and start != 0:
             raise fail("start", "0 where time counts steps", start)
         if what := self._lanes.uneven:
@@ -292,7 +292,7 @@ class Timeline:
             ValueError: no snapshot, or one of another network or version.
         """
         head, arrays = unpack(data)
-        mine, other = shared_lanes(network).identity, head.get("of", {})
+        mine, other = shared_program(network).identity, head.get("of", {})
         if accept_changes and mine != other:
             arrays = arrays | {"plant": cls._carry_over(network, head, arrays["plant"].tobytes())}
             return cls._resume(network, head, arrays)
@@ -303,8 +303,8 @@ class Timeline:
     def _carry_over(cls, network: Network, head: Mapping[str, Any], plant: bytes) -> np.ndarray:
         """Return the bytes of a plant that another network or version saved, as this one would."""
         window, ahead, capacity = head["options"]
-        fleet = Fleet(shared_lanes(network), Options(window, ahead, capacity=capacity), alone=True)
-        mine, other = fleet.lanes.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
+        fleet = Fleet(shared_program(network), Options(window, ahead, capacity=capacity), alone=True)
+        mine, other = fleet.program.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
         # A version before 0.3.0 did not write where states stand: it is known for the same nodes and filters.
         if DESCRIPTION not in head:
             check_same("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)

@@ -35,7 +35,7 @@ class ForecastPublisher:
     """
 
     def __init__(self, fleet: Fleet, horizons: Spans):
-        self._fleet, self._continuous = fleet, fleet.lanes.dt is not None
+        self._fleet, self._continuous = fleet, fleet.program.dt is not None
         if isinstance(horizons, int):
             if self._continuous:
                 raise fail("--forecast", "spans of time, such as 5s,1min, as no step is usual", horizons)

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.numerics.types import Float
 from heliograph.simulation.rows.columns import FilterColumns
 
@@ -29,20 +29,20 @@ class EstimateWriter:
     the line of a row that holds column numbers. Any other row is written filter by filter.
     """
 
-    def __init__(self, lanes: NetworkProgram):
-        self._n, n = len(lanes.network.states), len(lanes.network.states)
+    def __init__(self, program: NetworkProgram):
+        self._n, n = len(program.network.states), len(program.network.states)
         self._nodes: dict[str, list[FilterColumns]] = {}
-        for columns in lanes.places:
+        for columns in program.places:
             self._nodes.setdefault(columns.node, []).append(columns)
         # Columns that decide whether the template fits.
-        claimed = [columns.covariance for columns in lanes.places if columns.claim != "none"]
+        claimed = [columns.covariance for columns in program.places if columns.claim != "none"]
         self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]
-        self._reasons = [columns.judgement.reason for columns in lanes.places if columns.judgement is not None]
-        self._finite = [i for columns in lanes.places for i in range(columns.mean, columns.mean + n)]
-        self._finite += [i for columns in lanes.places for i in range(columns.covariance, columns.covariance + n * n)]
-        self._finite += [columns.tested.distance for columns in lanes.places if columns.tested is not None]
+        self._reasons = [columns.judgement.reason for columns in program.places if columns.judgement is not None]
+        self._finite = [i for columns in program.places for i in range(columns.mean, columns.mean + n)]
+        self._finite += [i for columns in program.places for i in range(columns.covariance, columns.covariance + n * n)]
+        self._finite += [columns.tested.distance for columns in program.places if columns.tested is not None]
         # The template, the columns that fill it, and which of these are whole numbers.
-        numbered = FIRST + np.arange(float(lanes.step_rows.outputs.size))
+        numbered = FIRST + np.arange(float(program.step_rows.outputs.size))
         numbered[self._reasons] = 0.0
         written = line(self._write_estimates(numbered.tolist()))
         filled = COLUMN.findall(written)

@@ -88,7 +88,7 @@ class Using:
         """Return the inputs that lead to no valid prediction from the state before the batch."""
         given = [(i, m, values) for i, m in enumerate(messages) if not isinstance(m, str | UnreadMessage)
                  and (values := m.values if m.node == INPUTS else m.inputs)
-                 and len(values) == self.fleet.lanes.given]  # fmt: skip
+                 and len(values) == self.fleet.program.given]  # fmt: skip
         plants = [self.plants.get(message.plant) for _, message, _ in given]
         numbers = np.array([values for *_, values in given], dtype=np.float64)
         why = self._judges.implausible_inputs(plants, numbers)
@@ -232,7 +232,7 @@ class Using:
         """Return midnight, UTC, before a plant's first message, or the date of step 0; None where times are numbers."""
         if not isinstance(message.time, datetime):
             return None
-        if self.fleet.lanes.dt is None:
+        if self.fleet.program.dt is None:
             return None if self.fleet.options.step is None else message.time
         return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
 

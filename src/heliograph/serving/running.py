@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.numerics.check import fail, instance
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
@@ -136,16 +136,16 @@ async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     _log_to_stderr()
     async with _watched(settings) as look:
-        lanes = await _compile_steps(settings.network)
-        if lanes is None:
+        program = await _compile_steps(settings.network)
+        if program is None:
             return
-        if lanes.uneven:
-            what = f"predictions depend on when others are asked for: {lanes.uneven}"
+        if program.uneven:
+            what = f"predictions depend on when others are asked for: {program.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
         if settings.parts is None:
-            await _alone(settings, lanes, look)
+            await _alone(settings, program, look)
         else:
-            await _shared(settings, lanes, look, settings.parts)
+            await _shared(settings, program, look, settings.parts)
 
 
 async def _compile_steps(network: Network) -> NetworkProgram | None:
@@ -153,10 +153,10 @@ async def _compile_steps(network: Network) -> NetworkProgram | None:
     stop = asyncio.Event()
     with signals(stop):
         try:
-            lanes = await Ending(stop).call(NetworkProgram, network)
+            program = await Ending(stop).call(NetworkProgram, network)
         except AbandonedError:
             return None
-    return None if stop.is_set() else lanes
+    return None if stop.is_set() else program
 
 
 def _log_to_stderr() -> None:
@@ -188,12 +188,12 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
         yield watch.wrap
 
 
-async def _alone(settings: ServiceSettings, lanes: NetworkProgram, look: Look) -> None:
+async def _alone(settings: ServiceSettings, program: NetworkProgram, look: Look) -> None:
     """Serve all messages in one process."""
     stop = asyncio.Event()
     reads = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
     step = settings.options.step if reads is None else reads.sources.step
-    fleet = Fleet(lanes, settings.options._replace(step=step))
+    fleet = Fleet(program, settings.options._replace(step=step))
     fleet.periods = {} if reads is None else reads.sources.periods
     with signals(stop), contextlib.ExitStack() as owning:
         # The store first, whose state the service goes on from.
@@ -246,7 +246,7 @@ def _say(what: str) -> None:
     print(f"heliograph: {what}", file=sys.stderr)
 
 
-async def _shared(settings: ServiceSettings, lanes: NetworkProgram, look: Look, parts: int) -> None:
+async def _shared(settings: ServiceSettings, program: NetworkProgram, look: Look, parts: int) -> None:
     """One process of several: the parts that it leases."""
     from heliograph.serving.storage.database import engine_at
     from heliograph.serving.storage.leases import Leases
@@ -255,7 +255,7 @@ async def _shared(settings: ServiceSettings, lanes: NetworkProgram, look: Look, 
 
     store_name, broker = str(settings.store), settings.broker
     assert broker is not None  # as Wanted checked
-    fleet = Fleet(lanes, settings.options)
+    fleet = Fleet(program, settings.options)
     # Check the store once, before any part is served.
     first = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet), asyncio.Event())
     assert isinstance(first, Store)  # as Wanted checked
@@ -266,7 +266,7 @@ async def _shared(settings: ServiceSettings, lanes: NetworkProgram, look: Look, 
         # The journal of a part continues with whichever process serves it.
         store = Store(store_name, mine, f"part {number} of {parts}", opened=first)
         try:
-            service = look(Service(Fleet(lanes, settings.options), store, _say))
+            service = look(Service(Fleet(program, settings.options), store, _say))
             await serve_until(stop, WaitingService(service, stop), make_transport(broker, Part(number, parts)))
         finally:
             store.close()

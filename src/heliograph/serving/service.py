@@ -13,7 +13,7 @@ from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
 from heliograph.live.implausible_events import FleetAngles
-from heliograph.live.lanes import NetworkProgram as NetworkProgram
+from heliograph.live.network_program import NetworkProgram as NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
@@ -83,7 +83,7 @@ class Service:
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, BatchStatistics(0, 0, 0.0, 0.0, 0.0)
-        self._writer, self._using = EstimateWriter(fleet.lanes), Using(fleet, self.plants)
+        self._writer, self._using = EstimateWriter(fleet.program), Using(fleet, self.plants)
         self._exchange, self._silence = Exchange(fleet, self._time_in_messages), Silence(fleet, every)
         self._angles, self._doubt = FleetAngles(fleet), say
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast)
@@ -142,7 +142,7 @@ class Service:
 
     def _make_step_messages(self, now: datetime) -> list[Message]:
         """Return a message of inputs that all stay as they were for each plant of which another step has begun."""
-        nothing: list[float | None] = [None] * self.fleet.lanes.given
+        nothing: list[float | None] = [None] * self.fleet.program.given
         return [
             Message.model_construct(
                 plant=plant.name, node=INPUTS, sequence=int(step), time=now, values=nothing, inputs=None, arrival=None

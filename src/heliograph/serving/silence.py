@@ -30,7 +30,7 @@ class Silence:
         self.fleet, self.every, self._begun = fleet, every, monotonic()
         self._told: dict[str, tuple[np.ndarray, tuple[str, ...], float]] = {}  # outputs, dead senders, step
         self._resumed = set[str]()
-        n, places = len(fleet.network.states), fleet.lanes.places
+        n, places = len(fleet.network.states), fleet.program.places
         self._means = np.array([[place.mean + i for i in range(n)] for place in places], dtype=int)
         self._variances = np.array([[place.covariance + i * (n + 1) for i in range(n)] for place in places], dtype=int)
 

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import LinkCounts
 from heliograph.live.stored.plant_codec import unpack_plant
 from heliograph.report.figures import BLUE, GREEN, VERMILION
@@ -101,12 +101,12 @@ def of_killed(drive: Drive, count: int, setting: Setting, stages: Stages) -> tup
 
 def of_speed(drive: Drive, setting: Setting) -> dict[str, int]:
     """Steps a second, by where the messages come from."""
-    lanes, options, lines = _lanes(), Options(WINDOW), many_plants(drive.lines, setting.messages)
-    in_memory(lanes, options, lines[:2000])  # compiles
-    speed = {"jsonlines": in_memory(lanes, options, lines)}
+    program, options, lines = _lanes(), Options(WINDOW), many_plants(drive.lines, setting.messages)
+    in_memory(program, options, lines[:2000])  # compiles
+    speed = {"jsonlines": in_memory(program, options, lines)}
     with TemporaryDirectory() as name, Server(Path(name)) as server:
         for kind in ("mqtt", "nats"):
-            speed[kind] = asyncio.run(through(kind, Path(name), server, lanes, options, lines))
+            speed[kind] = asyncio.run(through(kind, Path(name), server, program, options, lines))
     return {name: round(value) for name, value in speed.items()}
 
 

@@ -11,7 +11,7 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.brokers.url import Address, parse_address
 from heliograph.serving.loop import serve_until
 from heliograph.serving.message import Payload
@@ -63,9 +63,9 @@ class Counted:
         return self.service.finish(ended)
 
 
-def in_memory(lanes: NetworkProgram, options: Options, lines: Sequence[bytes]) -> float:
+def in_memory(program: NetworkProgram, options: Options, lines: Sequence[bytes]) -> float:
     """Steps a second of a service that keeps nothing."""
-    service = Service(Fleet(lanes, options), InMemoryStore())
+    service = Service(Fleet(program, options), InMemoryStore())
     begun = perf_counter()
     for i in range(0, len(lines), BATCH):
         service.take(lines[i : i + BATCH])
@@ -73,13 +73,13 @@ def in_memory(lanes: NetworkProgram, options: Options, lines: Sequence[bytes]) -
 
 
 async def through(
-    kind: str, folder: Path, server: Server, lanes: NetworkProgram, options: Options, lines: Sequence[bytes]
+    kind: str, folder: Path, server: Server, program: NetworkProgram, options: Options, lines: Sequence[bytes]
 ) -> float:
     """Steps a second through a broker that has the messages already, estimates published to it, commits on disk."""
     where = parse_address(f"{kind}://127.0.0.1:{getattr(server, kind)}/speed-{kind}", {})
     await _subscribed(where)
     await (_sent(where, lines) if kind == "nats" else asyncio.to_thread(_published, where, lines))
-    fleet, stop = Fleet(lanes, options), asyncio.Event()
+    fleet, stop = Fleet(program, options), asyncio.Event()
     store = Store(str(folder / f"{kind}.sqlite"), identity(fleet))
     counted = Counted(Service(fleet, store), len(lines), stop)
     try:

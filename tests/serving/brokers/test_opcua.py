@@ -11,7 +11,7 @@ from asyncua import Server, ua
 import heliograph as hg
 from heliograph.files.inspection import Topic, suggestion
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.listening import listen
 from heliograph.serving.brokers.opcua import Reporting, read_reporting, reporting_of

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.live.stored.migration import Carrier
 from heliograph.live.stored.plant_codec import unpack_plant
 from heliograph.serving.service import Service

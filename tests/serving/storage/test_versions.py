@@ -18,7 +18,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.lanes import NetworkProgram
+from heliograph.live.network_program import NetworkProgram
 from heliograph.live.stored.migration import Carrier
 from heliograph.numerics.check import InputError
 from heliograph.serving.service import Service
@@ -30,7 +30,7 @@ OPTIONS = Options(2.0, 0.1)
 
 
 @pytest.fixture(scope="module")
-def lanes() -> NetworkProgram:
+def program() -> NetworkProgram:
     return NetworkProgram(runpy.run_path(str(WRITTEN / "network.py"))["network"])
 
 
@@ -79,10 +79,10 @@ def check_goes_on(known: list[dict]) -> None:
                 np.testing.assert_allclose(estimate["covariance"], covariance, rtol=1e-9)
 
 
-def test_a_store_of_the_version_before_is_named_in_one_line_and_stays_as_it_is(place, lanes):
+def test_a_store_of_the_version_before_is_named_in_one_line_and_stays_as_it_is(place, program):
     before = content(place)
     with pytest.raises(InputError) as refused:
-        Store(str(place), identity(Fleet(lanes, OPTIONS)))
+        Store(str(place), identity(Fleet(program, OPTIONS)))
     assert str(refused.value) == (
         f"store {place}: expected layout 5, of heliograph {hg.__version__}, got layout 3, of heliograph 0.2.0; "
         "to begin anew, name another; --accept-changes goes on with what fits"
@@ -91,9 +91,9 @@ def test_a_store_of_the_version_before_is_named_in_one_line_and_stays_as_it_is(p
 
 
 @pytest.mark.parametrize("copied", [False, True])
-def test_a_store_of_the_version_before_goes_on_where_the_user_says_so(place, lanes, tmp_path, copied):
+def test_a_store_of_the_version_before_goes_on_where_the_user_says_so(place, program, tmp_path, copied):
     """In place, or in a new store with the old one as it is."""
-    fleet, said, before = Fleet(lanes, OPTIONS), [], content(place)
+    fleet, said, before = Fleet(program, OPTIONS), [], content(place)
     mine = identity(fleet)
     if copied:
         store = Store(str(tmp_path / "new.db"), mine)
@@ -111,9 +111,9 @@ def test_a_store_of_the_version_before_goes_on_where_the_user_says_so(place, lan
 
 
 @pytest.mark.slow
-def test_filters_go_on_where_the_nodes_have_changed_places_too(place, lanes):
+def test_filters_go_on_where_the_nodes_have_changed_places_too(place, program):
     """Then all columns are others, so that a flag with the place of another number would change that."""
-    item = lanes.network
+    item = program.network
     network = hg.Network(item.plant, {name: item.nodes[name] for name in ("b", "a")}, item.fused)
     fleet = Fleet(NetworkProgram(network), OPTIONS)
     store = Store(str(place), identity(fleet), carrier=Carrier(fleet, identity(fleet), print))
@@ -121,8 +121,8 @@ def test_filters_go_on_where_the_nodes_have_changed_places_too(place, lanes):
     store.close()
 
 
-def test_each_number_of_a_state_is_described_once(lanes):
+def test_each_number_of_a_state_is_described_once(program):
     """Flags among them, whose columns cannot be told from the numbers in them."""
-    layout = json.loads(identity(Fleet(lanes, OPTIONS))["description"])["layout"]
+    layout = json.loads(identity(Fleet(program, OPTIONS))["description"])["layout"]
     columns = [i for parts in layout["filters"].values() for _, *ends in parts.values() for i in range(*ends)]
     assert sorted(columns) == list(range(layout["state"]))

@@ -38,7 +38,7 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
     filters, size = _filter_columns(fleet, covariances)
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
-        "given": fleet.lanes.given,
+        "given": fleet.program.given,
         "state": size,
         "outputs": fleet.pool.step_rows.outputs.size,
         "filters": filters,
@@ -194,7 +194,7 @@ class Carrier:
 
     def _translate_rows(self, table: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
         """Return rows of the table with this network's columns."""
-        old, pool, lanes = self._old, self.fleet.pool, self.fleet.lanes
+        old, pool, program = self._old, self.fleet.pool, self.fleet.program
         given, state = old["given"], old["state"]
         translated = np.zeros((len(table), pool.table.shape[1]))
         # The state: of filters that go on their own, of others the start.
@@ -212,7 +212,7 @@ class Carrier:
         translated[:, pool.held], translated[:, pool.at] = table[:, after : after + given], table[:, [after + given]]
         numbers, received = translated[:, pool.numbers], table[:, after + given + 1 :]
         numbers[:] = np.nan
-        numbers[:, lanes.received :] = received[:, received.shape[1] - given - 1 :]
+        numbers[:, program.received :] = received[:, received.shape[1] - given - 1 :]
         starts = np.cumsum([0, *old["nodes"].values()])
         here = np.cumsum([0, *(self.fleet.network.nodes[name].received for name in self.fleet.network.names)])
         for i, j in new_index.items():

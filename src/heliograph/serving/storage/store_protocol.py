@@ -102,7 +102,7 @@ def identity(fleet: Fleet) -> Identity:
         fleet: the fleet whose plants the store keeps.
     """
     instance("fleet", fleet, Fleet, "a Fleet")
-    return network_identity(fleet.network, fleet.lanes.step_rows.program, fleet.options._asdict()) | {
+    return network_identity(fleet.network, fleet.program.step_rows.program, fleet.options._asdict()) | {
         DESCRIPTION: describe_network(fleet)
     }
 

@@ -134,4 +134,4 @@ class NetworkProgram:
         return network_identity(self.network, self.step_rows.program, {})
 
 
-shared_lanes = share_by_object(NetworkProgram)  # of a network, made at the first call
+shared_program = share_by_object(NetworkProgram)  # of a network, made at the first call
