@@ -161,8 +161,13 @@ def along_and_linear(plant, parts):
 
 
 @pytest.mark.slow
-def test_losses_that_are_said_count_with_the_pattern_that_happened():
-    """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_losses_that_are_said_count_with_the_pattern_that_happened(engine, monkeypatch):
+    """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean.
+
+    Every estimate is a number by both engines: what nobody knows along estimates does not count behind whole links.
+    """
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", engine)
     z = {"node 0": np.zeros((6, 1)), "node 1": np.full((6, 2), np.nan)}
     fused = hg.run(along_and_linear(*random_case(7, nodes=2, n=2)), z).estimates["fused"]
     np.testing.assert_allclose(fused["local matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)

@@ -204,7 +204,9 @@ def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel
     error = jnp.asarray(links.error)
     known = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
     known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))
-    noise = jnp.einsum("iabcd,icd->iab", links.spread, known)
+    # A link without spread adds no noise, whatever is sent: along estimates nobody knows the moments of that.
+    spreads = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))
+    noise = jnp.einsum("iabcd,icd->iab", links.spread, jnp.where(spreads[:, None, None], known, 0.0))
     new = PastReports(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
     return PastReports(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
 
