@@ -17,9 +17,11 @@ from . import (
     campaign as campaign,
     testing as testing,
 )
+from .random_affine.fading_law import (
+    Rayleigh as Rayleigh,
+)
 from .random_affine.law import (
     Discrete as Discrete,
-    Rayleigh as Rayleigh,
 )
 from .random_affine.noise import (
     Gaussian as Gaussian,

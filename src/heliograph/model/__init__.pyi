@@ -42,6 +42,10 @@ from .sensor import (
 from .bias import (
     with_bias as with_bias,
 )
+from .told import (
+    Pilot as Pilot,
+    told as told,
+)
 from .trigger import (
     AbstractTrigger as AbstractTrigger,
     SendReason as SendReason,

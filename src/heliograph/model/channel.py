@@ -1,7 +1,8 @@
 """Channels between a sensor and a filter, each one random affine map: hops, relays, dropouts, direct links."""
 
 from collections.abc import Sequence
-from typing import overload
+from functools import partial
+from typing import Literal, overload
 
 import numpy as np
 from typing_extensions import TypeAliasType
@@ -9,6 +10,7 @@ from typing_extensions import TypeAliasType
 from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_turns
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
+from heliograph.model.told import KnownGain, Pilot, build_with_told, tell_gain
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.traced import library
@@ -53,6 +55,17 @@ def hop(
     *,
     delay: Delay,
 ) -> Delayed: ...
+@overload
+def hop(
+    gain: LawLike,
+    noise: NoiseLike,
+    power: ArrayLike = 1.0,
+    amplification: ArrayLike = 1.0,
+    dimension: int = 1,
+    delay: None = None,
+    *,
+    known: Literal[True] | Pilot,
+) -> Stack: ...
 
 
 def hop(
@@ -62,7 +75,8 @@ def hop(
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
     delay: Delay | None = None,
-) -> GainAndNoise | Delayed:
+    known: KnownGain = False,
+) -> GainAndNoise | Delayed | Stack:
     """One radio hop: z = amplification sqrt(power) g y + n, the same gain for all components of y.
 
     `gain` is a law or a number; `noise` a noise law, a covariance (m, m), or one variance common to `dimension`
@@ -76,9 +90,13 @@ def hop(
         amplification: of a relay, z per unit of what it receives (default 1).
         dimension: number of components where `noise` is a variance (default 1).
         delay: in steps, or its law (default: none).
+        known: True for a coherent receiver, which is told the gain with each message, z = (a sqrt(E) g y + n, g); a
+            `Pilot` for one that is told a reading of it. What is told passes by all that the hop is built into, and
+            stands after all of z. False unless given.
 
     Raises:
         ValueError: a negative power, a noise that is no covariance, numbers that are not finite.
+
     Source: cubature fusion under amplify-and-forward relays, equations (3) and (5).
     """
     law = gain if isinstance(gain, AbstractLaw) else Constant(gain)
@@ -86,7 +104,8 @@ def hop(
     p = scalar("hop power", power, 0.0)
     factor = scalar("amplification", amplification) * library(p).sqrt(p)
     radio_hop = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
-    return radio_hop if delay is None else Delayed(radio_hop, delay)
+    link = tell_gain(radio_hop, known)
+    return link if delay is None else delayed(link, delay)
 
 
 def perfect(dimension: int = 1) -> GainAndNoise:
@@ -133,7 +152,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
         ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
-    return connect_in_series(separate_memories(check_maps("series", hops)))
+    return build_with_told(connect_in_series, separate_memories(check_maps("series", hops)))
 
 
 def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> Delayed:
@@ -150,7 +169,7 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
     Raises:
         ValueError: a delay that is no whole number of steps from 0, a link that is late already.
     """
-    return Delayed(link, delay, timestamped)
+    return build_with_told(lambda links: Delayed(links[0], delay, timestamped), check_maps("delayed link", [link]))
 
 
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
@@ -167,8 +186,12 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
         ValueError: an arrival probability outside [0, 1].
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
-    (channel,) = check_maps("dropout", [channel])
-    return Mixture([channel, silent(channel.outputs, channel.inputs)], library(p).stack([p, 1 - p]), radius)
+
+    def build(links: Sequence[AbstractRandomAffine]) -> Mixture:
+        nothing = silent(links[0].outputs, links[0].inputs)
+        return Mixture([links[0], nothing], library(p).stack([p, 1 - p]), radius)
+
+    return build_with_told(build, check_maps("dropout", [channel]))
 
 
 def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
@@ -183,7 +206,7 @@ def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
     Raises:
         ValueError: an arrival probability outside [0, 1]; later, when asked for moments.
     """
-    return Erasure(channel, arrival)
+    return build_with_told(lambda links: Erasure(links[0], arrival), check_maps("erasure", [channel]))
 
 
 def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine) -> Stack:
@@ -196,9 +219,13 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    both = separate_memories(check_maps("stack", [relayed, direct]))
-    past = max(c.past for c in both)
-    return Stack([c if c.past == past else place_part(c, signal_size(c), 0, past) for c in both])
+    return build_with_told(_stack_links, separate_memories(check_maps("stack", [relayed, direct])))
+
+
+def _stack_links(links: Sequence[AbstractRandomAffine]) -> Stack:
+    """Stack links of one signal, each as late as the latest."""
+    past = max(c.past for c in links)
+    return Stack([c if c.past == past else place_part(c, signal_size(c), 0, past) for c in links])
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
@@ -210,9 +237,13 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    channels = separate_memories(check_maps("parallel channels", channels))
-    parts, start, total, past = [], 0, sum(signal_size(c) for c in channels), max(c.past for c in channels)
-    for c in channels:
+    return build_with_told(_place_links, separate_memories(check_maps("parallel channels", channels)))
+
+
+def _place_links(links: Sequence[AbstractRandomAffine]) -> Stack:
+    """Stack links of which each takes its own part of the signal."""
+    parts, start, total, past = [], 0, sum(signal_size(c) for c in links), max(c.past for c in links)
+    for c in links:
         parts.append(place_part(c, total, start, past))
         start += signal_size(c)
     return Stack(parts)
@@ -234,7 +265,12 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
         ValueError: links of other sizes; an erasure in a link, since a receiver of a sum does not see who is missing;
             flags or time stamps, which would be added up.
     """
-    links = separate_memories(check_maps("links of a sum", links))
+    separate = separate_memories(check_maps("links of a sum", links))
+    return build_with_told(partial(_add_links, noise=noise, same=same), separate)
+
+
+def _add_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool) -> Superposed:
+    """Check links without what is told of them, place each on the signal, and add them up."""
     for i, link in enumerate(links, 1):
         _check_added(f"link {i} of a sum", link)
     sizes, sent = [link.outputs for link in links], [signal_size(link) for link in links]

@@ -19,14 +19,16 @@ from .moments.lift import (
     Lift as Lift,
     square as square,
 )
+from .fading_law import (
+    LogNormal as LogNormal,
+    Nakagami as Nakagami,
+    Rician as Rician,
+)
 from .law import (
     AbstractLaw as AbstractLaw,
     Constant as Constant,
     GivenMoments as GivenMoments,
     bernoulli as bernoulli,
-    LogNormal as LogNormal,
-    Nakagami as Nakagami,
-    Rician as Rician,
 )
 from .modes import (
     Faded as Faded,

@@ -81,6 +81,16 @@ class AbstractMemory(Module):
         """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
         raise unwritten(self, "nodes")
 
+    @property
+    def announced(self) -> int:
+        """How many numbers a receiver that is told of the state gets; one unless said otherwise."""
+        return 1
+
+    def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+        """Return the numbers that a receiver gets which is told of the state (announced,): by default the state."""
+        numbers: jax.Array | np.ndarray = library(state).stack([state])
+        return numbers
+
     def state_from_number(self, number: jax.Array) -> jax.Array:
         """Return the state that a received number stands for."""
         raise unwritten(self, "state_from_number")
@@ -101,7 +111,7 @@ class AbstractMemory(Module):
 
     def named(self, name: str) -> "AbstractMemory":
         """Return a copy with this name, one memory with all others of the name."""
-        twin = self.labelled(_identify_memory(name))
+        twin = self.labelled(identify_memory(name))
         object.__setattr__(twin, "name", name)
         return twin
 
@@ -143,7 +153,7 @@ class MarkovChain(AbstractMemory):
             probabilities(f"transition from mode {i}", row)
         self.radius = radii("radius of the transition", radius, rows)
         self.initial = stationary(rows) if initial is None else probabilities("initial law", initial, len(rows))
-        self.name, self.identity = name, _identify_memory(name)
+        self.name, self.identity = name, identify_memory(name)
 
     @property
     def is_uncertain(self) -> bool:
@@ -183,6 +193,25 @@ class MarkovChain(AbstractMemory):
         return jnp.arange(self.modes), law
 
 
+class CertainChain(MarkovChain):
+    """A chain whose transitions are certain, also where all numbers are traced.
+
+    Raises:
+        ValueError: a chain whose transitions may be off.
+    """
+
+    def __init__(self, chain: MarkovChain):
+        if chain.is_uncertain:
+            raise fail("transitions of a chain", "known ones, beside what a message tells", "uncertain ones")
+        self.transition, self.initial, self.radius = chain.transition, chain.initial, chain.radius
+        self.name, self.identity = chain.name, chain.identity
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Always False."""
+        return False
+
+
 class Autoregression(AbstractMemory):
     """Gaussian memory with mean 0 and variance 1 that drifts, c+ = rho c + sqrt(1 - rho^2) e, always stationary.
 
@@ -200,7 +229,7 @@ class Autoregression(AbstractMemory):
 
     def __init__(self, correlation: "Float[ArrayLike, '']", name: str | None = None):
         self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
-        self.name, self.identity = name, _identify_memory(name)
+        self.name, self.identity = name, identify_memory(name)
 
     @property
     def drifts(self) -> bool:
@@ -266,7 +295,7 @@ def stationary(transition: Rows) -> Law:
     return normalised
 
 
-def _identify_memory(name: str | None) -> str:
+def identify_memory(name: str | None) -> str:
     """Return a text that identifies a memory, through copies and in other processes; no draw depends on it."""
     if name is not None and (not isinstance(name, str) or not name):
         raise fail("name of a memory", "a text", repr(name))

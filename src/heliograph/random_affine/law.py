@@ -6,12 +6,10 @@ is linear in p has its worst case.
 """
 
 from itertools import product
-from math import gamma
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics import check
@@ -19,13 +17,14 @@ from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, radii, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable, same, unwritten
-from heliograph.numerics.traced import equal_to_rounding, is_traced, library, plain, scipy_for, stack_parts, within
+from heliograph.numerics.traced import equal_to_rounding, is_traced, plain, stack_parts, within
 from heliograph.numerics.types import ArrayLike, Float
 
 Scalar = Float[jax.Array | np.ndarray, ""]
 Vector = Float[jax.Array | np.ndarray, " n"]
 
 DRAWS = 2**14  # of a law that nobody knows but by its samples
+NATS = 36.0  # e^-36 is a rounding error of 1
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
@@ -87,6 +86,19 @@ class AbstractLaw(Module):
     def _draw_values(self) -> np.ndarray:
         values: np.ndarray = np.asarray(jax.vmap(self.sample)(jax.random.split(jax.random.key(0), DRAWS)))
         return values
+
+    @property
+    def logarithmic(self) -> bool:
+        """True of a positive gain whose law is wide on a logarithmic scale."""
+        return False
+
+    def log_density(self, g: jax.Array) -> jax.Array:
+        """Return log p(g) but for a constant, of a positive gain that has a density."""
+        raise unwritten(self, "log_density")
+
+    def bulk(self) -> "tuple[Scalar | float, Scalar | float]":
+        """Return gains between which all of the law lies but a share of e^-36."""
+        raise unwritten(self, "bulk")
 
     def mean_law(self) -> "Constant":
         """Return the constant law at E[g], for a filter that takes the mean gain as the true one."""
@@ -213,6 +225,23 @@ class Discrete(AbstractLaw):
         return np.array([np.array(c) / sum(c) for c in sorted(corners)])
 
 
+class CertainDiscrete(Discrete):
+    """Gains of finitely many values whose probabilities are certain, also where all numbers are traced.
+
+    Raises:
+        ValueError: a law whose probabilities may be off.
+    """
+
+    def __init__(self, law: Discrete):
+        if np.any(law.radius > 0):
+            raise fail("probabilities of a gain", "known ones, beside what a message tells", "uncertain ones")
+        self.values, self.probabilities, self.radius = law.values, law.probabilities, law.radius
+
+    def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
+        """The probabilities alone."""
+        return self.probabilities[None]
+
+
 def bernoulli(probability: "Float[ArrayLike, '']", radius: "Float[ArrayLike, '']" = 0.0) -> Discrete:
     """Return the law of a link that works (gain 1) with `probability` and is silent (gain 0) otherwise.
 
@@ -225,124 +254,6 @@ def bernoulli(probability: "Float[ArrayLike, '']", radius: "Float[ArrayLike, '']
     """
     p = scalar("probability that a link works", probability, 0.0, 1.0)
     return Discrete([0.0, 1.0], [1 - p, p], radius)
-
-
-class Rayleigh(AbstractLaw):
-    """Rayleigh fading: the length of a centred complex Gaussian with standard deviation `scale` per part."""
-
-    scale: Scalar
-
-    def __init__(self, scale: "Float[ArrayLike, '']"):
-        self.scale = scalar("Rayleigh scale", scale, 0.0)
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw scale * sqrt(-2 log u)."""
-        return jax.random.rayleigh(key, jnp.asarray(self.scale), dtype=float)
-
-    def moment(self, order: int) -> float | jax.Array:
-        """Return scale^k 2^(k/2) Gamma(1 + k/2)."""
-        return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2))
-
-    def quantile(self, probability: Vector) -> np.ndarray:
-        """Return scale sqrt(-2 log(1 - p))."""
-        return np.asarray(np.sqrt(-2 * np.log1p(-probability)) * float(self.scale))
-
-
-class Rician(AbstractLaw):
-    """Rician fading: a line of sight of amplitude `sight` plus scatter of standard deviation `scale` per part."""
-
-    sight: Scalar
-    scale: Scalar
-
-    def __init__(self, sight: "Float[ArrayLike, '']", scale: "Float[ArrayLike, '']"):
-        self.sight = scalar("Rician line of sight", sight, 0.0)
-        self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the length of (sight + scale n1, scale n2)."""
-        parts = jax.random.normal(key, (2,), dtype=float) * self.scale
-        return jnp.hypot(self.sight + parts[0], parts[1])
-
-    def moment(self, order: int) -> float | jax.Array:
-        """Return scale^k 2^(k/2) Gamma(1 + k/2) L_(k/2)(-sight^2 / (2 scale^2)), L the Laguerre function."""
-        shape = _laguerre(order, ((self.sight / self.scale) ** 2) / 2)
-        return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2) * shape)
-
-    def quantile(self, probability: Vector) -> np.ndarray:
-        """Return scale sqrt of the quantile of the noncentral chi-squared law of 2 degrees."""
-        return np.asarray(
-            np.sqrt(special.chndtrix(probability, 2, (float(self.sight) / float(self.scale)) ** 2)) * float(self.scale)
-        )
-
-
-def _laguerre(order: int, x: Scalar) -> Scalar:
-    """L_(order/2)(-x) = 1F1(-order/2; 1; -x) for x >= 0, by (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1).
-
-    Even orders are polynomials, from L_0 = 1; odd ones start from exponentially scaled Bessel functions,
-    L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) = e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the
-    difference loses no digits.
-    """
-    if order % 2:
-        bessel = scipy_for(x).special
-        before = bessel.i0e(x / 2)
-        now, v = (1 + x) * before + x * bessel.i1e(x / 2), 0.5
-    else:
-        before, now, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
-    while v < order / 2:
-        before, now, v = now, ((2 * v + 1 + x) * now - v * before) / (v + 1), v + 1
-    moment: Scalar = now
-    return moment
-
-
-class Nakagami(AbstractLaw):
-    """Nakagami-m fading with `shape` m >= 1/2 and mean power `power` = E[g^2]."""
-
-    shape: Scalar
-    power: Scalar
-
-    def __init__(self, shape: "Float[ArrayLike, '']", power: "Float[ArrayLike, '']" = 1.0):
-        self.shape = scalar("Nakagami shape", shape, 0.5)
-        self.power = scalar("Nakagami power", power, 0.0)
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the root of a gamma variable with shape m and mean `power`."""
-        return jnp.sqrt(jax.random.gamma(key, jnp.asarray(self.shape), dtype=float) * self.power / self.shape)
-
-    def moment(self, order: int) -> float | jax.Array:
-        """Return Gamma(m + k/2) / Gamma(m) (power / m)^(k/2)."""
-        gammaln = scipy_for(self.shape).special.gammaln
-        ratio = library(self.shape).exp(gammaln(self.shape + order / 2) - gammaln(self.shape))
-        return plain(ratio * (self.power / self.shape) ** (order / 2))
-
-    def quantile(self, probability: Vector) -> np.ndarray:
-        """Return the root of the quantile of the gamma law of g^2."""
-        return np.asarray(
-            np.sqrt(special.gammaincinv(float(self.shape), probability) * float(self.power) / float(self.shape))
-        )
-
-
-class LogNormal(AbstractLaw):
-    """Shadowing: log g is Gaussian with `log_mean` and `log_deviation`."""
-
-    log_mean: Scalar
-    log_deviation: Scalar
-
-    def __init__(self, log_mean: "Float[ArrayLike, '']", log_deviation: "Float[ArrayLike, '']"):
-        self.log_mean = scalar("log-normal mean", log_mean)
-        self.log_deviation = scalar("log-normal deviation", log_deviation, 0.0)
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw exp(log_mean + log_deviation n)."""
-        return jnp.exp(self.log_mean + self.log_deviation * jax.random.normal(key, dtype=float))
-
-    def moment(self, order: int) -> float | jax.Array:
-        """Return exp(k mu + k^2 sigma^2 / 2)."""
-        exponent = order * self.log_mean + (order * self.log_deviation) ** 2 / 2
-        return plain(library(exponent).exp(exponent))
-
-    def quantile(self, probability: Vector) -> np.ndarray:
-        """Return exp(log_mean + log_deviation t) with t the normal quantile."""
-        return np.asarray(np.exp(float(self.log_mean) + float(self.log_deviation) * special.ndtri(probability)))
 
 
 class GivenMoments(AbstractLaw):

@@ -90,15 +90,15 @@ class _Chosen(AbstractUniform):
 
 
 class ModeOutput(AbstractModal):
-    """Side information z = the state of a memory as a number; what is sent does not enter."""
+    """Side information z = what a receiver is told of the state of a memory; what is sent does not enter."""
 
     memory: AbstractMemory
     sent: int = eqx.field(static=True)
 
     @property
     def outputs(self) -> int:
-        """Always one."""
-        return 1
+        """How many numbers are told; one of a mode."""
+        return self.memory.announced
 
     @property
     def inputs(self) -> int:
@@ -114,8 +114,8 @@ class ModeOutput(AbstractModal):
         return self, position
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
-        """Return the constant map to this state."""
-        return known(np.zeros((1, self.sent)), library(state).stack([state]))
+        """Return the constant map to what is told of this state."""
+        return known(np.zeros((self.outputs, self.sent)), self.memory.announce(state))
 
 
 class OneStepLate(AbstractWrapper):

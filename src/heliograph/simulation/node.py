@@ -20,6 +20,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.told import names_told
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value, table
@@ -155,7 +156,8 @@ class Node(Module):
     @property
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
-        return name_received(self.outputs, self.received)
+        told = names_told(first(self.channel))
+        return name_received(self.outputs, self.received - len(told)) + told
 
 
 @readable

@@ -23,6 +23,7 @@ from heliograph.filters.gaussian.signal import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain, perfect
 from heliograph.model.estimate import Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, without_memory
@@ -184,6 +185,7 @@ def _make_gaussian_filter(
     return believing(filter, premise)
 
 
+@takes_told
 def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -221,6 +223,7 @@ def gaussian_filter(
     )
 
 
+@takes_told
 def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -251,6 +254,7 @@ def cubature_filter(
     return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
 
 
+@takes_told
 def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -308,6 +312,23 @@ def mean_gain_filter(
     )
 
 
+def gaussian_filter_of(
+    name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
+) -> GaussianFilter:
+    """Return the Gaussian filter that another one stands on, refused behind a link of which anything is told.
+
+    Args:
+        name: of the other filter, in the refusal.
+        plant: the plant.
+        sensor: its sensor.
+        channel: from the sensor to the filter.
+        transform: moments of a nonlinear function.
+        rule: how an uncertain channel is bounded.
+    """
+    filter = gaussian_filter(plant, sensor, channel, transform, rule)
+    return instance(f"channel of a {name}", filter, GaussianFilter, "one of which nothing is told")
+
+
 MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"
 
 
@@ -337,4 +358,6 @@ def kalman_filter(
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
-    return gaussian_filter(plant, sensor, None, Linearization(), None, initial_mean, initial_covariance)
+    return _make_gaussian_filter(
+        plant, sensor, None, Linearization(), Polytope(), initial_mean, initial_covariance, trusted=True
+    )

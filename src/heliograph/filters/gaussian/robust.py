@@ -25,6 +25,7 @@ from heliograph.filters.gaussian.scores import (
 from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
+from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
@@ -234,6 +235,7 @@ def _student_degrees_of(noise: ReceivedNoise) -> Vector:
 
 
 @believes
+@takes_told
 def robust_filter(
     plant: AnyPlant,
     sensor: AnySensor,

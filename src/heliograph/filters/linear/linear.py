@@ -20,6 +20,7 @@ from heliograph.filters.modes.side_information import side_information_filter
 from heliograph.filters.modes.uncertain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
+from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
@@ -129,6 +130,7 @@ def correct_linear(
 
 
 @believes
+@takes_told
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> AbstractFilter:
@@ -194,6 +196,8 @@ def linear_filter(
     )
 
 
+@believes
+@takes_told
 def memoryless_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> AbstractFilter:

@@ -27,6 +27,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, list_steps, restack, steps_covered
@@ -184,6 +185,7 @@ def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " 
 
 
 @believes
+@takes_told
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
     """Filter on the full laws of gains and noises with finitely many values, with one Gaussian after each step.
 

@@ -45,6 +45,7 @@ from heliograph.filters.modes.mixing import (
 )
 from heliograph.filters.modes.patterns import SideInformation, describe_by_pattern, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, restack, unstack
@@ -241,6 +242,7 @@ def fields_of_mode_filters(
 
 
 @believes
+@takes_told
 def imm_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
@@ -271,6 +273,7 @@ def imm_filter(
 
 
 @believes
+@takes_told
 def gpb1_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
@@ -297,6 +300,7 @@ def gpb1_filter(
 
 
 @believes
+@takes_told
 def gpb2_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:

@@ -19,7 +19,7 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
+from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter_of
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.gaussian.update import Polytope
@@ -224,7 +224,7 @@ def clock_filter(
         raise fail("clocks", f"some whose offsets are among the states {list(states)}", list(clocks))
     # The joint Gaussian filter, to which the test of observability is added.
     chosen = PolynomialMoments(2) if transform is None else transform
-    base = gaussian_filter(plant, sensor, channel, chosen, Polytope())
+    base = gaussian_filter_of("clock filter", plant, sensor, channel, chosen, Polytope())
     # Schmidt's update needs the moments of the channel themselves, not bounds.
     described = jax.tree.leaves(base.channel, is_leaf=lambda leaf: isinstance(leaf, SecondOrder))
     if any(isinstance(leaf, SecondOrder) and leaf.uncertain for leaf in described):

@@ -16,10 +16,10 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal, gaussian_filter
+from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal, gaussian_filter_of
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.gaussian.update import AbstractUpdate
+from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.model.centred import predict_signal
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
@@ -200,7 +200,8 @@ def fed_back_filter(
     Source: Schalkwijk and Kailath, A coding scheme for additive noise channels with feedback (1966), for a state that
         moves; Elia, Remote stabilization over fading channels (2005).
     """
-    base = gaussian_filter(plant, sensor, channel, Cubature() if transform is None else transform, update)
+    chosen, rule = Cubature() if transform is None else transform, Polytope() if update is None else update
+    base = gaussian_filter_of("filter that is fed back", plant, sensor, channel, chosen, rule)
     refuse_angles("filter that is fed back", plant, sensor)
     described = stacked(base.channel)
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None

@@ -1,0 +1,194 @@
+"""Filters of links whose law is told with each message: for each the filter of the law that its numbers give."""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    make_sizes,
+    predicts,
+)
+from heliograph.filters.modes.patterns import append_flag
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import at, at_each_step, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.premises.premise import believing
+from heliograph.model.sensor import AnySensor
+from heliograph.model.told import count_told, strip_told
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.module import Module
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import ArrayLike, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.told import believe_told, made_certain, told_maps
+
+F = TypeVar("F", bound=AbstractFilter)
+P = ParamSpec("P")
+
+
+class MakeFilter(Module):
+    """A function that makes a filter, with all of its arguments but plant, sensor and channel."""
+
+    function: Callable[..., AbstractFilter] = eqx.field(static=True)
+    arguments: dict[str, object]
+
+    def __call__(self, plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
+        """Make the filter of these three."""
+        return self.function(plant=plant, sensor=sensor, channel=channel, **self.arguments)
+
+
+class ToldFilter(AbstractSizedFilter):
+    """The filter that `make` builds, for each message behind the link whose law its numbers give.
+
+    Between messages all such filters are one: how a state moves depends on the plant, not on the link. A message with
+    a number missing is not used, but for a pilot: without a reading the gain has its own law.
+
+    Args:
+        base: the filter for typical numbers, which predicts.
+        plant: the plant.
+        sensor: its sensor.
+        link: the channel without what is told.
+        make: builds a filter of plant, sensor and a link.
+    """
+
+    base: AbstractFilter
+    plant: AnyPlant
+    sensor: AnySensor
+    link: Channel
+    make: MakeFilter
+
+    @in_float64
+    def init(self) -> PyTree:
+        """Return the state before any message."""
+        return self.base.init()
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Predict as without what is told."""
+        return self.base.predict(state, u, k)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Correct by the filter of the law that the numbers of the message give."""
+        values, numbers = self._split(jnp.asarray(z))
+        after, innovation = self._filter_given(numbers, k).correct(state, values, k)
+        # What is told belongs to the innovation; given it, it adds nothing to the likelihood.
+        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        for number in numbers:
+            flag_innovation, covariance = append_flag(covariance, number)
+            value = jnp.append(value, flag_innovation)
+        return after, Innovation(value, covariance, innovation.log_likelihood)
+
+    @estimates
+    def estimate(self, state: PyTree) -> Estimate:
+        """Mean and covariance of the estimate."""
+        return self._claim(self.base.estimate(state))
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """Mean and covariance after step k."""
+        return self._claim(self.base.after_step(state, k))
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the smoother step of the filter of the law that was told."""
+        values, numbers = self._split(jnp.asarray(step.z))
+        return self._filter_given(numbers, step.k).smoother_step(step._replace(z=values))
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return those of the filter within; what is told is none."""
+        return self.base.angles_used()
+
+    @property
+    def of_atoms(self) -> bool:
+        """As the filter within."""
+        return self.base.of_atoms
+
+    @property
+    def silence_tells(self) -> bool:
+        """As the filter within."""
+        return self.base.silence_tells
+
+    def _claim(self, estimate: Estimate) -> Estimate:
+        return Estimate(estimate.mean, estimate.covariance, self.claim)
+
+    def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Values and numbers of a message; no values where a number is missing without which they mean nothing."""
+        m = self.base.received
+        numbers, optional = z[m:], self._optional
+        usable = jnp.all(~jnp.isnan(numbers) | optional)
+        return jnp.where(usable, z[:m], jnp.nan), numbers
+
+    @property
+    def _optional(self) -> jax.Array:
+        """Which numbers may be missing."""
+        return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in told_maps(first(self.link))])
+
+    def _filter_given(self, numbers: jax.Array, k: Step) -> AbstractFilter:
+        """Build the filter of the law that the numbers give; where one is missing that must not, of a typical law."""
+        typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in told_maps(first(self.link))])
+        complete = jnp.where(jnp.isnan(numbers) & ~self._optional, typical, numbers)
+        return self.make(self.plant, at(self.sensor, k), believe_told(at(self.link, k), complete))
+
+
+def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: MakeFilter) -> ToldFilter:
+    """Build a filter behind a channel that tells of its link from `make`, which builds one for a link of known law.
+
+    Args:
+        plant: the plant.
+        sensor: its sensor.
+        channel: a channel that delivers numbers after z; it may vary over time.
+        make: builds a filter of plant, sensor and a link.
+
+    Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state.
+    """
+    link = at_each_step(lambda channel: made_certain(strip_told(channel)), channel)
+    typical = at_each_step(_believe_typical, link)
+    base = make(plant, sensor, typical)
+    exogenous = all(affine.exogenous for affine in told_maps(first(link)))
+    claim: Claim = base.claim if exogenous or base.claim == "none" else "nominal"
+    received = base.received + count_told(first(channel))
+    filter = ToldFilter(
+        base=base, plant=plant, sensor=sensor, link=link, make=make, **make_sizes(claim, base, received)
+    )
+    premise = base.premise
+    return believing(filter, premise and premise.replaced(sensor=sensor, channel=channel))
+
+
+@in_float64
+def _believe_typical(link: PyTree) -> PyTree:
+    typical = [affine.typical for affine in told_maps(link)]
+    return believe_told(link, library(typical).concatenate(typical))
+
+
+def takes_told(make: Callable[P, F]) -> Callable[P, F]:
+    """Let a function that makes a filter take channels that tell of their links, by a `ToldFilter` of what it makes.
+
+    To a type checker it returns what it makes: behind any other channel it does.
+
+    Args:
+        make: a function of a plant, a sensor, a channel, and more.
+    """
+    parameters = inspect.signature(make)
+
+    @wraps(make)
+    def build(*args: P.args, **kwargs: P.kwargs) -> F:
+        given = parameters.bind(*args, **kwargs).arguments
+        channel = given.get("channel")
+        if not isinstance(first(channel), AbstractRandomAffine) or not count_told(first(channel)):
+            return make(*args, **kwargs)
+        plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
+        return cast(F, build_told_filter(plant, sensor, link, MakeFilter(make, given)))
+
+    return build

@@ -1,0 +1,151 @@
+"""What comes with a message: gains, readings of gains and numbers of quality that the receiver is told."""
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar, cast
+
+import jax
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.numerics.check import array, fail, flag, instance, name_list, scalar, show_value
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.types import ArrayLike, Float, Names
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.chain import AbstractMemory
+from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.law import AbstractLaw
+from heliograph.random_affine.modes import ModeOutput
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.told import FreshNumbers, FreshReading, GainTold, PilotedHop, Told, told_maps
+
+M = TypeVar("M", bound=AbstractRandomAffine)
+
+
+LinkGivenNumbers = TypeAliasType("LinkGivenNumbers", Callable[[jax.Array | np.ndarray], AbstractRandomAffine])
+LawOfNumbers = TypeAliasType("LawOfNumbers", AbstractLaw | AbstractNoise | AbstractMemory)
+
+
+@readable
+class Pilot(Module):
+    """A reading of a gain that comes with each message: a = g + e with e of N(0, `noise`), fresh at each step.
+
+    A pilot that is sent with amplitude b and received with noise variance r has `noise` r / b^2.
+
+    Args:
+        noise: variance of e, positive.
+
+    Raises:
+        ValueError: a variance that is not positive (`known=True` is a gain that is told exactly).
+    """
+
+    noise: Float[jax.Array | np.ndarray, ""]
+
+    def __init__(self, noise: "Float[ArrayLike, '']"):
+        self.noise = scalar("noise of a pilot", noise, np.finfo(float).tiny)
+
+
+def told(
+    link: LinkGivenNumbers,
+    about: Names,
+    law: LawOfNumbers | None = None,
+    typical: "Float[ArrayLike, ' told'] | None" = None,
+    exogenous: bool = True,
+) -> Stack:
+    """Return a link whose law is a function of numbers that come with each message: z = (link's z, numbers).
+
+    `told(lambda a: hop(1., a[0]), ["variance"], typical=[0.1])` has the noise that each message declares; a gain, a
+    scatter or the chance of a zero may depend on what is told likewise. A filter made for it uses each message by the
+    law that its numbers give. The numbers are never lost with z; where one is missing, z is not used.
+
+    Args:
+        link: function of the numbers (count,) that returns a link, of the same sizes for all numbers.
+        about: names of the numbers.
+        law: of the numbers, to simulate them: a noise law, a law of gains for one number, or a `MarkovChain` whose
+            mode is told; none by default: then recorded and live data are filtered, and nothing can be simulated.
+        typical: numbers as they may come (count,); the mean of their law unless given.
+        exogenous: whether the numbers are independent of the state; False (as of a strength that falls with the
+            distance) makes claims nominal. True unless given.
+
+    Claim: what the filter's would be behind a link of known law, given all numbers told; "nominal" if not exogenous.
+
+    Raises:
+        ValueError: no function, neither a law nor typical numbers, numbers that are not as many as their names, a link
+            that remembers, is late or erases.
+
+    Source: De Koning (1984), given the numbers.
+    """
+    if not callable(link):
+        raise fail("link", "a function of the numbers that are told", show_value(link))
+    names = tuple(name_list("numbers told", about))
+    memory = law if isinstance(law, AbstractMemory) else FreshNumbers(_check_law(law), len(names))
+    if memory.announced != len(names):
+        raise fail("numbers told", f"{memory.announced} names", list(names))
+    example = array("typical numbers", _mean_of(law, memory) if typical is None else typical, (len(names),))
+    return deliver_told(Told(memory, link, example, names, flag("exogenous", exogenous)))
+
+
+def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
+    if law is None or isinstance(law, AbstractLaw | AbstractNoise):
+        return law
+    raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))
+
+
+def _mean_of(law: object, memory: AbstractMemory) -> ArrayLike:
+    """Mean of a law of numbers; zeros, the first mode, of a memory."""
+    if law is None:
+        raise fail("typical numbers", "numbers as they may come, where there is no law", "none")
+    if isinstance(law, AbstractLaw):
+        return np.asarray([law.moment(1)])
+    return law.mean if isinstance(law, AbstractNoise) else np.zeros(memory.announced)
+
+
+KnownGain = TypeAliasType("KnownGain", bool | Pilot)  # of a hop: told, by a pilot, or not at all
+
+
+def tell_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
+    """Return the hop with its gain, or a pilot's reading of it, after z; the hop itself where neither is known."""
+    if known is False:
+        return hop
+    if isinstance(known, Pilot):
+        return deliver_told(PilotedHop(FreshReading(hop.law, known.noise), hop.matrix, hop.noise))
+    instance("known", known, bool, "True, False or a Pilot")
+    typical = np.asarray([hop.law.moment(1)])
+    return deliver_told(Told(FreshNumbers(hop.law, 1), GainTold(hop.matrix, hop.noise), typical, ("gain",)))
+
+
+def deliver_told(link: AbstractRandomAffine) -> Stack:
+    """Return a link with the numbers that are told of its maps after z."""
+    return Stack([link, *(ModeOutput(affine.memory, link.inputs) for affine in told_maps(link))])
+
+
+def strip_told(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return the link of a channel that delivers what is told of it, without what is told; another channel as it is."""
+    if not isinstance(channel, Stack) or len(channel.maps) < 2:
+        return channel
+    link, *rest = channel.maps
+    by_identity = [affine.memory.identity for affine in told_maps(link)]
+    announced = [m.memory.identity for m in rest if isinstance(m, ModeOutput)]
+    return link if announced and announced == by_identity and len(announced) == len(rest) else channel
+
+
+def count_told(channel: AbstractRandomAffine) -> int:
+    """Return how many numbers a channel delivers after z, that are told of its link."""
+    link = strip_told(channel)
+    return 0 if link is channel else sum(affine.memory.announced for affine in told_maps(link))
+
+
+def build_with_told(build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]) -> M:
+    """Return what is built of channels, with all that is told of them after z: it passes by whatever is built."""
+    links = [strip_told(channel) for channel in channels]
+    built = build(links)
+    apart = any(link is not channel for link, channel in zip(links, channels, strict=True))
+    return cast(M, deliver_told(built)) if apart else built
+
+
+def names_told(channel: AbstractRandomAffine) -> tuple[str, ...]:
+    """Return the names of the numbers that are told after z, told apart where several have one name."""
+    link = strip_told(channel)
+    names = [] if link is channel else [name for affine in told_maps(link) for name in affine.names]
+    several = {name for name in names if names.count(name) > 1}
+    return tuple(f"{name}_{names[:i].count(name) + 1}" if name in several else name for i, name in enumerate(names))

@@ -1,0 +1,141 @@
+"""A random gain given a noisy reading of it: the law of g given a = g + e, e of N(0, s^2)."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+
+NODES = 64  # of Gauss-Legendre, over all that matters of the posterior
+NATS = 36.0  # below its mode, where a density no longer counts: e^-36 is a rounding error
+GRID = 33  # points among which the mode, and then each end, is looked for
+ZOOMS = 12  # times that the grid shrinks to two of its cells: by (2 / 32)^12, to the last bit
+
+
+class GivenReading(AbstractLaw):
+    """Law of a gain given a reading of it, known by its mean and variance.
+
+    Args:
+        mean: E[g | a].
+        variance: Var(g | a).
+    """
+
+    mean: Float[Array, ""]
+    variance: Float[Array, ""]
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Refuse: the law is what a receiver believes, and nothing is drawn from it."""
+        raise fail("a gain given its reading", "a law that can be sampled", "mean and variance alone")
+
+    def moment(self, order: int) -> jax.Array:
+        """Return E[g^order | a] up to the second."""
+        if order > 2:
+            raise fail("moments of a gain given its reading", "at most order 2", order)
+        powers = jnp.stack([jnp.ones(()), jnp.asarray(self.mean), self.variance + jnp.square(self.mean)])
+        return powers[order]
+
+
+def check_density(law: AbstractLaw) -> AbstractLaw:
+    """Return a law of which readings can be used: one with a density, or of finitely many values.
+
+    Raises:
+        ValueError: another law, probabilities that are uncertain.
+    """
+    if not isinstance(law, Constant | Discrete) and type(law).log_density is AbstractLaw.log_density:
+        raise fail("gain of which a pilot tells", "a law with a density or of finitely many values", type(law).__name__)
+    if isinstance(law, Discrete) and np.any(law.radius > 0):
+        raise fail("gain of which a pilot tells", "known probabilities", "uncertain ones")
+    return law
+
+
+def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Float[Array, ""]) -> AbstractLaw:
+    """Return the law of g given a = g + e: p(g | a) ~ p(g) exp(-(a - g)^2 / 2 s^2); where a is NaN, the gain's own.
+
+    Args:
+        law: of the gain before the reading.
+        reading: a, NaN where none came.
+        variance: s^2, positive.
+
+    Raises:
+        ValueError: a law without a density; probabilities that are uncertain.
+    """
+    if isinstance(law, Constant):
+        return law
+    known = ~jnp.isnan(reading)
+    a = jnp.where(known, reading, 0.0)
+    if isinstance(law, Discrete):
+        nats = jnp.log(law.probabilities) - jnp.square(a - law.values) / (2 * variance)
+        return Discrete(law.values, jnp.where(known, jax.nn.softmax(nats), law.probabilities))
+    mean, spread = _posterior_moments(law, a, jnp.asarray(variance))
+    own = law.moment(1), law.moment(2)
+    return GivenReading(jnp.where(known, mean, own[0]), jnp.where(known, spread, own[1] - own[0] ** 2))
+
+
+def _posterior_moments(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and variance of the posterior of a positive gain, by quadrature over all within NATS of its mode.
+
+    In t = g^(1/4), or log g of a law that is wide on a logarithmic scale, the density is smooth to its ends.
+    """
+    deviation = jnp.sqrt(variance)
+
+    def gain_at(t: jax.Array) -> jax.Array:
+        return jnp.exp(t) if law.logarithmic else t**4
+
+    def place_of(g: Float[Array, ""]) -> jax.Array:
+        return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
+
+    def nats(t: jax.Array) -> jax.Array:
+        """log p(t | a) but for a constant: the law's density in t, and the reading's."""
+        g = gain_at(t)
+        stretch = t if law.logarithmic else 3 * jnp.log(t)
+        return law.log_density(g) + stretch - jnp.square((a - g) / deviation) / 2
+
+    # All gains that may count: those of the law, those near the reading, and all between.
+    low, high = law.bulk()
+    low = place_of(jnp.minimum(low, a - 9 * deviation))
+    high = place_of(jnp.maximum(high, a + 9 * deviation))
+    top = _find_top(nats, low, high)
+    least = nats(top) - NATS
+    left, right = _find_end(nats, low, top, least), _find_end(nats, high, top, least)
+    # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
+    x, w = np.polynomial.legendre.leggauss(NODES)
+    t = (left + right) / 2 + (right - left) / 2 * x
+    weights = jax.nn.softmax(np.log(w) + jax.vmap(nats)(t))
+    g = gain_at(t)
+    mean = weights @ g
+    return mean, weights @ jnp.square(g - mean)
+
+
+Nats = Callable[[jax.Array], jax.Array]
+
+
+def _find_top(nats: Nats, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return the place of the largest value: the best point of a grid, and again between its neighbours."""
+    steps = np.linspace(0.0, 1.0, GRID)
+
+    def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        points = ends[0] + (ends[1] - ends[0]) * steps
+        best = jnp.argmax(jax.vmap(nats)(points))
+        return points[jnp.maximum(best - 1, 0)], points[jnp.minimum(best + 1, GRID - 1)]
+
+    left, right = jax.lax.fori_loop(0, ZOOMS, zoom, (low, high))
+    middle: jax.Array = (left + right) / 2
+    return middle
+
+
+def _find_end(nats: Nats, outer: jax.Array, top: jax.Array, least: jax.Array) -> jax.Array:
+    """Return a place between `outer` and the mode beyond which the density is below `least`, and shortly before not."""
+    steps = np.linspace(0.0, 1.0, GRID)
+
+    def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        points = ends[0] + (ends[1] - ends[0]) * steps
+        counts = (jax.vmap(nats)(points) > least).at[-1].set(True)
+        first = jnp.argmax(counts)  # from outside
+        return points[jnp.maximum(first - 1, 0)], points[first]
+
+    end: jax.Array = jax.lax.fori_loop(0, ZOOMS // 2, zoom, (outer, top))[0]
+    return end
