@@ -21,7 +21,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Node, name_received
+from heliograph.simulation.node import Node, name_values
 
 Forecasts: TypeAlias = dict[str, dict[str, Forecast]]  # by node and filter
 
@@ -113,7 +113,7 @@ def targets_of(origin: Origin) -> list[Target]:
     if isinstance(model, AbstractFilter):
         outlook = outlook_of(model)
         outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
-        return [Target("", "", outlook, origin.state, name_received(outputs, model.received))]
+        return [Target("", "", outlook, origin.state, name_values(outputs, model.received))]
     assert isinstance(model, Network)
     kinds, central, *_ = origin.state
     found = []

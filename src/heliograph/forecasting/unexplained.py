@@ -18,7 +18,7 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.node import name_received
+from heliograph.simulation.node import name_values
 
 FALSE = 0.01  # probability of any false doubt, of all tests together
 LEAST = 20  # residuals for tests
@@ -50,7 +50,7 @@ def predict_rows(
     outlook = outlook_of(filter)
     states, outputs, received = compute_once(_predict, _by_xla, (outlook, rows, inputs))
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
-    names = name_received(() if sensor is None else tuple(sensor.outputs), filter.received)
+    names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
     measured = outputs and prediction_of(outputs, tuple(sensor.outputs), output_claim(filter, outlook), sensor.angles)
     arriving = received and prediction_of(received, names, filter.claim, angles.received)
     whole = prediction_of(states, filter.states, filter.claim, angles.states)

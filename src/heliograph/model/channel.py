@@ -10,7 +10,7 @@ from typing_extensions import TypeAliasType
 from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_turns
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
-from heliograph.model.told import KnownGain, Pilot, build_with_told, tell_gain
+from heliograph.model.told import KnownGain, Pilot, build_with_told, stack_with_told, tell_gain
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.traced import library
@@ -219,13 +219,13 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    return build_with_told(_stack_links, separate_memories(check_maps("stack", [relayed, direct])))
+    return stack_with_told(_make_as_late, separate_memories(check_maps("stack", [relayed, direct])))
 
 
-def _stack_links(links: Sequence[AbstractRandomAffine]) -> Stack:
-    """Stack links of one signal, each as late as the latest."""
+def _make_as_late(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
+    """Return links of one signal, each as late as the latest."""
     past = max(c.past for c in links)
-    return Stack([c if c.past == past else place_part(c, signal_size(c), 0, past) for c in links])
+    return [c if c.past == past else place_part(c, signal_size(c), 0, past) for c in links]
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
@@ -237,16 +237,16 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    return build_with_told(_place_links, separate_memories(check_maps("parallel channels", channels)))
+    return stack_with_told(_place_links, separate_memories(check_maps("parallel channels", channels)))
 
 
-def _place_links(links: Sequence[AbstractRandomAffine]) -> Stack:
-    """Stack links of which each takes its own part of the signal."""
+def _place_links(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
+    """Return links of all of the signal, of which each takes its own part."""
     parts, start, total, past = [], 0, sum(signal_size(c) for c in links), max(c.past for c in links)
     for c in links:
         parts.append(place_part(c, total, start, past))
         start += signal_size(c)
-    return Stack(parts)
+    return parts
 
 
 def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool = False) -> Superposed:

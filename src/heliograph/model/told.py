@@ -1,7 +1,7 @@
 """What comes with a message: gains, readings of gains and numbers of quality that the receiver is told."""
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import jax
 import numpy as np
@@ -116,36 +116,82 @@ def tell_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
 
 def deliver_told(link: AbstractRandomAffine) -> Stack:
     """Return a link with the numbers that are told of its maps after z."""
-    return Stack([link, *(ModeOutput(affine.memory, link.inputs) for affine in told_maps(link))])
+    return Stack([link, *_announce(link, link.inputs)])
 
 
-def strip_told(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the link of a channel that delivers what is told of it, without what is told; another channel as it is."""
-    if not isinstance(channel, Stack) or len(channel.maps) < 2:
-        return channel
-    link, *rest = channel.maps
-    by_identity = [affine.memory.identity for affine in told_maps(link)]
-    announced = [m.memory.identity for m in rest if isinstance(m, ModeOutput)]
-    return link if announced and announced == by_identity and len(announced) == len(rest) else channel
+def _announce(link: AbstractRandomAffine, sent: int) -> list[ModeOutput]:
+    return [ModeOutput(affine.memory, sent) for affine in told_maps(link)]
 
 
-def count_told(channel: AbstractRandomAffine) -> int:
-    """Return how many numbers a channel delivers after z, that are told of its link."""
-    link = strip_told(channel)
-    return 0 if link is channel else sum(affine.memory.announced for affine in told_maps(link))
+class ToldApart(NamedTuple):
+    """A channel taken apart: the link of the values, and the rows of z in which values and told numbers stand.
+
+    Numbers are in the order of the link's `told_maps`, each once.
+    """
+
+    link: AbstractRandomAffine
+    values: tuple[int, ...]
+    numbers: tuple[int, ...]
+
+
+def take_apart(channel: AbstractRandomAffine) -> ToldApart:
+    """Take a channel apart into its link and what is told of it; of another one all rows are values."""
+    maps = channel.maps if isinstance(channel, Stack) else (channel,)
+    told_of = {affine.memory.identity for affine in told_maps(channel)}
+    rows, links, at_row = dict[str, tuple[int, ...]](), list[AbstractRandomAffine](), 0
+    values: tuple[int, ...] = ()
+    for part in maps:
+        places = tuple(range(at_row, at_row + part.outputs))
+        at_row += part.outputs
+        if isinstance(part, ModeOutput) and part.memory.identity in told_of:
+            rows.setdefault(part.memory.identity, places)
+        else:
+            links.append(part)
+            values += places
+    if not rows:
+        return ToldApart(channel, values, ())
+    link = links[0] if len(links) == 1 else Stack(links)
+    numbers = [row for affine in told_maps(link) for row in rows[affine.memory.identity]]
+    return ToldApart(link, values, tuple(numbers))
 
 
 def build_with_told(build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]) -> M:
     """Return what is built of channels, with all that is told of them after z: it passes by whatever is built."""
-    links = [strip_told(channel) for channel in channels]
+    links = [take_apart(channel).link for channel in channels]
     built = build(links)
     apart = any(link is not channel for link, channel in zip(links, channels, strict=True))
     return cast(M, deliver_told(built)) if apart else built
 
 
-def names_told(channel: AbstractRandomAffine) -> tuple[str, ...]:
-    """Return the names of the numbers that are told after z, told apart where several have one name."""
-    link = strip_told(channel)
-    names = [] if link is channel else [name for affine in told_maps(link) for name in affine.names]
-    several = {name for name in names if names.count(name) > 1}
-    return tuple(f"{name}_{names[:i].count(name) + 1}" if name in several else name for i, name in enumerate(names))
+def stack_with_told(
+    place: Callable[[list[AbstractRandomAffine]], list[AbstractRandomAffine]], channels: Sequence[AbstractRandomAffine]
+) -> Stack:
+    """Return channels side by side, each one's told numbers after its own outputs, as its receiver gets them.
+
+    Args:
+        place: makes of the links of several signals as many of all of them.
+        channels: the channels.
+    """
+    links = [take_apart(channel).link for channel in channels]
+    placed, maps = place(links), list[AbstractRandomAffine]()
+    for link, channel, of_all in zip(links, channels, placed, strict=True):
+        maps += [of_all] if link is channel else [of_all, *_announce(of_all, of_all.inputs)]
+    return Stack(maps)
+
+
+def name_received(outputs: tuple[str, ...], channel: AbstractRandomAffine, more: int = 0) -> tuple[str, ...]:
+    """Return names of what is received: of values those of the outputs where these are as many, else z0, z1, ...
+
+    Args:
+        outputs: names of the sensor's outputs.
+        channel: from the sensor to the receiver; told numbers have names of their own.
+        more: how many numbers are received beside what the channel delivers.
+    """
+    link, values, numbers = take_apart(channel)
+    count = len(values) + more
+    names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
+    told_names = [name for affine in told_maps(link) for name in affine.names] if numbers else []
+    several = {name for name in told_names if told_names.count(name) > 1}
+    for i, (row, name) in sorted(enumerate(zip(numbers, told_names, strict=True)), key=lambda item: item[1][0]):
+        names.insert(row, f"{name}_{told_names[:i].count(name) + 1}" if name in several else name)
+    return tuple(names)

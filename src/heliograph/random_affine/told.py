@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import eliminate
 from heliograph.numerics.check import fail, scalar, show_value
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.traced import library
@@ -17,7 +18,7 @@ from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, c
 from heliograph.random_affine.chain import AbstractMemory, CertainChain, MarkovChain, Nodes, identify_memory
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.law import AbstractLaw, CertainDiscrete, Constant, Discrete
-from heliograph.random_affine.noise import AbstractNoise, Matrix
+from heliograph.random_affine.noise import FACTOR_TOLERANCE, AbstractNoise, Matrix
 from heliograph.random_affine.reading import check_density, gain_given_reading
 
 T = TypeVar("T")
@@ -275,6 +276,30 @@ def believe_told(channel: T, numbers: Numbers) -> T:
         lambda leaf: leaf.believed(parts[leaf.memory.identity]) if _is_told(leaf) else leaf, channel, is_leaf=_is_told
     )
     return conditioned
+
+
+def is_law(believed: AbstractRandomAffine, typical: AbstractRandomAffine) -> jax.Array:
+    """Test whether what a told map became has finite numbers, and noises whose covariances are some.
+
+    A variance of zero is one only where it is zero for typical numbers as well: elsewhere it means that nobody knows.
+    """
+    numbers = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(believed) if eqx.is_array(leaf)]
+    noises = [_is_covariance(b, t) for b, t in zip(_covariances(believed), _covariances(typical), strict=True)]
+    return jnp.all(jnp.stack([*numbers, *noises]))
+
+
+def _covariances(link: AbstractRandomAffine) -> list[jax.Array | np.ndarray]:
+    leaves = jax.tree.leaves(link, is_leaf=lambda leaf: isinstance(leaf, AbstractNoise))
+    return [leaf.covariance for leaf in leaves if isinstance(leaf, AbstractNoise)]
+
+
+def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarray) -> jax.Array:
+    """Test whether L diag(d) L' with d not negative is the matrix, to rounding, and its variances are not lost."""
+    lower, pivots = eliminate(jnp.asarray(matrix))
+    variances = jnp.diagonal(jnp.asarray(matrix))
+    positive = (variances > 0) | (jnp.asarray(jnp.diagonal(jnp.asarray(typical)) == 0) & (variances == 0))
+    off = jnp.abs(lower @ jnp.diag(jnp.maximum(pivots, 0.0)) @ lower.T - matrix)
+    return jnp.all(positive) & jnp.all(off <= FACTOR_TOLERANCE * jnp.sqrt(jnp.outer(variances, variances)))
 
 
 def made_certain(link: T) -> T:

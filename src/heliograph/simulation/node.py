@@ -20,7 +20,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.model.told import names_told
+from heliograph.model.told import name_received
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value, table
@@ -156,8 +156,8 @@ class Node(Module):
     @property
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
-        told = names_told(first(self.channel))
-        return name_received(self.outputs, self.received - len(told)) + told
+        channel = first(self.channel)
+        return name_received(self.outputs, channel, self.received - channel.outputs)
 
 
 @readable
@@ -175,7 +175,7 @@ class ReceivingNode(Module):
     @property
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
-        return name_received(self.outputs, self.received)
+        return name_values(self.outputs, self.received)
 
     @property
     def limits(self) -> None:
@@ -276,7 +276,7 @@ def check_trigger(
         raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
 
 
-def name_received(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
+def name_values(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
     """Names of the received components: the sensor's outputs where these are as many, else z0, z1, ..."""
     return outputs if len(outputs) == received else tuple(f"z{i}" for i in range(received))
 

@@ -124,7 +124,24 @@ def test_names_of_what_is_told():
     two = hg.parallel([LINKS["gain"][0], LINKS["gain"][0], LINKS["variance"][0]])
     sensor = hg.LinearSensor(np.eye(3, 2), np.eye(3), outputs=["a", "b", "c"])
     node = hg.Node(sensor, two, {})
-    assert node.received_names == ("a", "b", "c", "gain_1", "gain_2", "variance")
+    assert node.received_names == ("a", "gain_1", "b", "gain_2", "c", "variance")
+
+
+def test_fusion_centre_that_is_told_by_each_node():
+    """Rows of all nodes stand one after another, each node's values before what it is told."""
+    links = {"a": LINKS["gain"][0], "b": LINKS["variance"][0]}
+    sensors = {"a": SENSOR, "b": hg.LinearSensor([[0.0, 1.0]], 0.2)}
+    nodes = {name: hg.Node(sensors[name], links[name], {}) for name in links}
+    joint, channel = hg.model.joint_sensor(sensors), hg.parallel(list(links.values()))
+    centre = hg.linear_filter(PLANT, joint, channel)
+    network = hg.Network(PLANT, nodes, {"all": centre})
+    assert network.claims() == {"a": {}, "b": {}, "fused": {"all": "exact"}}
+    a, b = gains(), gains()[::-1]
+    given = [hg.parallel([hg.hop(g, 0.1), hg.hop(1.0, r)]) for g, r in zip(a, b, strict=True)]
+    record = hg.run(network, {"a": rows(a), "b": rows(b)})
+    values = np.column_stack([rows(a)[:, 0], rows(b)[:, 0]])
+    expected = hg.linear_filter(PLANT, joint, over_time(given)).run(values)
+    np.testing.assert_allclose(record.estimates["fused"]["all"].mean, expected.means, rtol=1e-11, atol=1e-13)
 
 
 def test_message_without_its_number_is_not_used_but_without_a_pilot_by_the_law():
@@ -154,6 +171,34 @@ def last_errors(network, steps, runs):
 def assert_mean(found, expected):
     """Within four standard errors, as the batches show them."""
     assert abs(found.mean() - expected) < 4 * found.std() / np.sqrt(len(found) - 1)
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 0.0])
+def test_numbers_that_give_no_law_refuse_their_message(wrong):
+    link = LINKS["variance"][0]
+    filter = hg.linear_filter(PLANT, SENSOR, link)
+    network = hg.Network(PLANT, {"a": hg.Node(SENSOR, link, {"f": filter})})
+    z = rows(gains())
+    blank = z.copy()
+    z[3, 1], blank[3] = wrong, np.nan
+    with pytest.warns(UserWarning, match="node 'a': row 4 is implausible"):
+        record = hg.run(network, {"a": z})
+    expected = hg.run(network, {"a": blank}).estimates["a"]["f"].mean
+    np.testing.assert_array_equal(record.estimates["a"]["f"].mean, expected)
+    stream = hg.Stream(filter)
+    stream.push(z[0])
+    with pytest.raises(ValueError, match="expected a plausible one"):
+        stream.push(z[3])
+    stream.push(np.array([np.nan, wrong]))  # nothing came, and nothing is used
+
+
+def test_covariance_that_is_none_refuses_its_message():
+    sensor = hg.LinearSensor(np.eye(2), 0.0 * np.eye(2), outputs=["east", "north"])
+    link = told(lambda a: hg.hop(1.0, jnp.reshape(a, (2, 2))), list("abcd"), typical=[1.0, 0.0, 0.0, 1.0])
+    stream = hg.Stream(hg.linear_filter(PLANT, sensor, link))
+    stream.push([0.1, 0.2, 1.0, 0.9, 0.9, 1.0])
+    with pytest.raises(ValueError, match="expected a plausible one"):
+        stream.push([0.1, 0.2, 1.0, 1.1, 1.1, 1.0])
 
 
 # E P after 60 steps by quadrature, x+ = .95 x + w, Q = .1, R = .05, Rayleigh gain of scale .8, n of variance .1

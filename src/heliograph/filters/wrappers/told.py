@@ -8,6 +8,7 @@ from typing import ParamSpec, TypeVar, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.filters.base import (
     AbstractFilter,
@@ -27,13 +28,13 @@ from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believing
 from heliograph.model.sensor import AnySensor
-from heliograph.model.told import count_told, strip_told
+from heliograph.model.told import take_apart
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.told import believe_told, made_certain, told_maps
+from heliograph.random_affine.told import believe_told, is_law, made_certain, told_maps
 
 F = TypeVar("F", bound=AbstractFilter)
 P = ParamSpec("P")
@@ -62,6 +63,8 @@ class ToldFilter(AbstractSizedFilter):
         sensor: its sensor.
         link: the channel without what is told.
         make: builds a filter of plant, sensor and a link.
+        values: rows of z in which the link's values stand.
+        numbers: rows in which what is told stands.
     """
 
     base: AbstractFilter
@@ -69,6 +72,8 @@ class ToldFilter(AbstractSizedFilter):
     sensor: AnySensor
     link: Channel
     make: MakeFilter
+    values: tuple[int, ...] = eqx.field(static=True)
+    numbers: tuple[int, ...] = eqx.field(static=True)
 
     @in_float64
     def init(self) -> PyTree:
@@ -84,13 +89,17 @@ class ToldFilter(AbstractSizedFilter):
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct by the filter of the law that the numbers of the message give."""
         values, numbers = self._split(jnp.asarray(z))
-        after, innovation = self._filter_given(numbers, k).correct(state, values, k)
+        filter, is_law = self._filter_given(numbers, k)
+        after, innovation = filter.correct(state, values, k)
+        # Numbers that give no law make the state none, so that the message is refused where it came in.
+        after = _spoil(after, ~is_law & ~jnp.all(jnp.isnan(values)))
         # What is told belongs to the innovation; given it, it adds nothing to the likelihood.
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         for number in numbers:
             flag_innovation, covariance = append_flag(covariance, number)
             value = jnp.append(value, flag_innovation)
-        return after, Innovation(value, covariance, innovation.log_likelihood)
+        order = np.argsort((*self.values, *self.numbers))
+        return after, Innovation(value[order], covariance[order][:, order], innovation.log_likelihood)
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
@@ -104,11 +113,13 @@ class ToldFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the law that was told."""
         values, numbers = self._split(jnp.asarray(step.z))
-        return self._filter_given(numbers, step.k).smoother_step(step._replace(z=values))
+        filter, _ = self._filter_given(numbers, step.k)
+        return filter.smoother_step(step._replace(z=values))
 
     def angles_used(self) -> FilterAngles | None:
-        """Return those of the filter within; what is told is none."""
-        return self.base.angles_used()
+        """Return those of the filter within, at their rows; what is told is none."""
+        angles = self.base.angles_used()
+        return angles and angles._replace(received=tuple(self.values[i] for i in angles.received))
 
     @property
     def of_atoms(self) -> bool:
@@ -125,21 +136,35 @@ class ToldFilter(AbstractSizedFilter):
 
     def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Values and numbers of a message; no values where a number is missing without which they mean nothing."""
-        m = self.base.received
-        numbers, optional = z[m:], self._optional
-        usable = jnp.all(~jnp.isnan(numbers) | optional)
-        return jnp.where(usable, z[:m], jnp.nan), numbers
+        numbers = z[np.array(self.numbers)]
+        usable = jnp.all(~jnp.isnan(numbers) | self._optional)
+        return jnp.where(usable, z[np.array(self.values)], jnp.nan), numbers
 
     @property
     def _optional(self) -> jax.Array:
         """Which numbers may be missing."""
         return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in told_maps(first(self.link))])
 
-    def _filter_given(self, numbers: jax.Array, k: Step) -> AbstractFilter:
-        """Build the filter of the law that the numbers give; where one is missing that must not, of a typical law."""
-        typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in told_maps(first(self.link))])
+    def _filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
+        """Build the filter of the law that the numbers give, and tell whether they give one.
+
+        Where a number is missing that must not, it is that of a typical law.
+        """
+        link = at(self.link, k)
+        typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in told_maps(link)])
         complete = jnp.where(jnp.isnan(numbers) & ~self._optional, typical, numbers)
-        return self.make(self.plant, at(self.sensor, k), believe_told(at(self.link, k), complete))
+        believed, usual = believe_told(link, complete), believe_told(link, typical)
+        return self.make(self.plant, at(self.sensor, k), believed), is_law(believed, usual)
+
+
+def _spoil(state: PyTree, spoilt: jax.Array) -> PyTree:
+    """Make all real numbers of a state NaN, or leave it as it is."""
+
+    def spoil(leaf: jax.Array) -> jax.Array:
+        real = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+        return jnp.where(spoilt, jnp.nan, leaf) if real else leaf
+
+    return jax.tree.map(spoil, state)
 
 
 def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: MakeFilter) -> ToldFilter:
@@ -153,14 +178,20 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
 
     Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state.
     """
-    link = at_each_step(lambda channel: made_certain(strip_told(channel)), channel)
-    typical = at_each_step(_believe_typical, link)
-    base = make(plant, sensor, typical)
+    link = at_each_step(lambda channel: made_certain(take_apart(channel).link), channel)
+    base = make(plant, sensor, at_each_step(_believe_typical, link))
     exogenous = all(affine.exogenous for affine in told_maps(first(link)))
     claim: Claim = base.claim if exogenous or base.claim == "none" else "nominal"
-    received = base.received + count_told(first(channel))
+    _, values, numbers = take_apart(first(channel))
     filter = ToldFilter(
-        base=base, plant=plant, sensor=sensor, link=link, make=make, **make_sizes(claim, base, received)
+        base=base,
+        plant=plant,
+        sensor=sensor,
+        link=link,
+        make=make,
+        values=values,
+        numbers=numbers,
+        **make_sizes(claim, base, len(values) + len(numbers)),
     )
     premise = base.premise
     return believing(filter, premise and premise.replaced(sensor=sensor, channel=channel))
@@ -186,7 +217,7 @@ def takes_told(make: Callable[P, F]) -> Callable[P, F]:
     def build(*args: P.args, **kwargs: P.kwargs) -> F:
         given = parameters.bind(*args, **kwargs).arguments
         channel = given.get("channel")
-        if not isinstance(first(channel), AbstractRandomAffine) or not count_told(first(channel)):
+        if not isinstance(first(channel), AbstractRandomAffine) or not take_apart(first(channel)).numbers:
             return make(*args, **kwargs)
         plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
         return cast(F, build_told_filter(plant, sensor, link, MakeFilter(make, given)))
