@@ -128,6 +128,10 @@ class AbstractTold(AbstractModal):
     def believed(self, numbers: Numbers) -> AbstractRandomAffine:
         """Return the map without memory, as the receiver knows it given the numbers."""
 
+    def give_law(self, numbers: Numbers) -> jax.Array:
+        """Test whether numbers give a law; by default all that are finite do."""
+        return jnp.all(jnp.isfinite(numbers))
+
 
 class Told(AbstractTold):
     """A map that is a function of the numbers that are told.
@@ -191,6 +195,19 @@ class Told(AbstractTold):
         """Return the map of these numbers."""
         return self.make(numbers)
 
+    def give_law(self, numbers: Numbers) -> jax.Array:
+        """Test whether the map has finite numbers, and noises whose covariances are some.
+
+        A variance of zero is one only where it is zero for typical numbers as well: elsewhere it means that nobody
+        knows. A gain that is told decides no noise.
+        """
+        if isinstance(self.make, GainTold):
+            return super().give_law(numbers)
+        link, usual = self.believed(numbers), self.believed(jnp.asarray(self.typical))
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(link) if eqx.is_array(leaf)]
+        noises = [_is_covariance(b, t) for b, t in zip(_covariances(link), _covariances(usual), strict=True)]
+        return jnp.all(jnp.stack([*finite, *noises]))
+
     def in_words(self) -> str:
         """The map of typical numbers in words, and what is told."""
         return f"{self.believed(self.typical).in_words()} (told {', '.join(self.names)})"
@@ -240,6 +257,10 @@ class PilotedHop(AbstractHop, AbstractTold):
         """Return the hop of the gain that was drawn."""
         return GainAndNoise(Constant(jnp.asarray(state)[0]), self.matrix, self.noise)
 
+    def give_law(self, numbers: Numbers) -> jax.Array:
+        """Always: without a reading the gain has its own law."""
+        return jnp.asarray(True)
+
     def believed(self, numbers: Numbers) -> GainAndNoise:
         """Return the hop of the gain's law given the reading; its own law where none came."""
         law = gain_given_reading(self.memory.law, numbers[0], self.memory.variance)
@@ -267,25 +288,34 @@ def believe_told(channel: T, numbers: Numbers) -> T:
         channel: a channel, whose other memories stay.
         numbers: what is told of all its maps, one after another.
     """
-    parts, start = dict[str, Numbers](), 0
-    assert isinstance(channel, AbstractRandomAffine)
-    for affine in told_maps(channel):
-        parts[affine.memory.identity] = numbers[start : start + affine.memory.announced]
-        start += affine.memory.announced
-    conditioned: T = jax.tree.map(
-        lambda leaf: leaf.believed(parts[leaf.memory.identity]) if _is_told(leaf) else leaf, channel, is_leaf=_is_told
-    )
+    parts = _share_out(channel, numbers)
+
+    def believe(leaf: object) -> object:
+        return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractTold) else leaf
+
+    conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told)
     return conditioned
 
 
-def is_law(believed: AbstractRandomAffine, typical: AbstractRandomAffine) -> jax.Array:
-    """Test whether what a told map became has finite numbers, and noises whose covariances are some.
+def give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
+    """Test whether what is told of each of the channel's maps gives a law.
 
-    A variance of zero is one only where it is zero for typical numbers as well: elsewhere it means that nobody knows.
+    Args:
+        channel: a channel.
+        numbers: what is told of all its maps, one after another.
     """
-    numbers = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(believed) if eqx.is_array(leaf)]
-    noises = [_is_covariance(b, t) for b, t in zip(_covariances(believed), _covariances(typical), strict=True)]
-    return jnp.all(jnp.stack([*numbers, *noises]))
+    parts = _share_out(channel, numbers)
+    return jnp.all(jnp.stack([affine.give_law(parts[affine.memory.identity]) for affine in told_maps(channel)]))
+
+
+def _share_out(channel: object, numbers: Numbers) -> dict[str, Numbers]:
+    """Return what is told of each map of a channel, by the identity of its memory."""
+    assert isinstance(channel, AbstractRandomAffine)
+    parts, start = dict[str, Numbers](), 0
+    for affine in told_maps(channel):
+        parts[affine.memory.identity] = numbers[start : start + affine.memory.announced]
+        start += affine.memory.announced
+    return parts
 
 
 def _covariances(link: AbstractRandomAffine) -> list[jax.Array | np.ndarray]:

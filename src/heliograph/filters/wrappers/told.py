@@ -34,7 +34,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.told import believe_told, is_law, made_certain, told_maps
+from heliograph.random_affine.told import believe_told, give_law, made_certain, told_maps
 
 F = TypeVar("F", bound=AbstractFilter)
 P = ParamSpec("P")
@@ -153,8 +153,7 @@ class ToldFilter(AbstractSizedFilter):
         link = at(self.link, k)
         typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in told_maps(link)])
         complete = jnp.where(jnp.isnan(numbers) & ~self._optional, typical, numbers)
-        believed, usual = believe_told(link, complete), believe_told(link, typical)
-        return self.make(self.plant, at(self.sensor, k), believed), is_law(believed, usual)
+        return self.make(self.plant, at(self.sensor, k), believe_told(link, complete)), give_law(link, complete)
 
 
 def _spoil(state: PyTree, spoilt: jax.Array) -> PyTree:
