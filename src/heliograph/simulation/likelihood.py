@@ -6,10 +6,11 @@ import jax.numpy as jnp
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.filter_data import check_data
+from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.traced import is_traced
-from heliograph.numerics.types import Array, ArrayLike, Float, Scalar
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, Scalar
 
 
 def log_likelihood(
@@ -28,6 +29,9 @@ def log_likelihood(
         measurements: rows (steps, received); NaN did not arrive and adds nothing.
         inputs: rows (steps, inputs); by default a filter without inputs is assumed.
 
+    Returns:
+        The sum; NaN from the row on at which the filter's estimate is no number.
+
     Raises:
         ValueError: measurements or inputs of the wrong shape, infinite values, more steps than the filter covers.
 
@@ -41,7 +45,12 @@ def log_likelihood(
 
 
 def _sum(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
-    return jnp.sum(filter.scan(z, u, lambda state, innovation, k: jnp.asarray(innovation.log_likelihood)))
+    def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:
+        """NaN where the estimate is no number, whose innovations would look like silence."""
+        lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
+        return jnp.where(lost, jnp.nan, innovation.log_likelihood)
+
+    return jnp.sum(filter.scan(z, u, judged))
 
 
 _by_xla = compile_in_float64(_sum)

@@ -125,10 +125,18 @@ class Objective:
         return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
-        """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m)."""
-        innovations: tuple[jax.Array, jax.Array] = self.filter(x).scan(
-            z, u, lambda state, innovation, k: (innovation.value, innovation.covariance)
-        )
+        """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
+
+        Where the estimate is no number the covariance is none, so that no likelihood is taken for that of silence.
+        """
+        filter = self.filter(x)
+
+        def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+            lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
+            value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+            return jnp.where(lost, 0.0, value), jnp.where(lost, jnp.nan, covariance)
+
+        innovations: tuple[jax.Array, jax.Array] = filter.scan(z, u, judged)
         return innovations
 
     def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:

@@ -1,0 +1,47 @@
+"""Laws of what messages tell, learned: the noise as a function of what is declared."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.model import told
+
+PLANT = hg.LinearPlant([[0.95]], 0.1, [0.0], 1.0)
+SENSOR = hg.LinearSensor([[1.0]], 0.05, outputs=["y"])
+TRUE = 2.5, 0.3  # noise of a message that declares a: 2.5 a + 0.3
+
+
+def noisy(scale, floor, law=None):
+    return told(lambda a: hg.hop(1.0, scale * a[0] + floor), ["variance"], law=law, typical=[0.1])
+
+
+def build():
+    link = noisy(hg.free(1.0, "scale"), hg.free(0.1, "floor"))
+    return hg.Network(PLANT, {"a": hg.Node(SENSOR, link, {"f": hg.linear_filter(PLANT, SENSOR, link)})})
+
+
+def rows(count):
+    law = hg.random_affine.FiniteSupport([[0.1], [1.0]], [0.5, 0.5])
+    world = hg.Network(PLANT, {"a": hg.Node(SENSOR, noisy(*TRUE, law=law), {})})
+    return hg.simulate(world, count, 3).measurements["a"]
+
+
+def test_likelihood_of_numbers_that_give_no_law_is_none():
+    z = rows(30)
+    filter = hg.linear_filter(PLANT, SENSOR, noisy(*TRUE))
+    assert np.isfinite(hg.log_likelihood(filter, z))
+    z[10, 1] = -1.0
+    assert np.isnan(hg.log_likelihood(filter, z))
+
+
+@pytest.mark.slow
+def test_noise_as_a_function_of_what_is_declared():
+    z = rows(600)
+    found = hg.fit(build, {"a": z})
+    intervals = {row.name: (row.low, row.high) for row in found.table}
+    for name, value in zip(("scale", "floor"), TRUE, strict=True):
+        assert intervals[name][0] < value < intervals[name][1]
+    # The search starts where numbers in a function may be any, also such as give negative variances: none of these is
+    # taken for silence, whose likelihood of 0 would win.
+    at_the_truth = hg.log_likelihood(hg.linear_filter(PLANT, SENSOR, noisy(*TRUE)), z)
+    assert at_the_truth < found.best.total < at_the_truth + 5  # two numbers: 1 nat in the mean
