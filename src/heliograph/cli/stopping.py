@@ -54,7 +54,8 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
 class GentleStop:
     """A stop that keeps what there is: from `begin` on the first signal is only noted, and a second one unwinds.
 
-    As a context it gives the signals back at its end.
+    The exit code is that of the first: a second may be the interrupt that `stoppable` raises again where the first was
+    swallowed. As a context it gives the signals back at its end.
     """
 
     def __init__(self) -> None:
@@ -104,11 +105,11 @@ class GentleStop:
         return None
 
     def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
-        self._number = number
+        self._number = self._number or number
         raise KeyboardInterrupt
 
     def _note(self, number: int, _: FrameType | None) -> None:
-        self._number = number
+        self._number = self._number or number
         self._give_back()
 
     def _give_back(self) -> None:
