@@ -60,9 +60,9 @@ def tried(place, name):
     # A contract's check fails by AssertionError; a message's model is read by the service, which has the words.
     if place == "heliograph.testing" or (inspect.isclass(item) and issubclass(item, BaseModel)):
         return False
-    # What others derive from does nothing itself, and a tuple of results holds whatever it is given.
+    # What others derive from does nothing itself; a tuple of results and an error hold whatever they are given.
     made = inspect.isclass(item) and (name.startswith("Abstract") or name in PROTOCOLS)
-    return not made and not (inspect.isclass(item) and issubclass(item, tuple))
+    return not made and not (inspect.isclass(item) and issubclass(item, tuple | Exception))
 
 
 NAMES = [pair for pair in PUBLIC if tried(*pair)]

@@ -17,6 +17,9 @@ from . import (
     campaign as campaign,
     testing as testing,
 )
+from .numerics.check import (
+    InputError as InputError,
+)
 from .random_affine.fading_law import (
     Rayleigh as Rayleigh,
 )

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 import heliograph as h
+import heliograph as hg
 from heliograph import cli
-from heliograph.numerics.check import InputError
 from tests.cli.example import contents, refused, run_arguments, stub_study
 
 
@@ -71,7 +71,7 @@ def test_all_that_is_missing_is_named_at_once_with_one_command(folder, capsys, m
 
 def test_a_long_message_stays_on_one_line(folder, capsys, monkeypatch):
     def wrong(*_):
-        raise InputError("thing: expected\n  one, got\n  two")
+        raise hg.InputError("thing: expected\n  one, got\n  two")
 
     stub_study(monkeypatch, wrong)
     refused(folder, capsys, ["demo", "--out", "results"], "heliograph: thing: expected one, got two")

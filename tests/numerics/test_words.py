@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.check import InputError, array, scalar
+from heliograph.numerics.check import array, scalar
 from heliograph.serving.message import read_message
 
 
@@ -38,7 +38,7 @@ def single(x):
     ],
 )
 def test_a_line_says_what_to_write(make, line):
-    with pytest.raises(InputError) as error:
+    with pytest.raises(hg.InputError) as error:
         make()
     assert str(error.value) == line
 
@@ -90,7 +90,7 @@ def assigning_in_place(x, u):
     ],
 )
 def test_what_jax_cannot_trace_is_named_with_what_to_write(make, words):
-    with pytest.raises(InputError, match=re.escape(f"got {words}")):
+    with pytest.raises(hg.InputError, match=re.escape(f"got {words}")):
         make()
 
 
@@ -195,6 +195,6 @@ def test_any_object_of_ours_answers_a_wrong_attribute_with_near_ones_or_the_func
 )
 def test_no_word_of_the_library_that_reads_messages_is_in_an_error(payload, came):
     with pytest.raises(
-        InputError, match=r"^message: expected a JSON object with no fields but .*" + re.escape(came) + "$"
+        hg.InputError, match=r"^message: expected a JSON object with no fields but .*" + re.escape(came) + "$"
     ):
         read_message(payload)

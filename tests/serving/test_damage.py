@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import heliograph as hg
 from heliograph.live.stored.migration import Carrier
-from heliograph.numerics.check import InputError
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import Damage, identity, report_damage
@@ -162,7 +162,7 @@ def test_damage_is_one_line_with_what_to_do():
 def test_damage_outside_the_plants_ends_the_service_in_one_line(whole, tmp_path, mine, how, what):
     place = copy(whole, tmp_path)
     changed(place, how)
-    with pytest.raises(InputError, match=what) as error:
+    with pytest.raises(hg.InputError, match=what) as error:
         gone_on(place, mine)
     assert f"store {place}" in str(error.value) and "\n" not in str(error.value)
 
@@ -196,7 +196,7 @@ def test_a_store_of_an_older_release_is_refused_by_its_layout_and_release(tmp_pa
     changed(place, "insert into whose values ('identity', ?)", json.dumps(mine | {"heliograph": "0.1.0"}))
     changed(place, "insert into plants values ('p', 1, x'00')")
     said = []
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(hg.InputError) as refused:
         Store(str(place), mine, carrier=Carrier(here, mine, said.append) if accepts else None)
     assert str(refused.value) == (
         f"store {place}: expected layout 5, of heliograph {mine['heliograph']}, got layout 1, of heliograph "
@@ -220,7 +220,7 @@ def test_no_byte_of_the_file_changes_what_is_informed(whole, tmp_path, mine):
         place.write_bytes(other)
         try:
             estimates, refused = gone_on(place, mine)
-        except InputError as error:
+        except hg.InputError as error:
             assert str(error).startswith(f"store {place}") and "\n" not in str(error)
             outcomes["refused"] += 1
             continue
@@ -237,7 +237,7 @@ def test_no_byte_of_the_file_changes_what_is_informed(whole, tmp_path, mine):
 
 @pytest.mark.parametrize("place", ["", " ", ":memory:", "sqlite://"])
 def test_a_place_that_is_none_is_refused(place):
-    with pytest.raises(InputError, match=r"store: expected a file, .*; none keeps nothing, got"):
+    with pytest.raises(hg.InputError, match=r"store: expected a file, .*; none keeps nothing, got"):
         Store(place, {})
 
 

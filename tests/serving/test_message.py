@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.numerics.check import InputError
+import heliograph as hg
 from heliograph.serving.message import Message, NumberedMessage, UnreadMessage, read_message, read_messages
 
 FIELDS = {"node": '"a"', "sequence": "1", "time": "1"}
@@ -21,7 +21,7 @@ VALUES = (
 def by_pydantic(payload: bytes) -> Message | str:
     try:
         return read_message(payload)
-    except InputError as error:
+    except hg.InputError as error:
         return str(error)
 
 

@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import minimize
 
 import heliograph as hg
-from heliograph.numerics.check import InputError
 from heliograph.planning import Budget, Error, independent_paths, paths_of
 from heliograph.planning.budget import power_limits
 from heliograph.planning.paths.design import power_task
@@ -155,32 +154,32 @@ def test_several_hops_are_designed_from_arrays_too():
     result = hg.design(relayed_paths(), budget=6.0)
     assert result.error == pytest.approx(1.36438855, abs=1e-8) and not result.certificate.convex
     assert np.isnan(result.present)
-    with pytest.raises(InputError, match="network of a design: expected a design of a Network"):
+    with pytest.raises(hg.InputError, match="network of a design: expected a design of a Network"):
         _ = result.network
 
 
 def test_what_cannot_be_is_refused():
     paths = direct_paths()
     limit = task_of(paths, 1e13).problem.exact(np.full((1, 6), 1e13))
-    with pytest.raises(InputError, match=rf"target error: expected more than {limit:.5g}.*: unlimited power leaves"):
+    with pytest.raises(hg.InputError, match=rf"target error: expected more than {limit:.5g}.*: unlimited power leaves"):
         hg.design(paths, target_error=0.3)
-    with pytest.raises(InputError, match="error: expected that over 1 steps"):
+    with pytest.raises(hg.InputError, match="error: expected that over 1 steps"):
         hg.design(paths, error=Error(period=2), budget=1.0)
-    with pytest.raises(InputError, match="free powers of paths: expected all of them"):
+    with pytest.raises(hg.InputError, match="free powers of paths: expected all of them"):
         hg.design(paths, free=["sender0"], budget=1.0)
-    with pytest.raises(InputError, match="budget: expected one that limits every transmitter"):
+    with pytest.raises(hg.InputError, match="budget: expected one that limits every transmitter"):
         hg.design(paths, budget=Budget(per_transmitter={"sender0": 1.0}))
-    with pytest.raises(InputError, match=r"network: expected a Network, a RelayNetwork, Paths or .* got int"):
+    with pytest.raises(hg.InputError, match=r"network: expected a Network, a RelayNetwork, Paths or .* got int"):
         hg.design(3, budget=1.0)
-    with pytest.raises(InputError, match="error: expected an Error, got 'trace'"):
+    with pytest.raises(hg.InputError, match="error: expected an Error, got 'trace'"):
         hg.design(paths, error="trace", budget=1.0)
-    with pytest.raises(InputError, match=r"steady power: expected a stable plant.*1\.1"):
+    with pytest.raises(hg.InputError, match=r"steady power: expected a stable plant.*1\.1"):
         independent_paths([[1.1]], [[1.0]], [[1.0]], [1.0], 1.0, [1.0])
-    with pytest.raises(InputError, match="paths over a horizon: expected initial_covariance"):
+    with pytest.raises(hg.InputError, match="paths over a horizon: expected initial_covariance"):
         independent_paths([[1.1]], [[1.0]], [[1.0]], [1.0], 1.0, [1.0], Error(horizon=2))
-    with pytest.raises(InputError, match=r"kappa of paths: expected numbers of at least 1, got 0\.9"):
+    with pytest.raises(hg.InputError, match=r"kappa of paths: expected numbers of at least 1, got 0\.9"):
         independent_paths([[0.5]], [[1.0]], [[1.0]], [1.0], [0.9], [1.0])
-    with pytest.raises(InputError, match="noises of paths: expected shape"):
+    with pytest.raises(hg.InputError, match="noises of paths: expected shape"):
         independent_paths([[0.5]], [[1.0]], [[1.0]], NOISES, 1.0, [1.0])
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from heliograph.numerics.check import InputError
+import heliograph as hg
 from heliograph.planning import split_power
 from heliograph.planning.paths.relaxation import SplitPaths, envelope, split
 
@@ -32,7 +32,7 @@ def test_two_hops_share_by_their_closed_form_and_one_gets_all():
     assert split_power([0.0, 2.0, 0.0], 3.0).tolist() == pytest.approx([0.0, 3.0, 0.0], rel=1e-14)
     assert split_power([0.0, 0.0], 1.0).tolist() == split_power([1.0, 2.0], 0.0).tolist() == [0.0, 0.0]
     np.testing.assert_allclose(split_power([1e-9, 1e9, 1.0], 1e-3).sum(), 1e-3, rtol=1e-13)
-    with pytest.raises(InputError, match="alpha of hops: expected numbers of at least 0"):
+    with pytest.raises(hg.InputError, match="alpha of hops: expected numbers of at least 0"):
         split_power([-1.0], 1.0)
 
 

@@ -12,7 +12,6 @@ import heliograph as hg
 from heliograph.files.inspection import Topic, suggestion
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
-from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.listening import listen
 from heliograph.serving.brokers.opcua import Reporting, read_reporting, reporting_of
 from heliograph.serving.brokers.translator import Translator
@@ -61,14 +60,14 @@ async def stopped(server: Server) -> None:
 def test_a_deadband_is_the_sender_of_a_node():
     trigger = Reporting(0.5, 0.1).trigger(heartbeat=60)
     assert trigger.delta == 0.5 and trigger.heartbeat == 60
-    with pytest.raises(InputError, match=r"deadband of the server: expected a positive number, got 0\.0"):
+    with pytest.raises(hg.InputError, match=r"deadband of the server: expected a positive number, got 0\.0"):
         Reporting(0.0, 0.1).trigger()
 
 
 def test_a_server_needs_sources_and_an_answer():
     where = parse_address("opc.tcp://me:secret@127.0.0.1:4840/plant", {})
     assert str(where) == "opc.tcp://127.0.0.1:4840/plant" and "secret" not in repr(where)
-    with pytest.raises(InputError, match=r"opc\.tcp://.*: expected sources in the network's file"):
+    with pytest.raises(hg.InputError, match=r"opc\.tcp://.*: expected sources in the network's file"):
         make_transport(where)
 
 
@@ -205,5 +204,5 @@ def test_inspect_lists_the_variables_of_a_server_and_suggests_sources():
 
 @pytest.mark.real("OPC UA")
 def test_no_server_is_one_line():
-    with pytest.raises(InputError, match=r"^OPC UA server opc\.tcp://127\.0\.0\.1:\d+/: expected an answer, got "):
+    with pytest.raises(hg.InputError, match=r"^OPC UA server opc\.tcp://127\.0\.0\.1:\d+/: expected an answer, got "):
         read_reporting(f"opc.tcp://127.0.0.1:{free_port()}", [VARIABLE])

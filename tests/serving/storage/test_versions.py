@@ -20,7 +20,6 @@ import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.live.stored.migration import Carrier
-from heliograph.numerics.check import InputError
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
@@ -81,7 +80,7 @@ def check_goes_on(known: list[dict]) -> None:
 
 def test_a_store_of_the_version_before_is_named_in_one_line_and_stays_as_it_is(place, program):
     before = content(place)
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(hg.InputError) as refused:
         Store(str(place), identity(Fleet(program, OPTIONS)))
     assert str(refused.value) == (
         f"store {place}: expected layout 5, of heliograph {hg.__version__}, got layout 3, of heliograph 0.2.0; "

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from heliograph.numerics.check import InputError
+import heliograph as hg
 from heliograph.planning import split_power
 from heliograph_studies.theory.relay_line import best_relays, relay_line
 
@@ -59,7 +59,7 @@ def test_a_line_is_the_chain_of_hops_that_planning_knows():
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(InputError, match="kappa: expected a number of at least 1"):
+    with pytest.raises(hg.InputError, match="kappa: expected a number of at least 1"):
         relay_line(1.0, 3.0, kappa=0.5)
-    with pytest.raises(InputError, match="rho: expected a number of at least 0"):
+    with pytest.raises(hg.InputError, match="rho: expected a number of at least 0"):
         relay_line(-1.0, 3.0)

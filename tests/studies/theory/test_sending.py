@@ -7,7 +7,6 @@ import pytest
 from scipy.optimize import minimize
 
 import heliograph as hg
-from heliograph.numerics.check import InputError
 from heliograph.planning import Error, independent_paths, split_power
 from heliograph.planning.paths.model import path_information
 from heliograph_studies.theory.sending import (
@@ -106,17 +105,17 @@ def test_bursts_never_help_over_one_hop():
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(InputError, match="sensors to choose: expected at most the 6 there are, got 7"):
+    with pytest.raises(hg.InputError, match="sensors to choose: expected at most the 6 there are, got 7"):
         choose_sensors(PATHS, 7, 1.0)
-    with pytest.raises(InputError, match="powers: expected one number or one for each of 12 hops"):
+    with pytest.raises(hg.InputError, match="powers: expected one number or one for each of 12 hops"):
         choose_sensors(relayed_paths(), 2, [1.0, 2.0])
-    with pytest.raises(InputError, match="powers: expected one number or one for each of 6 hops, of at least zero"):
+    with pytest.raises(hg.InputError, match="powers: expected one number or one for each of 6 hops, of at least zero"):
         choose_sensors(PATHS, 1, -1.0)
-    with pytest.raises(InputError, match="paths: expected steady ones"):
+    with pytest.raises(hg.InputError, match="paths: expected steady ones"):
         best_schedule(direct_paths(Error(period=2)), 1.0)
-    with pytest.raises(InputError, match="periods: expected at least one"):
+    with pytest.raises(hg.InputError, match="periods: expected at least one"):
         best_schedule(PATHS, 1.0, [])
-    with pytest.raises(InputError, match="steps between bursts: expected at least one"):
+    with pytest.raises(hg.InputError, match="steps between bursts: expected at least one"):
         burst_sending(PATHS, 1.0, [])
-    with pytest.raises(InputError, match="paths: expected Paths"):
+    with pytest.raises(hg.InputError, match="paths: expected Paths"):
         choose_sensors(3, 1, powers=1.0)
