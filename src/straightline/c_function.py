@@ -111,7 +111,7 @@ def to_c(
     except Unsupported as error:
         raise Unsupported(error.operation, error.where or _line_of(error.operation, equations)) from None
     arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
-    results = _results(written, program, outputs, flat, real)
+    results = _describe_results(written, program, outputs, flat, real)
     ends = [
         f"    {x.name}[{i}] = {source.name(node)};"
         for x, nodes in zip(results, flat, strict=True)
@@ -153,9 +153,10 @@ def _declared(name: str, arguments: Sequence[CArray], results: Sequence[CArray])
     return line if len(line) <= 100 else f"void {name}(\n    " + ",\n    ".join(every) + ")"
 
 
-def _results(
+def _describe_results(
     names: Sequence[str], program: ClosedJaxpr, outputs: Sequence[np.ndarray], flat: Sequence[list[Node]], real: Real
 ) -> list[CArray]:
+    """Describe the arrays that a C function writes: name, type, length, whether symmetric, and which are the same."""
     results = []
     for n, (name, variable, value, nodes) in enumerate(zip(names, program.jaxpr.outvars, outputs, flat, strict=True)):
         aval: Any = variable.aval

@@ -110,7 +110,7 @@ def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     if source == "bool" and op in ("max", "min"):
         return WHOLE[op](*arguments)
     if source not in (*REAL, "bool") and op in WHOLE:
-        return _of_integers(op, source, arguments)
+        return _write_integer(op, source, arguments)
     if op in COMPOSED:
         return COMPOSED[op](*arguments)
     if op in INFIX:
@@ -120,7 +120,8 @@ def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     raise Unsupported(op)
 
 
-def _of_integers(op: str, type: Type, arguments: Sequence[str]) -> str:
+def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
+    """Return the C expression of an operation on integers, defined where C leaves it open (overflow, long shifts)."""
     bits = int(type[1:])
     if type[0] == "u" and op in UNSIGNED:
         return UNSIGNED[op](*arguments, t=f"uint{bits}_t")
@@ -195,7 +196,7 @@ class CSource:
             if statement not in self.needed and not isinstance(statement, Check):
                 continue
             if isinstance(statement, Node):
-                lines += self._node(statement, indent)
+                lines += self._write_node(statement, indent)
             elif isinstance(statement, Loop):
                 lines += self._loop(statement, indent)
             elif isinstance(statement, Guard):
@@ -222,7 +223,8 @@ class CSource:
         self.count += 1
         return f"v{self.count}"
 
-    def _node(self, node: Node, indent: str) -> list[str]:
+    def _write_node(self, node: Node, indent: str) -> list[str]:
+        """Return the line of C that computes a node; none for a constant or a number that exists already."""
         if node.op in ("constant", "counter", "parameter", "result", "guarded"):
             return []
         if node.op == "load":
@@ -243,7 +245,7 @@ class CSource:
         whole, start = buffer.owner
         index = self._at(start + offset, strides, indices)
         if whole.table is not None:
-            return f"{self._table(whole)}[{index}]"
+            return f"{self._name_table(whole)}[{index}]"
         if whole in self.places:
             return self.places[whole](index)
         return f"{self.arrays.setdefault(whole, f'a{len(self.arrays)}')}[{index}]"
@@ -252,7 +254,8 @@ class CSource:
         terms = [f"{s} * {self.name(i)}" if s != 1 else self.name(i) for s, i in zip(strides, indices, strict=True)]
         return " + ".join(([str(offset)] if offset or not terms else []) + terms)
 
-    def _table(self, buffer: Buffer) -> str:
+    def _name_table(self, buffer: Buffer) -> str:
+        """Return the name of the constant array that holds a buffer's numbers, written once for equal ones."""
         assert buffer.table is not None
         values: np.ndarray = np.ascontiguousarray(buffer.table)
         key = (buffer.type, values.tobytes())
@@ -260,7 +263,7 @@ class CSource:
             name = f"{self.prefix}_table_{len(self.tables)}"
             numbers = [literal(x, buffer.type, self.real) for x in values.ravel().tolist()]
             head = f"static const {c_type(buffer.type, self.real)} {name}[{len(numbers)}] = {{"
-            self.tables[key] = name, "\n".join([head, *_wrapped(numbers), "};"])
+            self.tables[key] = name, "\n".join([head, *_wrap_numbers(numbers), "};"])
         return self.tables[key][0]
 
     def _loop(self, loop: Loop, indent: str) -> list[str]:
@@ -301,7 +304,8 @@ class CSource:
         return [*lines, *(f"{deeper}{self.names[r]} = {self.name(v)};" for r, v in results), f"{indent}}}"]
 
 
-def _wrapped(numbers: Sequence[str]) -> list[str]:
+def _wrap_numbers(numbers: Sequence[str]) -> list[str]:
+    """Return numbers separated by commas, as lines of at most the width of the file."""
     lines, line = [], "   "
     for number in numbers:
         if len(line) + len(number) + 2 > WIDTH:

@@ -101,10 +101,11 @@ class Compiled:
             self._copy_common(outputs, shared)
         if not all(code.common):
             memory = arrays, code.tables, outputs, shared
-            self._run(Call(self.blocks.machine(-(-runs // self.width)), pointers, memory, runs), cores)
+            self._compute_blocks(Call(self.blocks.machine(-(-runs // self.width)), pointers, memory, runs), cores)
         return jax.tree.unflatten(self.tree, outputs)
 
-    def _run(self, call: "Call", cores: int | None) -> None:
+    def _compute_blocks(self, call: "Call", cores: int | None) -> None:
+        """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""
         blocks, scratch = -(-call.runs // call.machine.width), self.code.scratch
         if cores == 1 or blocks * self.code.blocks.work < LITTLE:
             call.compute(0, blocks, scratch)

@@ -133,7 +133,7 @@ def folded(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | 
         if a.op != "constant":
             rule = SIMPLER.get(op)
             return None if rule is None else rule(graph, type, *args)
-    return _evaluated(graph, op, type, args)
+    return _evaluate(graph, op, type, args)
 
 
 # The same of doubles, as Python computes them in a tenth of the time: of a matrix's known zeros there are millions.
@@ -142,7 +142,8 @@ OF_DOUBLES: dict[str, Callable[[float, float], float]] = {
 }  # fmt: skip
 
 
-def _evaluated(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+def _evaluate(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    """Return the constant that an operation on constants gives, or None for one that is not folded."""
     if type == "f64" and op in OF_DOUBLES:
         return graph.constant(OF_DOUBLES[op](float(args[0].value), float(args[1].value)), type)
     numbers = [DTYPES[a.type](a.value) for a in args]
@@ -173,7 +174,8 @@ def is_finite(node: Node) -> bool:
     return node.op == "select" and all(is_finite(a) for a in node.args[1:])
 
 
-def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a + b: x + 0 = x, a + (-x) = a - x; None where nothing is simpler."""
     if a.op == "constant" and a.value == 0:
         return b
     if b.op == "constant" and b.value == 0:
@@ -185,7 +187,8 @@ def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return None
 
 
-def _sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a - b: x - 0 = x, -0 - x = -x, a - (-x) = a + x; None where nothing is simpler."""
     if _is(b, 0):
         return a
     if type in REAL and _is(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
@@ -195,7 +198,8 @@ def _sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return None
 
 
-def _mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a b: 1 x = x, 0 x = 0 of a finite x, -1 x = -x, (x + x) / 2 = x; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
     if a.op != "constant":
@@ -213,7 +217,7 @@ def _mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return graph.node("mul", type, graph.constant(-a.value, type), b.args[0])
 
 
-def _div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     """Replace a division by a power of two by the product with its reciprocal, which is exact."""
     if type not in REAL or b.op != "constant" or not b.value or not math.isfinite(b.value):
         return None
@@ -223,11 +227,13 @@ def _div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return graph.node("mul", type, a, graph.constant(1 / b.value, type))
 
 
-def _neg(graph: Graph, type: Type, a: Node) -> Node | None:
+def _fold_neg(graph: Graph, type: Type, a: Node) -> Node | None:
+    """Simplify -(-x) to x."""
     return a.args[0] if a.op == "neg" else None
 
 
-def _and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a & b where one is a constant flag or both are the same; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
     if a.op == "constant" and type == "bool":
@@ -235,7 +241,8 @@ def _and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return a if a is b else None
 
 
-def _or(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_or(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a | b where one is a constant or both are the same; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
     if a.op == "constant" and type == "bool":
@@ -245,7 +252,8 @@ def _or(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return a if a is b else None
 
 
-def _xor(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_xor(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a ^ b where one is zero, or a constant flag; None where nothing is simpler."""
     if b.op == "constant":
         a, b = b, a
     if a.op == "constant" and not a.value:
@@ -253,19 +261,23 @@ def _xor(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     return graph.node("not", type, b) if a.op == "constant" and type == "bool" else None
 
 
-def _not(graph: Graph, type: Type, a: Node) -> Node | None:
+def _fold_not(graph: Graph, type: Type, a: Node) -> Node | None:
+    """Simplify not not x to x."""
     return a.args[0] if a.op == "not" else None
 
 
-def _shift(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_shift(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a shift by no bits."""
     return a if _is(b, 0) else None
 
 
-def _same(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+def _fold_extremum(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify max(x, x) and min(x, x) to x."""
     return a if a is b else None
 
 
-def _select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
+def _fold_select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
+    """Simplify a choice by a condition known, negated, or that of an inner choice; None where nothing is simpler."""
     if a is b:
         return a
     if condition.op == "constant":
@@ -281,7 +293,9 @@ def _select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node
     return None
 
 
-def _compare(op: str) -> Callable[..., Node | None]:
+def _fold_comparison(op: str) -> Callable[..., Node | None]:
+    """Return the rule that simplifies == or !=."""
+
     def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
         """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
         if a is b and (a.type not in REAL or a in graph.numbers or is_finite(a)):
@@ -298,7 +312,9 @@ def _compare(op: str) -> Callable[..., Node | None]:
     return rule
 
 
-def _order(strict: bool, turned: bool) -> Callable[..., Node | None]:
+def _fold_order(strict: bool, turned: bool) -> Callable[..., Node | None]:
+    """Return the rule that writes an order of flags as logic."""
+
     def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
         """Write the order of two flags, false before true, as logic: LLVM has no such comparison of vectors of them."""
         if a.type != "bool":
@@ -309,7 +325,8 @@ def _order(strict: bool, turned: bool) -> Callable[..., Node | None]:
     return rule
 
 
-def _convert(graph: Graph, type: Type, a: Node) -> Node | None:
+def _fold_convert(graph: Graph, type: Type, a: Node) -> Node | None:
+    """Simplify a conversion: of the same type, there and back, or to a flag (x != 0); None where nothing is simpler."""
     if a.type == type:
         return a
     if type == "f32" and a.op == "convert" and a.args[0].type == "f32" and a.type == "f64":  # nothing was lost
@@ -320,8 +337,10 @@ def _convert(graph: Graph, type: Type, a: Node) -> Node | None:
 
 
 SIMPLER: dict[str, Callable[..., Node | None]] = {
-    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "and": _and, "or": _or, "xor": _xor, "not": _not,
-    "shift_left": _shift, "shift_right": _shift, "max": _same, "min": _same, "select": _select, "eq": _compare("eq"),
-    "ne": _compare("ne"), "convert": _convert, "lt": _order(True, False), "le": _order(False, False),
-    "gt": _order(True, True), "ge": _order(False, True),
+    "add": _fold_add, "sub": _fold_sub, "mul": _fold_mul, "div": _fold_div, "neg": _fold_neg,
+    "and": _fold_and, "or": _fold_or, "xor": _fold_xor, "not": _fold_not, "select": _fold_select,
+    "shift_left": _fold_shift, "shift_right": _fold_shift, "max": _fold_extremum, "min": _fold_extremum,
+    "eq": _fold_comparison("eq"), "ne": _fold_comparison("ne"), "convert": _fold_convert,
+    "lt": _fold_order(True, False), "le": _fold_order(False, False),
+    "gt": _fold_order(True, True), "ge": _fold_order(False, True),
 }  # fmt: skip

@@ -54,9 +54,10 @@ class _Evaluation:
             start = np.zeros(buffer.size) if buffer.table is None else buffer.table.ravel()
             self.memory[buffer] = jnp.asarray(start, DTYPES[buffer.type])
         self.block(self.program.graph.top.items)
-        return [self._result(x) for x in self.program.outputs]
+        return [self._gather_result(x) for x in self.program.outputs]
 
-    def _result(self, value: Any) -> jax.Array:
+    def _gather_result(self, value: Any) -> jax.Array:
+        """Return an array of the result: its numbers stacked, or read from memory by places and strides."""
         if not isinstance(value, InMemory):
             nodes = [self.value(n) for n in value.ravel().tolist()]
             return jnp.stack(nodes).reshape(value.shape) if nodes else jnp.zeros(value.shape)
@@ -84,9 +85,10 @@ class _Evaluation:
             elif isinstance(statement, Guard):
                 self._guard(statement)
             elif statement.op not in ("counter", "parameter", "result", "guarded"):
-                self.values[statement] = self._operation(statement)
+                self.values[statement] = self._evaluate_node(statement)
 
-    def _operation(self, node: Node) -> jax.Array:
+    def _evaluate_node(self, node: Node) -> jax.Array:
+        """Compute a node by the operation of JAX that has its name."""
         if node.op == "load":
             buffer, offset, strides = node.value
             return self.memory[buffer.owner[0]][self._entry_at(buffer, offset, strides, node.args)]

@@ -127,11 +127,12 @@ def _needs(node: Any) -> list[Any]:
         within = [] if node.inside is None else [node.inside[0]]
         return [*node.stores, *node.parts, *within]
     owner = node.block.owner
-    arguments = node.args if isinstance(node, Node) and node.op not in REFERRING else _arguments(node)
+    arguments = node.args if isinstance(node, Node) and node.op not in REFERRING else _list_dependencies(node)
     return [*arguments] if owner is None else [owner, *arguments]
 
 
-def _arguments(node: Any) -> list[Any]:
+def _list_dependencies(node: Any) -> list[Any]:
+    """Return what a node, store, guard or loop needs before it can be computed."""
     if isinstance(node, Store):
         return [node.node, *node.indices]
     if isinstance(node, Guard):
@@ -242,7 +243,7 @@ def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
 
 def _read_within(items: Iterable[Any]) -> set[Buffer]:
     """Return the memory of which items read a part that is filled in a block inside its own."""
-    used = (n for x in items if not isinstance(x, Buffer) for n in (x, *_arguments(x)) if isinstance(n, Node))
+    used = (n for x in items if not isinstance(x, Buffer) for n in (x, *_list_dependencies(x)) if isinstance(n, Node))
     parts = {n.value[0] for n in used if n.op == "load"}
     return {part.owner[0] for part in parts if part.block is not part.owner[0].block}
 

@@ -41,7 +41,7 @@ def sweep(
     from heliograph.campaign.page import write_report  # a missing extra is reported before the work starts
 
     campaign = load_campaign(path)
-    only = _only(campaign, setting, chunk)
+    only = _select_chunks(campaign, setting, chunk)
     if only is not None and workers is None:
         workers = 0  # so that a debugger can follow
     # Compute with a progress bar, then write the report from the new scores.
@@ -65,7 +65,8 @@ def sweep(
     return FAILED if outcome.failures else 0
 
 
-def _only(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tuple[int, int]] | None:
+def _select_chunks(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tuple[int, int]] | None:
+    """Return the pairs (setting, chunk) that --setting and --chunk ask for; None where all are wanted."""
     if setting is None:
         if chunk is not None:
             raise fail("--chunk", "a --setting whose chunk it is", "none")

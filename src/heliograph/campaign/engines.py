@@ -53,13 +53,14 @@ def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = 
     """Do one job at a time in each worker process; a process that dies, or that takes too long, is replaced."""
     crew = [_Worker(campaign, store, timeout) for _ in range(workers)]
     try:
-        yield lambda jobs: _share(crew, deque(jobs))
+        yield lambda jobs: _share_jobs(crew, deque(jobs))
     finally:
         for worker in crew:
             worker.stop()
 
 
-def _share(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
+def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
+    """Let a thread for each worker take jobs until none waits; yield each job with its reply, as they end."""
     finished: queue.SimpleQueue[tuple[Job, Reply]] = queue.SimpleQueue()
     count = len(waiting)
 
@@ -87,7 +88,7 @@ class _Worker:
 
     def ask(self, job: Job) -> Reply:
         """Do a job in the process; if it dies or is too late, the next job gets a new process."""
-        process = self._alive()
+        process = self._ensure_running()
         late = Event()
 
         def give_up() -> None:
@@ -106,14 +107,15 @@ class _Worker:
         if line.endswith("\n") and not late.is_set():
             return Reply(**json.loads(line))
         code = process.wait()
-        self._end()
+        self._kill()
         if late.is_set():
             return _too_late(self.timeout)
         return Reply(error=f"WorkerDied: the worker process ended with {_ending(code)}")
 
-    def _alive(self) -> subprocess.Popen[str]:
+    def _ensure_running(self) -> subprocess.Popen[str]:
+        """Return the worker's process, started again where it has died."""
         if self.process is not None and self.process.poll() is not None:  # it died since its last job
-            self._end()
+            self._kill()
         if self.process is None:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "heliograph.campaign.worker"],
@@ -129,9 +131,10 @@ class _Worker:
     def stop(self) -> None:
         """End the process; a chunk that it is computing leaves only a partial file."""
         self.stopped = True
-        self._end()
+        self._kill()
 
-    def _end(self) -> None:
+    def _kill(self) -> None:
+        """Kill the worker's process, if there is one, and close its pipes."""
         process, self.process = self.process, None
         if process is not None:
             process.kill()
@@ -176,7 +179,7 @@ def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = ma
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise fail(f"scheduler {address}", "the address of a Dask scheduler that answers", _line(error)) from None
     try:
-        yield lambda jobs: _submit(client, campaign, str(store), deque(jobs), timeout)
+        yield lambda jobs: _submit_jobs(client, campaign, str(store), deque(jobs), timeout)
     finally:
         _leave(client)
 
@@ -187,9 +190,14 @@ def _leave(client: Untyped) -> None:
         client.close(timeout=CONNECT)
 
 
-def _submit(
+def _submit_jobs(
     client: Untyped, campaign: str, store: str, waiting: deque[Job], timeout: float
 ) -> Iterator[tuple[Job, Reply]]:
+    """Run jobs on a Dask cluster, a few more at once than it has threads; yield each with its reply.
+
+
+    Where none returns within `timeout` seconds all that are left are given up, each with the reason.
+    """
     from distributed import as_completed
 
     jobs: dict[object, Job] = {}

@@ -61,7 +61,7 @@ def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Seq
         parts = [_sums(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
         if parts:
             sums = [np.sum(totals, axis=0) for totals in zip(*parts, strict=True)]
-            results += _details_of(setting, labels, claims[setting], [0, *steps], sums)
+            results += _compute_details(setting, labels, claims[setting], [0, *steps], sums)
     return results
 
 
@@ -80,9 +80,14 @@ def _sums(
     return counted.sum(axis=0), at.sum(axis=1), (at**2).sum(axis=1)
 
 
-def _details_of(
+def _compute_details(
     setting: int, labels: Labels, claims: np.ndarray, steps: Sequence[int], sums: Sequence[np.ndarray]
 ) -> list[Detail]:
+    """Return RMSE, claimed deviation and NEES with standard errors, by node, filter, state and step of one setting.
+
+
+    `sums` are the number of runs by filter, and the sums over runs of values and of their squares.
+    """
     count, first, second = sums
     with np.errstate(divide="ignore", invalid="ignore"):
         n = count[None, None, :, :, None]
@@ -145,7 +150,7 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
 
 def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
     """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table."""
-    shown = _first(scores)
+    shown = _keep_first_settings(scores)
     settings = len({score.setting for score in shown})
     page = Page(
         kicker="Explore a campaign",
@@ -182,7 +187,8 @@ def _describe_cut(settings: int, campaign: Campaign, shown: Sequence[Score], sco
     )
 
 
-def _first(scores: Sequence[Score]) -> list[Score]:
+def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
+    """Keep the scores of the first settings, each setting as a whole: as many as a page shows."""
     shown: list[Score] = []
     for _, of_setting in groupby(scores, key=lambda score: score.setting):
         rows = list(of_setting)
@@ -200,17 +206,18 @@ def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> l
         for s in scores
     ]  # fmt: skip
     if look is None:
-        return [_explore_scores(campaign, scored)]
+        return [_table_scores(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
     detailed = look(settings[:1], steps)
     detailed += look(settings[1 : ROWS // max(len(detailed), 1)], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
-    return [_explore_scores(campaign, scored), _explore_steps(campaign, [detail for detail in detailed if detail.step])]
+    return [_table_scores(campaign, scored), _table_steps(campaign, [detail for detail in detailed if detail.step])]
 
 
-def _explore_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+def _table_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+    """Make the table of the page that shows each filter's scores over all steps, and how to draw it at first."""
     columns, parameters = _columns(campaign, rows, SCORED), list(campaign.parameters)
     x = _axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")
@@ -221,7 +228,8 @@ def _explore_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     )
 
 
-def _explore_steps(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+def _table_steps(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+    """Make the table of the page that shows scores step by step, and how to draw it at first."""
     steps = {"time": [row.step for row in rows]}
     columns = steps | _columns(campaign, rows, OVER_TIME)
     dimensions = ["time", "setting", *campaign.parameters, *NAMES]

@@ -50,7 +50,7 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
             *([_failures(failures)] if failures else []),
             Section("Results", pictures(campaign, scores)),
             Section("All scores", [score_table(campaign, scores)]),
-            _reading(campaign),
+            _explain_reading(campaign),
             Section("The campaign", [Code(campaign.text.strip())]),
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
@@ -109,7 +109,8 @@ def score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
     return Table(["setting", *score_headers(campaign)], rows, caption)
 
 
-def _reading(campaign: Campaign) -> Section:
+def _explain_reading(campaign: Campaign) -> Section:
+    """Return the section that shows how to open the errors of all runs in Python."""
     lines = [
         "import heliograph as hg",
         "",
@@ -172,7 +173,7 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
         title = ", ".join([score.node, *(f"{name} = {value}" for name, value in rest.items())])
         panels.setdefault(title, []).append(score)
     shown = dict(list(panels.items())[:PANELS])
-    figure, grid = _panels(len(shown), 2.5)
+    figure, grid = _make_panels(len(shown), 2.5)
     colours = _colours(scores)
     # A curve for each filter, in order of the parameter, with +- 2 standard errors.
     for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):
@@ -187,7 +188,7 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
     drawn = [score for of_panel in shown.values() for score in of_panel]
     _scale(grid[0], [values[score.setting] for score in drawn], "x")
     figure.supxlabel(quote_for_figure(parameter), fontsize=10, color=INK)
-    _finish(figure, grid, drawn, quantity, colours)
+    _finish_figure(figure, grid, drawn, quantity, colours)
     return figure
 
 
@@ -196,7 +197,7 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quant
     """Plot a quantity by setting, a point for each filter with two standard errors; one panel for each node."""
     nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
     settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
-    figure, grid = _panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
+    figure, grid = _make_panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
     colours = _colours(scores)
     # Rows are settings; the filters of a row are shifted so that error bars do not overlap.
     for axes, node in zip(grid, nodes, strict=False):
@@ -216,7 +217,7 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quant
     drawn = [score for score in scores if score.node in nodes and score.setting in settings]
     _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
     grid[-1].set_xlabel(quantity.label)
-    _legend(figure, grid, colours)
+    _draw_legend(figure, grid, colours)
     return figure
 
 
@@ -225,7 +226,8 @@ def _name_setting(campaign: Campaign, setting: int) -> str:
     return quote_for_figure(text if len(text) <= 36 else text[:35] + "…")
 
 
-def _panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
+def _make_panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
+    """Return a figure with `count` axes that share their scales, in rows of two; axes beyond the count are hidden."""
     columns = min(columns, max(count, 1))
     rows = -(-max(count, 1) // columns)
     figure = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
@@ -245,15 +247,16 @@ def _columns(scores: Sequence[Score], quantity: Quantity) -> tuple[np.ndarray, n
     return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
 
 
-def _finish(
+def _finish_figure(
     figure: Figure, grid: list[Axes], drawn: Sequence[Score], quantity: Quantity, colours: Mapping[str, str]
 ) -> None:
+    """Add what all panels share: the line NEES = 1, the scale, the quantity's name and the legend."""
     if quantity is NEES:
         for axes in grid:
             axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
     _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
     figure.supylabel(quantity.label, fontsize=10, color=INK)
-    _legend(figure, grid, colours)
+    _draw_legend(figure, grid, colours)
 
 
 def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
@@ -263,7 +266,8 @@ def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
         axes.set_xscale("log") if axis == "x" else axes.set_yscale("log")
 
 
-def _legend(figure: Figure, grid: list[Axes], colours: Mapping[str, str]) -> None:
+def _draw_legend(figure: Figure, grid: list[Axes], colours: Mapping[str, str]) -> None:
+    """Draw one legend for all panels, with the colour of each filter that appears in any of them."""
     entries = {name: handle for axes in grid for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     names = [name for name in map(quote_for_figure, colours) if name in entries]
     figure.legend(

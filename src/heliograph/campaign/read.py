@@ -79,8 +79,8 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         seed=check_seed(f"{name}, seed", table.get("seed", 0)),
         chunk=min(_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
         keep=_one_of(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
-        inputs=_inputs(table.get("inputs", {}), horizon, name),
-        settings=_settings(table, name),
+        inputs=_read_inputs(table.get("inputs", {}), horizon, name),
+        settings=_read_settings(table, name),
         timeout=_timeout(table.get("timeout", TIMEOUT), name),
         versions=versions(),
     )
@@ -128,7 +128,8 @@ def _one_of(value: object, choices: Sequence[str], name: str) -> str:
     return str(value)
 
 
-def _inputs(table: object, horizon: int, name: str) -> dict[str, float | list[float]]:
+def _read_inputs(table: object, horizon: int, name: str) -> dict[str, float | list[float]]:
+    """Return the inputs of a campaign's file by name, each a number or one number for each step."""
     if not isinstance(table, dict):
         raise fail(f"{name}, inputs", "a table of numbers by the input's name", repr(table))
     for key, value in table.items():
@@ -146,7 +147,8 @@ def _short(value: object) -> str:
     return f"{len(value)} values" if isinstance(value, list) else repr(value)
 
 
-def _settings(table: Mapping[str, object], name: str) -> list[Setting]:
+def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
+    """Return the settings of a campaign's file, from [grid] or [[settings]]; names free in the store, no two equal."""
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
     settings = _grid(table["grid"], name) if "grid" in table else _list_settings(table["settings"], name)

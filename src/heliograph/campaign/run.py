@@ -92,10 +92,10 @@ def run_campaign(
     with only_here(out) as alone:
         if not alone:
             raise fail(f"results folder {out}", "no other campaign at work in it", "one that is")
-        return _run(campaign, out, workers, scheduler, only, progress)
+        return _compute_missing(campaign, out, workers, scheduler, only, progress)
 
 
-def _run(
+def _compute_missing(
     campaign: Campaign,
     out: Path,
     workers: int | None,
@@ -103,10 +103,11 @@ def _run(
     only: Sequence[tuple[int, int]] | None,
     progress: Progress,
 ) -> CampaignRun:
+    """Compute the chunks that the store lacks, and write failures and summary; return what was done."""
     store = (out / STORE).absolute()
     clear_left(store)
     check_replaceable(out, f"{STORE}/zarr.json")
-    expected = _jobs(campaign, only)
+    expected = _list_jobs(campaign, only)
     # A store that exists must be of this campaign; damaged and partial files are removed first.
     done: set[tuple[int, ...]] = set()
     damaged: list[Path] = []
@@ -152,7 +153,8 @@ def _compute(
     return dict(sorted(failed.items(), key=lambda failure: (failure[0].setting, failure[0].chunk or 0)))
 
 
-def _jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
+def _list_jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
+    """Return the chunks to compute, all or those of `only`, which must be the campaign's."""
     every = [Job(chunk.setting, chunk.number) for chunk in campaign.all_chunks()]
     if only is None:
         return every

@@ -125,24 +125,27 @@ def create(path: Path, campaign: Campaign, labels: Labels) -> None:
         }
         group = zarr.create_group(folder, zarr_format=3, attributes=attributes)
         # Coordinates: parameters along the settings, names along the other axes.
-        coordinates = _coordinates(campaign, labels)
+        coordinates = _make_coordinates(campaign, labels)
         for name, values in coordinates.items():
             _write_coordinate(group, name, values, "setting" if name in campaign.parameters else name)
         sizes = {name: len(values) for name, values in coordinates.items()}
         # Empty variables; a file for each chunk of runs of each setting.
         for name, (axes, meaning) in variables(campaign).items():
             shape = tuple(sizes[axis] for axis in axes)
-            _create(group, name, axes, shape, (1, campaign.chunk, *shape[2:]), np.nan, {"long_name": meaning})
+            _create_array(group, name, axes, shape, (1, campaign.chunk, *shape[2:]), np.nan, {"long_name": meaning})
         # The claims of a setting are one file.
         axes = ("setting", "node", "filter")
         shape = tuple(sizes[axis] for axis in axes)
-        _create(group, CLAIM, axes, shape, (1, *shape[1:]), "", {"long_name": "what the filter claims of its variance"})
+        _create_array(
+            group, CLAIM, axes, shape, (1, *shape[1:]), "", {"long_name": "what the filter claims of its variance"}
+        )
         with warnings.catch_warnings():  # zarr says that consolidated metadata are not in the format's text yet
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
             zarr.consolidate_metadata(folder)
 
 
-def _coordinates(campaign: Campaign, labels: Labels) -> dict[str, np.ndarray]:
+def _make_coordinates(campaign: Campaign, labels: Labels) -> dict[str, np.ndarray]:
+    """Return the store's coordinates by dimension: settings, runs, times, names, and the parameters of the settings."""
     steps = {
         "setting": np.arange(len(campaign.settings)),
         "run": np.arange(campaign.runs),
@@ -173,11 +176,11 @@ def _text(value: object) -> str:
 
 def _write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axis: str) -> None:
     fill = "" if values.dtype.kind == "U" else values.dtype.type(0)
-    _create(group, name, (axis,), values.shape, values.shape, fill, {}, values.dtype)
+    _create_array(group, name, (axis,), values.shape, values.shape, fill, {}, values.dtype)
     _open(group, name)[...] = values
 
 
-def _create(
+def _create_array(
     group: zarr.Group,
     name: str,
     axes: tuple[str, ...],
@@ -187,6 +190,7 @@ def _create(
     attributes: Mapping[str, str],
     kind: np.dtype | type = np.float64,
 ) -> None:
+    """Create one array of the store, with its chunks, its fill value and a checksum for each chunk."""
     text = isinstance(fill, str)
     group.create_array(
         name,
@@ -277,14 +281,14 @@ def read_labels(path: Path) -> Labels:
 
 def restore_campaign(path: Path) -> Campaign:
     """Return the campaign that the store was created with; its file is assumed to be next to the store."""
-    attributes: Any = _attributes(path)
+    attributes: Any = _read_attributes(path)
     stored = read_campaign(attributes["campaign"], attributes["network_source"], path.parent / "campaign.toml")
     return replace(stored, versions=attributes["versions"])
 
 
 def check_same(path: Path, campaign: Campaign) -> None:
     """Raise ValueError, naming the difference, unless the store was created with this campaign."""
-    attributes: Any = _attributes(path)
+    attributes: Any = _read_attributes(path)
     begun = dict(attributes["versions"])
     differs = [
         f"{name} {campaign.versions.get(name) or 'none'} (was {begun.get(name) or 'none'})"
@@ -293,14 +297,15 @@ def check_same(path: Path, campaign: Campaign) -> None:
     ]
     if not differs:
         stored = read_campaign(attributes["campaign"], attributes["network_source"], Path(campaign.path))
-        differs = list(_differences(stored, campaign))
+        differs = list(_list_differences(stored, campaign))
     if differs:
         raise fail(
             f"results folder {path.parent}", "the campaign it was begun with, or another folder", "; ".join(differs)
         )
 
 
-def _attributes(path: Path) -> Mapping[str, object]:
+def _read_attributes(path: Path) -> Mapping[str, object]:
+    """Return the attributes of a store, or raise one line if they are damaged."""
     try:
         attributes = zarr.open_group(path, mode="r").attrs.asdict()
         if not {"versions", "campaign", "network_source", "labels"} <= attributes.keys():
@@ -311,7 +316,8 @@ def _attributes(path: Path) -> Mapping[str, object]:
     return attributes
 
 
-def _differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:
+def _list_differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:
+    """Yield in words what the campaign of a store has otherwise than this one."""
     for name in ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs"):
         new, old = getattr(campaign, name), getattr(stored, name)
         if new != old:

@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stopped: list[int] = []
     try:
         with stoppable(stopped):
-            code = _command(arguments)
+            code = _run_command(arguments)
     except KeyboardInterrupt:
         return SIGNALLED + stopped[0] if stopped else INTERRUPTED
     except Exception:
@@ -66,7 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return SIGNALLED + stopped[0] if stopped else code
 
 
-def _command(arguments: Sequence[str] | None) -> int:
+def _run_command(arguments: Sequence[str] | None) -> int:
+    """Parse the arguments and run their command; return the exit status. What a user can mend is one line on stderr."""
     with suppress(ValueError):  # a home that cannot be written to: then everything is compiled again
         keep_compilations()
     # Parse and run; what a user can mend becomes one line on stderr.

@@ -69,6 +69,7 @@ def _topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
 
 
 def _print_table(topics: "dict[str, Topic]") -> None:
+    """Print a line for each topic: its messages, their rate and largest gap, and how late they come."""
     import rich.console
     import rich.markup
     import rich.table

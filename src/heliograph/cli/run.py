@@ -312,6 +312,7 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
 def _write_report(
     name: str, network: "Network", plants: "Mapping[str, tuple[Record, Recording, ByFilter]]", report: Path
 ) -> None:
+    """Examine the records of all plants and write the report, a page for each plant and one of all."""
     from dataclasses import replace
 
     from heliograph.report.health import Health, examine

@@ -29,7 +29,7 @@ def try_lock(path: Path) -> Iterator[bool]:
         yield False
         return
     try:
-        yield _lock(handle)
+        yield _try_lock(handle)
     finally:
         os.close(handle)
 
@@ -48,7 +48,7 @@ def only_here(folder: Path) -> Iterator[bool]:
         while True:
             # Lock the file that is opened.
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-            if not _lock(handle):
+            if not _try_lock(handle):
                 os.close(handle)
                 yield False
                 return
@@ -70,7 +70,8 @@ def only_here(folder: Path) -> Iterator[bool]:
                 missing.rmdir()
 
 
-def _lock(handle: int) -> bool:
+def _try_lock(handle: int) -> bool:
+    """Take the lock of an open file without waiting; return whether it was free (always, where locks do not exist)."""
     if fcntl is None:
         return True
     try:

@@ -136,6 +136,7 @@ def triangularise(columns: Columns) -> Columns:
 
 
 def _triangularise_row_by_row(columns: Columns) -> Columns:
+    """Return L and d with L diag(d) L' = A diag(w) A', by weighted Gram-Schmidt, one row of A after another."""
     rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
     n, lower, variances = len(rows), [], []
     for j in range(n):
@@ -161,6 +162,7 @@ def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
 
 
 def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> Columns:
+    """Return L and d with L diag(d) L' = P, by elimination without square roots; no d is below `least`."""
     n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(rest, j, axis=1, keepdims=False)

@@ -39,6 +39,7 @@ class Available:
     path: str = "state"
 
     def __post_init__(self) -> None:
+        """Check the fields, and keep words as tuples in lower case."""
         if not isinstance(self.topic, str) or not self.topic or "#" in self.topic:
             raise fail(
                 "Available, topic", "a topic, with + for what that of the values has there", show_value(self.topic)

@@ -87,7 +87,7 @@ def read_design(path: Path) -> DesignFile:
         problem=problem,
         front=None if front is None else tuple(array(f"{path.name}, front", front, (None,)).tolist()),
         exponent=_number(path, table, "path_loss_exponent"),
-        map=_map(path, table) if "map" in table else None,
+        map=_read_map(path, table) if "map" in table else None,
     )
 
 
@@ -102,7 +102,8 @@ def _budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
     return Budget(**value) if isinstance(value, dict) else Budget(scalar(f"{path.name}, budget", value, 0.0))
 
 
-def _map(path: Path, table: Mapping[str, object]) -> MapPlaces:
+def _read_map(path: Path, table: Mapping[str, object]) -> MapPlaces:
+    """Return the places of the map that a design file asks for: the network's function of x and y, and the grid."""
     values = _table(path, table, "map")
     file, name = _place(path, values.get("network"), "map.network")
     if not name:

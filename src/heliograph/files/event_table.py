@@ -380,6 +380,7 @@ class EventTable:
         return events._replace(time=time, arrival=arrival)
 
     def _judge_events(self, window: float, ahead: float) -> tuple[Events, Int[np.ndarray, " events"]]:
+        """Return the events in order of arrival, and what a timeline with this window would do with each."""
         events, matrices = self._sort_by_arrival(), self._matrices()
 
         def values(i: int) -> np.ndarray:

@@ -132,12 +132,13 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
 def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:
     """Add a message of a broker to its topic; `arrival` is in nanoseconds since 1970."""
     try:
-        _note(topics, name, decode_json(payload, name), "JSON", arrival)
+        _note_message(topics, name, decode_json(payload, name), "JSON", arrival)
     except InputError:
-        _note(topics, name, None, "no JSON", arrival)
+        _note_message(topics, name, None, "no JSON", arrival)
 
 
-def _note(topics: dict[str, Topic], name: str, content: object, kind: str, arrival: int | None) -> None:
+def _note_message(topics: dict[str, Topic], name: str, content: object, kind: str, arrival: int | None) -> None:
+    """Count a message under its topic; note its fields of numbers, and its dates with how late it came."""
     topic = topics.setdefault(name, Topic(kind))
     topic.messages += 1
     if arrival is not None:
@@ -184,9 +185,9 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
             note(topics, name, message.content, came)
             continue
         try:
-            _note(topics, name, payload_of(message), "JSON" if is_message_file(path) else "row", came)
+            _note_message(topics, name, payload_of(message), "JSON" if is_message_file(path) else "row", came)
         except InputError:
-            _note(topics, name, None, "no JSON", came)
+            _note_message(topics, name, None, "no JSON", came)
     return topics, broken
 
 

@@ -77,7 +77,7 @@ def messages_of(path: Path) -> Iterator[FileMessage | InputError]:
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if kind in LINES:
-        yield from _lines(path)
+        yield from _read_lines(path)
         return
     for where, row in _csv_rows(path) if kind == ".csv" else _parquet_rows(path):
         yield row if isinstance(row, InputError) else _convert_row(where, row)
@@ -124,7 +124,8 @@ def _convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
     return FileMessage(where, str(row[TOPIC]), payload, arrival)
 
 
-def _lines(path: Path) -> Iterator[FileMessage | InputError]:
+def _read_lines(path: Path) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a file of JSON, one document or one message a line; an error in place of a bad one."""
     with open_text(path) as file:
         if kind_of(path) == ".json":  # one document, of any number of lines, or one a line
             text = file.read()

@@ -49,12 +49,12 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
             raise fail(f"network {source_name}", "a Python file", got)
         with _importing_from(path.parent):
             module = _call_user_code(lambda: _run_source(path, path.read_bytes()), source_name, path)
-            return _pick(module, name, source_name, path), vars(module)
+            return _find_network(module, name, source_name, path), vars(module)
     # A module, by its name.
     with _importing_from(Path.cwd()):
         source = _call_user_code(lambda: _source(source_name), source_name, None)
         module = _call_user_code(lambda: importlib.import_module(source_name), source_name, source)
-        return _pick(module, name, source_name, source), vars(module)
+        return _find_network(module, name, source_name, source), vars(module)
 
 
 def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
@@ -87,10 +87,11 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     return build
 
 
-def _pick(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
+def _find_network(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
+    """Return the network of a module, by its name or because there is only one."""
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
-        return _get_network(module, name, file, path, networks)
+        return _read_name(module, name, file, path, networks)
     if len({id(network) for network in networks.values()}) == 1:
         return next(iter(networks.values()))
     if networks:
@@ -99,7 +100,8 @@ def _pick(module: ModuleType, name: str, file: str, path: Path | None) -> Networ
     raise fail(f"network {file}", f"a heliograph.Network (or {file}:FUNCTION that returns one)", "none in the module")
 
 
-def _get_network(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
+def _read_name(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
+    """Return the network that a name of a module stands for; a function is called for it."""
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)
         holds = ", ".join(networks) or "no networks"

@@ -72,7 +72,7 @@ class OwnMessages:
         try:
             if isinstance(message, InputError):
                 raise message
-            self._add(message.where, message.content)
+            self._add_message(message.where, message.content)
             self.used += 1
         except HeaderError:
             raise
@@ -95,7 +95,8 @@ class OwnMessages:
         self._table.refused, self._table.reasons = self.refused, self.reasons
         return self._table
 
-    def _add(self, where: str, row: Mapping[str, Any]) -> None:
+    def _add_message(self, where: str, row: Mapping[str, Any]) -> None:
+        """Add the event of one message to the table, and one of the inputs that it brings."""
         self._check_columns(where, row)
         node = row[NODE]
         if node not in self.components:
@@ -140,7 +141,7 @@ class OwnMessages:
             expected = "a number, as the times before" if dated else "a date, as the times before"
             raise fail(name, expected, show_value(cell))
         if not dated:
-            return self._number(cell, name), False
+            return self._read_time(cell, name), False
         if self.steps:
             raise fail(name, "a step, a whole number from 0", f"{show_value(cell)} ({OF_STEPS})")
         moment, zoned = moment_of(cell, name)
@@ -149,8 +150,9 @@ class OwnMessages:
             raise fail(name, "a zone with every date or with none", show_value(cell))
         return moment, True
 
-    def _number(self, cell: Any, name: str) -> float:
-        number = _number(cell, name)
+    def _read_time(self, cell: Any, name: str) -> float:
+        """Return a time that is a number, counted from the first one where these are too large for a double."""
+        number = _parse_number(cell, name)
         if isinstance(cell, int):
             if self._zero is None:
                 self._zero = cell if abs(cell) >= EXACT else 0
@@ -174,8 +176,8 @@ def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbe
         if len(parts) != len(names):
             raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", show_value(cell))
         from_text = isinstance(cell, str)
-        return np.array([_number(word, f"{where}, column {VALUES!r}", True, from_text) for word in parts])
-    return np.array([_number(row.get(name), f"{where}, column {name!r}", True) for name in names])
+        return np.array([_parse_number(word, f"{where}, column {VALUES!r}", True, from_text) for word in parts])
+    return np.array([_parse_number(row.get(name), f"{where}, column {name!r}", True) for name in names])
 
 
 def _items(cell: Any) -> list[Any]:
@@ -187,11 +189,11 @@ def _whole(cell: Any, name: str) -> int:
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
         return check_63_bits(name, int(cell))
     if not isinstance(cell, int):
-        _number(cell, name)
+        _parse_number(cell, name)
     return check_63_bits(name, cell)
 
 
-def _number(cell: Any, name: str, empty: bool = False, text: bool = False) -> float:
+def _parse_number(cell: Any, name: str, empty: bool = False, text: bool = False) -> float:
     """Return a number; NaN for what may be `empty` and is; a `text` that reads as one is one."""
     if empty and (cell is None or cell == ""):
         return np.nan

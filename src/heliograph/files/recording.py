@@ -63,7 +63,7 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
     source = str(table) if isinstance(table, str | Path) else name
     headers = _headers(network)
     columns = columns_of(table, source, headers if flag("ignore_unknown", ignore_unknown) else None)
-    return _recording_of({headers.get(name, name): values for name, values in columns.items()}, network, source)
+    return _make_recording({headers.get(name, name): values for name, values in columns.items()}, network, source)
 
 
 def write_recording(recording: Recording, network: Network, path: str | Path) -> None:
@@ -114,7 +114,8 @@ def _headers(network: Network) -> dict[str, str]:
     )
 
 
-def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
+def _make_recording(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
+    """Make the recording from a table's columns: measurements by node, inputs, times, and the truth if there."""
     inputs, received = network.inputs, _list_received_columns(network)
     # A relay whose measurements are left out altogether loses its filter only.
     for name in () if network.relays is None else network.relays.relays:
@@ -162,10 +163,10 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
             prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
-            columns += [(prefix + key, values) for key, values in _claims(record.states, record.units, estimate)]
+            columns += [(prefix + key, values) for key, values in _make_columns(record.states, record.units, estimate)]
             later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in later:
-                known = _claims(record.states, record.units, later[name])
+                known = _make_columns(record.states, record.units, later[name])
                 columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in known]
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
@@ -193,7 +194,8 @@ def make_header(name: str, unit: str | None) -> str:
     return f"{name} ({unit})" if unit else str(name)
 
 
-def _claims(states: Sequence[str], units: Mapping[str, str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
+def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
+    """Return the columns that show an estimate: means, standard deviations and covariances as claimed, and validity."""
     mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
@@ -237,6 +239,7 @@ def _list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]
 
 
 def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
+    """Raise one line with the closest known name if a column belongs to nothing of the network."""
     known = [name for names in expected for name in names]
     for column in columns:
         if column not in known:
@@ -281,6 +284,7 @@ def _complete(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.n
 
 
 def _read_measurements(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    """Return a column of measurements, NaN where none arrived; an infinite one is refused."""
     values = _numbers(columns, name, source)
     _refuse(
         np.isinf(values),

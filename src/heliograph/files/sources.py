@@ -293,9 +293,10 @@ class Sources:
         sources = [items] if isinstance(items, Source) else items
         if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
             raise fail(f"sources, {topic!r}", "json_field, or a list of them", show_value(items))
-        return [Mapped(source, topic, self._places(topic, source)) for source in sources]
+        return [Mapped(source, topic, self._place_outputs(topic, source)) for source in sources]
 
-    def _places(self, topic: str, source: Source) -> dict[str, np.ndarray]:
+    def _place_outputs(self, topic: str, source: Source) -> dict[str, np.ndarray]:
+        """Check a source against the network; return by node which output each of its values is."""
         name, node = f"sources, {topic!r}", source.node
         wild = [i for i, word in enumerate(topic.split("/")) if word in ("+", "#")]
         if wild and source.plant is None and isinstance(node, str):
@@ -304,7 +305,7 @@ class Sources:
         if isinstance(node, str):
             if node not in self.names:
                 raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _near(node, self.names))
-            found = {node: self._columns(name, source, node)}
+            found = {node: self._index_outputs(name, source, node)}
         else:  # of the nodes that have these outputs
             wanted = set(source.outputs)
             able = [
@@ -312,7 +313,7 @@ class Sources:
                 for n, known in self.names.items()
                 if (wanted <= set(known) if wanted else len(known) == len(source.paths))
             ]
-            found = {able_one: self._columns(name, source, able_one) for able_one in able if able_one != INPUTS}
+            found = {able_one: self._index_outputs(name, source, able_one) for able_one in able if able_one != INPUTS}
             if not found:
                 raise fail(f"{name}, output", "outputs of a node", show_value(source.outputs or len(source.paths)))
         for condition in source.available if "#" not in topic else ():
@@ -330,7 +331,8 @@ class Sources:
             )
         return found
 
-    def _columns(self, name: str, source: Source, node: str) -> np.ndarray:
+    def _index_outputs(self, name: str, source: Source, node: str) -> np.ndarray:
+        """Return the numbers of a source's outputs among those of a node, in the order of its values."""
         known = self.names[node]
         outputs = source.outputs or known
         if len(outputs) != len(source.paths):

@@ -220,18 +220,19 @@ def csv_header(path: Path) -> list[str]:
 
 
 def _read_csv(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
+    """Read a table of CSV: numbers by column (NaN where a cell is empty), or dates where the first row has one."""
     # Cells as text; every row must have as many as the header.
     with csv_lines(path) as lines:
         header = [unquote_cell(name.strip()) for name in next(lines, [])]
         _check_header(path, header)
-        rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
+        rows = [_split_row(path, header, number, line) for number, line in enumerate(lines, 1)]
     if only is not None:
         kept = [i for i, name in enumerate(header) if name in only]
         header, rows = [header[i] for i in kept], [[cells[i] for i in kept] for cells in rows]
     # The first row decides which columns are dates; all others are numbers.
     dated = {i for i, cell in enumerate(rows[0] if rows else []) if looks_like_date(cell)}
     numbers = [
-        [np.nan if i in dated else _number(path, header[i], row, cell) for i, cell in enumerate(cells)]
+        [np.nan if i in dated else _parse_number(path, header[i], row, cell) for i, cell in enumerate(cells)]
         for row, cells in enumerate(rows, 1)
     ]
     values = np.array(numbers, dtype=np.float64).reshape(len(rows), len(header))
@@ -248,7 +249,8 @@ def _exact(values: np.ndarray, cells: Sequence[str]) -> np.ndarray:
     return np.array([int(cell) for cell in cells], dtype=np.int64)
 
 
-def _cells(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
+def _split_row(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
+    """Return the cells of a row; raise one line if it is a comment or has more or fewer than the header."""
     if line[0].lstrip().startswith("#"):
         raise fail(
             f"{path}, row {number}", "numbers", f"a comment, {show_value(line[0])}: {_rewriting(path, comment='#')}"
@@ -259,7 +261,8 @@ def _cells(path: Path, header: list[str], number: int, line: list[str]) -> list[
     return [cell.strip() for cell in line]
 
 
-def _number(path: Path, name: str, number: int, cell: str) -> float:
+def _parse_number(path: Path, name: str, number: int, cell: str) -> float:
+    """Return the number of a cell, NaN if it is empty; else raise one line that says how to write it."""
     try:
         if "_" in cell:  # Python's own way to write a number, and nobody else's
             raise ValueError
@@ -279,6 +282,7 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
+    """Raise one line if the header is a comment, has other separators, or a name twice."""
     line = ",".join(header)
     if line.startswith(COMMENTS):
         raise fail(
@@ -322,6 +326,7 @@ def _rewriting(path: Path, **how: object) -> str:
 
 
 def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
+    """Read a Parquet table: numbers by column (NaN where null), times in nanoseconds."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -227,11 +227,14 @@ def roll(outlook: Outlook, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
     padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
     windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
     arguments = outlook, z, u, windows, np.asarray(horizons) - 1
-    rolled: tuple[Moments, Moments | None] = compute_once(_roll, _by_xla, arguments)
+    rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
     return rolled
 
 
-def _roll(outlook: Outlook, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array) -> PyTree:
+def _forecast_from_each_row(
+    outlook: Outlook, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
+) -> PyTree:
+    """Filter a recording, and from each of its rows predict the rows of its window; moments at `places` of each."""
     filter, length = outlook.filter, windows.shape[1]
 
     def with_variances(moments: Moments | None) -> Moments | None:
@@ -252,4 +255,4 @@ def _roll(outlook: Outlook, z: jax.Array, u: jax.Array, windows: jax.Array, plac
     return jax.lax.scan(body, start, rows)[1]
 
 
-_by_xla = quickly_compiled(_roll)
+_by_xla = quickly_compiled(_forecast_from_each_row)

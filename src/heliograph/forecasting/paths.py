@@ -104,6 +104,8 @@ def _drawn(
     """States and outputs of each path (draws, rows, ...)."""
 
     def of_path(x: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw one path from x: what plant and sensor do over the steps of u, with the draws of this key."""
+
         def move(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             u_k, k = row
             moving, measuring = jax.random.split(jax.random.fold_in(key, k))

@@ -48,7 +48,7 @@ def predict_rows(
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
     outlook = outlook_of(filter)
-    states, outputs, received = compute_once(_predict, _by_xla, (outlook, rows, inputs))
+    states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, rows, inputs))
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
     names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
     measured = outputs and prediction_of(outputs, tuple(sensor.outputs), output_claim(filter, outlook), sensor.angles)
@@ -58,7 +58,9 @@ def predict_rows(
     return Forecast(np.ones(len(rows), int), np.arange(float(len(rows))), whole, measured, arriving, given)
 
 
-def _predict(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
+def _predict_each_row(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
+    """Filter a recording; return the moments predicted for each row from those before it."""
+
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         k, z_k, u_k = row
         prior, moments = outlook.step(state, u_k, k)
@@ -68,7 +70,7 @@ def _predict(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
     return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
 
 
-_by_xla = quickly_compiled(_predict)
+_by_xla = quickly_compiled(_predict_each_row)
 
 
 @readable

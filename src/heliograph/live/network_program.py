@@ -76,6 +76,7 @@ def _integrate_parts(
     """Return state, Jacobian and noise covariance after the parts of each cut."""
 
     def after(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return mean, transition matrix and noise covariance after intervals of these lengths, one by one."""
         n = len(x)
         state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in parts:

@@ -45,6 +45,7 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
 
 
 def _centre(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
+    """Return z = G (y - r) + n + E[G] r: the reference r is taken off before the channel, its mean put back after."""
     (channel,) = check_maps("channel less a reference", [channel])
     if channel.past or channel.erases:
         what = "late" if channel.past else "one that erases"
@@ -91,11 +92,13 @@ def expected_signal(
         raise fail("inputs", f"an array ({horizon}, {len(start.inputs)}) of {list(start.inputs)}", "none")
     shape = (horizon, len(start.inputs))
     u = np.zeros(shape) if inputs is None else array("inputs", inputs, shape)
-    return np.asarray(_along(plant, sensor, u))
+    return np.asarray(_predict_outputs(plant, sensor, u))
 
 
 @compile_on_call
-def _along(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "horizon inputs"]) -> jax.Array:
+def _predict_outputs(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "horizon inputs"]) -> jax.Array:
+    """Return E[y_k] over the steps of a plant that moves by its mean alone, with these inputs."""
+
     def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         k, u = row
         moves, senses = at(plant, k), at(sensor, k)

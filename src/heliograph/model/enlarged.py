@@ -153,7 +153,8 @@ def with_clocks(
     places = {name: n + 2 * i for i, name in enumerate(clocks)}
     larger = driven_by(plant, _drifts(clocks, step), np.zeros((n, 2 * len(clocks))))
     return larger, {
-        name: _sensor(sensor, moving, n, n + 2 * len(clocks), places.get(name)) for name, sensor in sensors.items()
+        name: _enlarge_sensor(sensor, moving, n, n + 2 * len(clocks), places.get(name))
+        for name, sensor in sensors.items()
     }
 
 
@@ -197,9 +198,10 @@ def _drifts(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     return LinearPlant(move, gained, center, start, states=states, inputs=[dt])
 
 
-def _sensor(
+def _enlarge_sensor(
     sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
 ) -> LinearSensor | Stamped:
+    """Return the sensor of a state that has more components behind the plant's, which it does not see."""
     if offset is None and isinstance(sensor, LinearSensor):
         matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
         return LinearSensor(matrix, sensor.noise, sensor.outputs, sensor.circular)

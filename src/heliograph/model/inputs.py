@@ -124,6 +124,7 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
 
 
 def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
+    """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
     for name, function in _functions(first(plant)).items():
         values = np.concatenate(list(_evaluate_in_parts(plant, function, u, step)))
         wrong = covariances_wrong(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))

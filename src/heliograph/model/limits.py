@@ -18,7 +18,7 @@ LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | 
 
 def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":
     """Limits of so many received numbers; those of another node as they are; None where there are none."""
-    codes = _numbers("invalid values", invalid)
+    codes = _read_numbers("invalid values", invalid)
     if isinstance(limits, Limits):
         if len(limits.low) != received or codes.size:
             got = f"those of {len(limits.low)}" + " and further codes" * bool(codes.size)
@@ -45,9 +45,9 @@ class Limits(Module):
     invalid: Float[np.ndarray, " codes"]
 
     def __init__(self, received: int, limits: LimitsLike = None, invalid: ArrayLike = ()):
-        pairs = _pairs(limits, received)
+        pairs = _read_intervals(limits, received)
         self.low, self.high = pairs[:, 0], pairs[:, 1]
-        codes = _numbers("invalid values", invalid)
+        codes = _read_numbers("invalid values", invalid)
         if codes.ndim > 1 or not np.all(np.isfinite(codes)):
             raise fail("invalid values", "a finite number or several", show_value(invalid))
         self.invalid = np.atleast_1d(codes)
@@ -80,7 +80,8 @@ def is_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray
     return np.asarray(near.any(axis=-1))
 
 
-def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
+def _read_intervals(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
+    """Return (low, high) for each received number, infinite where there is no limit."""
     everything = [-np.inf, np.inf]
     if limits is None:
         return np.tile(everything, (received, 1))
@@ -93,13 +94,14 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
         raise fail("limits", expected, show_value(limits))
     rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
     pairs = [[end if bound is None else bound for bound, end in zip(row, everything, strict=True)] for row in rows]
-    intervals = _numbers("limits", pairs, expected)
+    intervals = _read_numbers("limits", pairs, expected)
     if np.any(~(intervals[:, 0] < intervals[:, 1])):
         raise fail("limits", "a low end below the high one", show_value(limits))
     return intervals
 
 
-def _numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
+def _read_numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
+    """Return real numbers as an array of doubles, or raise one line."""
     try:
         values = np.asarray(value)
         if values.size and values.dtype.kind not in "fiu":

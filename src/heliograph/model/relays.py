@@ -210,6 +210,7 @@ def _tile(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensio
 
 
 def _check_linear(plant: object, sensor: object) -> None:
+    """Raise unless plant and sensor are linear, without inputs or angles, and fit each other."""
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
         got = f"{type(plant).__name__} and {type(sensor).__name__}"
         raise fail("relay network", "a LinearPlant and a LinearSensor", got)
@@ -221,6 +222,7 @@ def _check_linear(plant: object, sensor: object) -> None:
 
 
 def _check_listener(network: RelayNetwork, number: int, listener: str, links: Links) -> None:
+    """Raise unless the links into one listener in one slot come from known senders and fit them and each other."""
     where = f"slot {number}, {listener!r}"
     # Names.
     if listener not in network.filters:

@@ -197,6 +197,7 @@ def _is_sensor(model: object) -> bool:
 
 
 def _drop_names(model: Any) -> Any:
+    """Return the sensor with outputs called y0, y1, ..., so that sensors that differ in names alone are equal."""
     if not _is_sensor(model) or "outputs" not in vars(model):
         return model
     parts, tree = jax.tree.flatten(model, is_leaf=lambda part: part is not model and _is_sensor(part))

@@ -27,7 +27,8 @@ def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concat
     first = next(iter(signature(function).parameters))
 
     @wraps(function)
-    def known(*given: Any, **named: Any) -> T:
+    def look_up(*given: Any, **named: Any) -> T:
+        """Return the answer for this object and these arguments, computed only once while the object lives."""
         if not given and first not in named:
             return function(*given, **named)  # which says what is missing
         owner, rest = (given[0], given[1:]) if given else (named.pop(first), ())
@@ -47,7 +48,7 @@ def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concat
         results.setdefault(identity, (ref(owner, lambda _: results.pop(identity, None)), answers))
         return answer
 
-    return cast(Callable[Concatenate[S, P], T], known)
+    return cast(Callable[Concatenate[S, P], T], look_up)
 
 
 def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:

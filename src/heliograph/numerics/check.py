@@ -104,7 +104,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     shape alone is checked.
     """
     report_domain(name, value, REAL)
-    numbers = _numbers(name, value)
+    numbers = _read_numbers(name, value)
     matches = numbers.ndim == len(shape) and all(
         not isinstance(projection, int) or projection == have
         for projection, have in zip(shape, numbers.shape, strict=True)
@@ -130,7 +130,8 @@ def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
     return f"shape ({lengths}){example}"
 
 
-def _numbers(name: str, value: ArrayLike) -> Any:
+def _read_numbers(name: str, value: ArrayLike) -> Any:
+    """Return real numbers as an array of doubles, traced ones as they are; raise one line of anything else."""
     traced = is_traced(value)
     try:
         numbers = jnp.asarray(value) if traced else np.asarray(fill_masked(value))
@@ -277,7 +278,7 @@ def check_horizon(value: object, covered: int | None = None) -> int:
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
     """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
     report_covariance(name, value)
-    matrix = _numbers(name, value)
+    matrix = _read_numbers(name, value)
     # A scalar c stands for c I where the dimension is known.
     if matrix.ndim != 2 and (dimension is None or matrix.ndim):
         raise fail(
@@ -331,7 +332,7 @@ def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
     A radius above max(p, 1 - p) is refused: no probability could ever move that far. Which corners a radius leaves is
     read off the numbers, so that neither it nor, where it is positive, the probabilities can be traced.
     """
-    numbers = _numbers(name, value)
+    numbers = _read_numbers(name, value)
     if is_traced(numbers):
         raise fail(name, "a number, since the corners of what is possible depend on it", "a traced one")
     radius: np.ndarray = array(name, np.full(nominal.shape, numbers) if numbers.ndim == 0 else numbers, nominal.shape)

@@ -39,6 +39,7 @@ def log_density(
     reach = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
     def condition(j: Any, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Add log N of component j given those before it, and condition the components behind it on it."""
         rest, left, total, growth = carry
         pivot = left[j, j]
         # Determined: the pivot is zero, to rounding.

@@ -135,6 +135,7 @@ class Programme:
         constraints: list[NonlinearConstraint],
         tolerance: float,
     ) -> Vector:
+        """Minimise by SLSQP within bounds and constraints; return the end, moved to where the limits hold."""
         optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
                           options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
         end = np.clip(optimum.x, self.bounds.lb, self.bounds.ub)

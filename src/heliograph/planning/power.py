@@ -201,7 +201,10 @@ def _draw_moments(
 def _average_draws(
     plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, keys: jax.Array
 ) -> dict[str, jax.Array]:
-    def run(key: jax.Array) -> dict[str, jax.Array]:
+    """Return E (y, 1)(y, 1)' of each sensor and step, a mean over drawn trajectories for each batch of keys."""
+
+    def simulate(key: jax.Array) -> dict[str, jax.Array]:
+        """Draw one trajectory of the plant; return (y, 1)(y, 1)' of each sensor at its steps."""
         begin, rest = jax.random.split(key)
 
         def step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -221,6 +224,6 @@ def _average_draws(
         over_time: dict[str, jax.Array] = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
         return over_time
 
-    runs: dict[str, jax.Array] = jax.vmap(jax.vmap(run))(keys)
+    runs: dict[str, jax.Array] = jax.vmap(jax.vmap(simulate))(keys)
     averages: dict[str, jax.Array] = jax.tree.map(lambda moments: moments.mean(axis=1), runs)
     return averages

@@ -347,7 +347,7 @@ def _penalise(
 def _make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
     """Value, gradient and power of a cost given by its traces, soundness and power."""
 
-    def value(
+    def evaluate(
         x: Array,
         steps: RelaySteps,
         base: Array,
@@ -356,6 +356,8 @@ def _make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arr
         limit: Array,
         multipliers: Array,
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the penalised cost of gains x, its gradient, and the powers that they send."""
+
         def inner(x: jax.Array) -> tuple[jax.Array, jax.Array]:
             trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
             return _penalise(trace, sound, power, limit, multipliers), power
@@ -363,7 +365,7 @@ def _make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arr
         (cost, power), gradient = jax.value_and_grad(inner, has_aux=True)(x)
         return cost, gradient, power
 
-    return compile_in_float64(value)
+    return compile_in_float64(evaluate)
 
 
 def _receiver_traces(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

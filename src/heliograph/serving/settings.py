@@ -63,6 +63,7 @@ class ServiceSettings:
     forecast: Spans | None = None
 
     def __post_init__(self) -> None:
+        """Raise one line if options contradict each other, or need one that is not given."""
         if self.hosts and self.page is None:
             raise fail("--host", "a page for this host name (--page PORT)", "none")
         if self.every is not None:

@@ -255,13 +255,14 @@ def _judge_unseen(
     if unseen.growth < 1:
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
-    reason = _why(links, channel.system, unseen)
+    reason = _explain_growth(links, channel.system, unseen)
     if not _is_excited(network, growing, channel, unseen):
         return "undecided", f"{reason}; but noise does not reach all that grows, so that it may stay zero"
     return "impossible", reason
 
 
-def _why(links: JointLinks, system: KnownLossSystem, unseen: UnobservedGrowth) -> str:
+def _explain_growth(links: JointLinks, system: KnownLossSystem, unseen: UnobservedGrowth) -> str:
+    """Say why no filter's error can stay bounded: the plant's mode, and why what is received does not show it."""
     value = unseen.eigenvalue
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
     if len(unseen.modes) < len(system.chain):

@@ -170,6 +170,7 @@ class Network(Module):
                 find_received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:
+        """Raise unless each fusion fits its nodes, and each central filter all that is received."""
         for name, fusion in self.fused.items():
             if isinstance(fusion, Fusion):
                 fusion.check(self.nodes_with(fusion.filter), len(self.states))
@@ -327,12 +328,13 @@ class Network(Module):
         return claims
 
     def _find_claims(self) -> dict[tuple[str, str], Claim]:
+        """Return the claim of each filter, by (node, name); fused ones under the name of the fused estimates."""
         claims = {(name, f): filter.claim for name, node in self.nodes.items() for f, filter in node.filters.items()}
         for name, mesh in self.meshes.items():
             claims |= dict.fromkeys(((node, name) for node in self.mesh_nodes(name)), mesh_claim(name, mesh, self))
         by_data = any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values())
         for name, fusion in self.fused.items():
-            claim = self._claim_of_fusion(fusion)
+            claim = self._find_claim_of_fusion(fusion)
             claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim
         return claims
 
@@ -348,7 +350,8 @@ class Network(Module):
             object.__setattr__(lowered, field, value)
         return lowered
 
-    def _claim_of_fusion(self, fusion: Fusion | AbstractFilter) -> Claim:
+    def _find_claim_of_fusion(self, fusion: Fusion | AbstractFilter) -> Claim:
+        """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report."""
         if isinstance(fusion, AbstractFilter):
             return fusion.claim
         names = self.nodes_with(fusion.filter)

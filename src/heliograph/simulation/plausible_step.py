@@ -87,16 +87,17 @@ class Judges:
 
     def of_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
         """Judgements of the filters that receive from a node; where it has none, of the central ones."""
-        return self._rows(outputs, self._places[node], not self._places[node])
+        return self._stack_judgements(outputs, self._places[node], not self._places[node])
 
     def of_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
         """Judgements of all filters."""
         places = [(k, f, i) for k, j in enumerate(outputs["judged"]) for f, i in np.ndindex(*j[0].shape[-2:])]
-        return self._rows(outputs, places, True)
+        return self._stack_judgements(outputs, places, True)
 
-    def _rows(
+    def _stack_judgements(
         self, outputs: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
+        """Return the judgements of these filters, those of the centre behind them, as rows of numbers."""
         judgements = [[field[..., f, i] for field in outputs["judged"][k]] for k, f, i in places]
         judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
         if not judgements:

@@ -111,7 +111,8 @@ class SeparateChannels(AbstractMedium):
     ) -> tuple[PyTree, ObservationModel]:
         """Measure x, subtract the reference of sensors with feedback, and deliver through the channels."""
 
-        def single(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
+        def receive_one(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
+            """Measure x at one node, let its trigger decide, and deliver through its channel."""
             sensor = at(group.sensor, k)
             y = measure(sensor, x, draw_key(key, k, group.checksums, SENSOR))
             if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
@@ -134,7 +135,7 @@ class SeparateChannels(AbstractMedium):
         results = [
             (reach, jnp.zeros((group.count, 0)))
             if isinstance(group, Silent)
-            else map_all(single, len(group.checksums))(group, reach)
+            else map_all(receive_one, len(group.checksums))(group, reach)
             for group, reach in zip(self.groups, state, strict=True)
         ]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
@@ -246,7 +247,7 @@ class Slots(AbstractMedium):
         kind, position = np.zeros((2, len(self.relays.slots)), dtype=int)  # of each slot: its branch, and where in it
         for i, numbers in enumerate(kinds.values()):
             kind[numbers], position[numbers] = i, np.arange(len(numbers))
-        branches = [self._branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
+        branches = [self._make_branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
         # The branch of this step's slot.
         now = k % len(kind)
         received: dict[str, jax.Array] = jax.lax.switch(
@@ -254,7 +255,8 @@ class Slots(AbstractMedium):
         )
         return received
 
-    def _branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
+    def _make_branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
+        """Return the function that computes what each listener receives in these slots."""
         # a hop that is an OverTime is read at the step; stacking slots would read it at the slot
         single: PyTree = slots[0] if len(slots) == 1 else over_time(slots)
 
@@ -263,7 +265,7 @@ class Slots(AbstractMedium):
         ) -> dict[str, jax.Array]:
             slot: PyTree = at(single, position) if isinstance(single, OverTime) else single
             listeners = zip(self.relays.filters, self.relays.received, strict=True)
-            return {name: _receive(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
+            return {name: _receive_sum(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
 
         return branch
 
@@ -279,9 +281,10 @@ def _remembering(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel
     }
 
 
-def _receive(
+def _receive_sum(
     hops: Mapping[str, Channel], listener: str, size: int, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
 ) -> jax.Array:
+    """Return the sum of what arrives at a listener from all its senders; NaN where nobody sends to it."""
     parts = [
         deliver(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())[1]
         for sender, hop in hops.items()

@@ -144,7 +144,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
     }
     if smoothed.fused:
         claims[FUSED] = {
-            name: _claim_of_fusion(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()
+            name: _find_claim_of_fusion(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()
         }
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
@@ -160,7 +160,8 @@ def _claim_of_smoother(filter: AbstractFilter) -> Claim:
     return claim
 
 
-def _claim_of_fusion(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
+def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
+    """Return what a fusion of smoothed estimates can claim; raise where it has no smoothed form."""
     if isinstance(fusion, AbstractFilter):
         return _claim_of_smoother(fusion)
     if isinstance(fusion.rule, AbstractInformedFusion):

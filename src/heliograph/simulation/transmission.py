@@ -47,10 +47,11 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     if not len(y):
         raise fail("signal", "at least one step", "none")
     check_horizon(len(y), steps_covered(channel))
-    return np.asarray(compute_once(_transmit, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
+    return np.asarray(compute_once(_transmit_all, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
 
 
-def _transmit(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
+def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
+    """Send the rows of y through a channel, by the draws of a seed; NaN where a missing number would be used."""
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
@@ -65,7 +66,7 @@ def _transmit(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.
     return received
 
 
-_by_xla = quickly_compiled(_transmit)
+_by_xla = quickly_compiled(_transmit_all)
 
 
 def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:

@@ -97,6 +97,7 @@ def _each_way_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
 
 
 def _check_sizes(filter: AbstractFilter, inputs: ArrayLike) -> None:
+    """Check that a filter has a claim and names, and refuses measurements, inputs and steps that do not fit it."""
     assert filter.claim in STRENGTH, f"claim: expected one of {list(STRENGTH)}, got {filter.claim!r}"
     assert filter.states and len(set(filter.states)) == len(filter.states), "states: expected distinct names"
     assert filter.received >= 0, "received: expected a length"
@@ -121,6 +122,7 @@ def _check_sizes(filter: AbstractFilter, inputs: ArrayLike) -> None:
 
 
 def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
+    """Check that an estimate has its shape, finite numbers, and a positive semidefinite covariance if it claims one."""
     mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     assert mean.shape == (n,), f"step {k}: expected a mean of shape {(n,)}, got {mean.shape}"
     assert bound.shape == (n, n), f"step {k}: expected a covariance of shape {(n, n)}, got {bound.shape}"
@@ -139,6 +141,7 @@ def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
 
 
 def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFilter, k: int) -> None:
+    """Check that an innovation has NaN just where nothing arrived, and a likelihood that fits."""
     m, missing, likelihood = len(z), np.isnan(z), float(innovation.log_likelihood)
     value, covariance = np.asarray(innovation.value), np.asarray(innovation.covariance)
     assert value.shape == (m,) and covariance.shape == (m, m), f"step {k}: expected an innovation of {m} components"

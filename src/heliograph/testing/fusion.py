@@ -105,6 +105,7 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
 
 
 def _check_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np.random.Generator) -> None:
+    """Check a quantizer on random values: its errors hold, Q(Q(x)) = Q(x), and the same under jit and vmap."""
     state = quantizer.init(n)
     structure, compiled = str(jax.tree.structure(state)), jax.jit(jax.vmap(quantizer.step))
     for k in range(steps):
@@ -130,6 +131,7 @@ def _check_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np
 
 
 def _check_quantized(sent: Quantized, value: np.ndarray, n: int) -> None:
+    """Check that what a quantizer delivers has the right shape, NaN in the right places, and keeps its bound."""
     assert all(np.shape(field) == (n,) for field in sent), f"step: expected parts of shape ({n},)"
     unusable = np.asarray(sent.saturated) | np.isnan(value)
     assert np.array_equal(np.isnan(sent.error), unusable), "error: expected NaN where saturated or NaN, and only there"

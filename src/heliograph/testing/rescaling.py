@@ -82,13 +82,15 @@ def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
             return replace(filter, plant=plant, sensor=sensor, channel=_channel(filter.channel, units))
         case MixtureFilter():
             return replace(
-                filter, plant=rescaled_plant(filter.plant, units), components=_components(filter.components, units)
+                filter,
+                plant=rescaled_plant(filter.plant, units),
+                components=_rescale_combinations(filter.components, units),
             )
         case PolynomialFilter(inner=LinearSystemFilter()):
             assert isinstance(filter.inner, LinearSystemFilter)
             # A filter of products x x' ...: its monomials are scaled by products of the factors.
-            inner = _system(filter.inner, filter.degree, units)
-            return PolynomialFilter(inner, filter.degree, filter.endless, _centre(filter.centre, units))
+            inner = _rescale_system(filter.inner, filter.degree, units)
+            return PolynomialFilter(inner, filter.degree, filter.endless, _rescale_centre(filter.centre, units))
         case ModalFilter() | UncertainModalFilter():
             plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
             return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
@@ -139,6 +141,7 @@ def rescaled_plant(plant: AnyPlant, units: Units) -> AnyPlant:
 
 
 def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
+    """Return the plant whose states and inputs are counted in other units: S f(S^-1 x, U^-1 u), S Q S."""
     s, u = units.states, units.inputs
     law = _noise(plant.deviation, s) if plant.deviation is not None else np.outer(s, s) * plant.initial_covariance
     center = s * (plant.initial_mean - (plant.deviation.mean if plant.deviation is not None else 0.0))
@@ -201,7 +204,8 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
     return OverTime(scaled) if isinstance(channel, OverTime) else scaled
 
 
-def _components(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
+def _rescale_combinations(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
+    """Return the combinations of a filter's atoms with state and measurements in other units."""
     values = stacked(components)
     q = units.received
     scaled = AtomCombinations(
@@ -215,7 +219,8 @@ def _components(components: AtomCombinations | OverTime, units: Units) -> AtomCo
     return OverTime(scaled) if isinstance(components, OverTime) else scaled
 
 
-def _centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeData | None:
+def _rescale_centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeData | None:
+    """Return the mean before data with state and measurements in other units."""
     if centre is None:
         return None
     s = units.states
@@ -229,7 +234,8 @@ def _centre(centre: MeanBeforeData | None, units: Units) -> MeanBeforeData | Non
     )
 
 
-def _system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
+def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
+    """Return the filter of a linear system with state and measurements in other units: monomials by powers of these."""
     y, z, s = _powers(units.states, degree), _powers(units.received, degree), filter.steps.values
     if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
         y = np.tile(np.append(y, 1.0), s.transition.shape[-1] // (len(y) + 1))

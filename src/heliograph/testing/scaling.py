@@ -112,7 +112,8 @@ def _compare_runs(
     units: dict[str, Units],
     common: bool,
 ) -> float:
-    nodes = {name: _node(name, node, units[name]) for name, node in _nodes(network).items()}
+    """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed."""
+    nodes = {name: _rescale_node(name, node, units[name]) for name, node in _nodes(network).items()}
     fused = {name: _rescale_fusion(name, fusion, units[Network.FUSED]) for name, fusion in network.fused.items()}
     scaled = Network(rescaled_plant(network.plant, units[Network.FUSED]), nodes, fused)
     shared = units[Network.FUSED].inputs
@@ -152,7 +153,8 @@ def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
     return np.asarray(difference)
 
 
-def _node(name: str, node: Node, units: Units) -> Node:
+def _rescale_node(name: str, node: Node, units: Units) -> Node:
+    """Return the node in other units, after checking that its channel's moments change as they must."""
     channel = first(node.channel)
     for affine in [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]:
         turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
@@ -196,21 +198,22 @@ def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) ->
 def _searches(network: Network, node: str, name: str) -> bool:
     """Return whether a trace is minimised on the way to this estimate."""
     if node != Network.FUSED:
-        return _minimises(network.nodes[node].filters[name])
+        return _has_search(network.nodes[node].filters[name])
     fusion = network.fused[name]
     if isinstance(fusion, AbstractFilter):
-        return _minimises(fusion)
+        return _has_search(fusion)
     if isinstance(fusion.rule, CovarianceIntersection | InverseCovarianceIntersection | ScalarWeights):
         return True
-    return any(_minimises(network.nodes[n].filters[fusion.filter]) for n in network.nodes_with(fusion.filter))
+    return any(_has_search(network.nodes[n].filters[fusion.filter]) for n in network.nodes_with(fusion.filter))
 
 
-def _minimises(filter: AbstractFilter) -> bool:
+def _has_search(filter: AbstractFilter) -> bool:
+    """Tell whether a filter minimises numerically, so that its answers depend on units by its tolerance."""
     match filter:
         case GaussianFilter() | LinearFilter():
             return bool(first(filter.channel).uncertain)
         case PredictionFilter():
-            return _minimises(filter.base)
+            return _has_search(filter.base)
         case SequentialFilter():
-            return any(_minimises(node_filter) for node_filter in filter.filters)
+            return any(_has_search(node_filter) for node_filter in filter.filters)
     return False

@@ -61,7 +61,7 @@ def operation(node: Node, names: list[str], emit: Emit) -> str:
     if op in ORDER:
         return emit(f"{_comparison(op, source)} {operand_type} {names[0]}, {names[1]}")
     if op == "convert":
-        return _converted(source, node.type, names[0], emit)
+        return _write_conversion(source, node.type, names[0], emit)
     if op == "bitcast":
         return emit(f"bitcast {operand_type} {names[0]} to {result_type}")
     if op == "not":
@@ -70,7 +70,7 @@ def operation(node: Node, names: list[str], emit: Emit) -> str:
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result_type} @hg_{called(node)}({typed})")
-    return (_of_reals if source in REAL else _of_integers)(node, names, operand_type, emit)
+    return (_write_real if source in REAL else _write_integer)(node, names, operand_type, emit)
 
 
 def called(node: Node) -> str:
@@ -86,7 +86,8 @@ def _comparison(op: str, type: Type) -> str:
     return f"icmp {'u' if type in ('u32', 'u64', 'bool') else 's'}{op}"
 
 
-def _of_reals(node: Node, names: list[str], text: str, emit: Emit) -> str:
+def _write_real(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    """Write an operation on vectors of real numbers; return the name of its result."""
     op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op == "neg":
         return emit(f"fneg {first}")
@@ -108,7 +109,8 @@ def _of_reals(node: Node, names: list[str], text: str, emit: Emit) -> str:
     raise Unsupported(op)
 
 
-def _of_integers(node: Node, names: list[str], text: str, emit: Emit) -> str:
+def _write_integer(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    """Write an operation on vectors of integers or flags; return the name of its result."""
     op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op in INTEGER:
         return emit(f"{INTEGER[op]} {first}, {names[1]}")
@@ -163,7 +165,8 @@ def _shifted(node: Node, names: list[str], text: str, emit: Emit) -> str:
     return emit(f"select {vector('bool')} {inside}, {text} {shifted}, {text} zeroinitializer")
 
 
-def _converted(source: Type, target: Type, name: str, emit: Emit) -> str:
+def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
+    """Write a conversion between types, saturating from reals to integers; return the name of its result."""
     operand_type, result_type = vector(source), vector(target)
     if source == target or LLVM[source] == LLVM[target]:
         return name

@@ -110,22 +110,23 @@ class Writer:
                 continue
             if isinstance(statement, Node):
                 if statement not in self.products:
-                    self._keep(statement, self._compute(statement))
+                    self._keep(statement, self._write_node(statement))
             elif isinstance(statement, Store):
-                self._store(statement)
+                self._write_store(statement)
             elif isinstance(statement, Loop):
                 self._loop(statement)
             elif isinstance(statement, Guard):
-                self._guard(statement)
+                self._write_guard(statement)
 
     def _keep(self, node: Node, name: str) -> None:
         self.scopes[-1][node] = name
         if self.single and node in self.slots.places:
             self.slots.store(self, node, name)
 
-    def _compute(self, node: Node) -> str:
+    def _write_node(self, node: Node) -> str:
+        """Write the operation of a node, a sum with a product as one fused operation; return the name of its result."""
         if node.op == "load":
-            return self._load(node)
+            return self._write_load(node)
         product = fusable(node, self.products)
         if product is not None:
             rest = node.args[0] if node.args[1] is product else node.args[1]
@@ -213,7 +214,8 @@ class Writer:
             bytes_ *= loop.length or 1
         return self.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
 
-    def _load(self, node: Node) -> str:
+    def _write_load(self, node: Node) -> str:
+        """Write the read of a number from a buffer: one for all lanes, one for each, or by indices that lanes have."""
         buffer, offset, strides = node.value
         if not all(self._is_scalar(i) for i in node.args):
             return self._gather(node)
@@ -251,7 +253,8 @@ class Writer:
             return self.add(f"icmp ne %i8 {loaded}, zeroinitializer")
         return self.add(f"bitcast %i{bits} {loaded} to {vector(node.type)}") if node.type in REAL else loaded
 
-    def _store(self, store: Store) -> None:
+    def _write_store(self, store: Store) -> None:
+        """Write the store of a number; where sums are kept, add it to what is there in lanes that count."""
         name, kind, bits = self.operand(store.node), vector(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
         address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
@@ -333,7 +336,8 @@ class Writer:
         """Emit whether a condition holds in some lane."""
         return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.operand(condition)} to %lanes')}, 0")
 
-    def _guard(self, guard: Guard) -> None:
+    def _write_guard(self, guard: Guard) -> None:
+        """Write a block that is skipped where no lane needs it; its results are zero then."""
         self.count += 1
         name = f"guard{self.count}"
         # Jump past the body if no lane needs it.

@@ -69,6 +69,7 @@ def _square(text: Lines, rows: list[str], width: int, group: int, bits: int, inw
     """Move as many entries as there are lanes."""
 
     def body(i: str) -> None:
+        """Write the transposition of one square: load its rows, exchange halves until each is a column, store."""
         vector = f"<{len(rows)} x i{bits}>"
         in_rows = [text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}") for row in rows]
         base = text.add(f"mul i64 {i}, {width}")

@@ -57,7 +57,8 @@ IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "call_hi_primitive": _expan
 RULES |= {"platform_index": _platform_index}
 
 
-def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Lower `cond`: a branch by a constant, else all branches, large ones skipped where no lane takes them."""
     branches = equation.params["branches"]
     which = lowering.scalar(inputs[0])
     if which.op == "constant":
@@ -103,12 +104,13 @@ def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value
         return results
     guard = Guard(block, condition)
     outer.items.append(guard)
-    return [array_of([_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results]
+    return [array_of([_guard_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results]
 
 
-def _result(lowering: Lowering, guard: Guard, value: Any) -> Any:
+def _guard_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
+    """Return a number of a guarded block as seen from outside of it: zero where the block is skipped."""
     if isinstance(value, Key):
-        return Key(_result(lowering, guard, value.first), _result(lowering, guard, value.second))
+        return Key(_guard_result(lowering, guard, value.first), _guard_result(lowering, guard, value.second))
     if value.block is not guard.body:
         return value
     if value in guard.values:
@@ -136,4 +138,4 @@ def _where(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) ->
     return array_of([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
 
 
-IN_MEMORY |= {"cond": _cond}
+IN_MEMORY |= {"cond": _lower_cond}

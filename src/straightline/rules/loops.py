@@ -128,13 +128,14 @@ def _mirrored(upper: np.ndarray, n: int) -> np.ndarray:
     return upper[..., np.maximum(places, places.T)]
 
 
-def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Lower `scan`: written out if it is short, else as a loop, whose long arrays stay in memory."""
     params = equation.params
     (consts, carried), length = _counts(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     # Short loops are written out.
     if length * size_of(lowering, params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
-        return _written_out(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
+        return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     jaxpr = params["jaxpr"].jaxpr
     # A carried number that the body returns unchanged is a constant of the loop; a long array is carried in memory.
     same = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
@@ -202,9 +203,10 @@ def _counts(params: dict[str, Any]) -> tuple[int, int]:
     return len(list(consts)), len(list(carried))
 
 
-def _written_out(
+def _write_out_scan(
     lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
 ) -> list[Value]:
+    """Lower a short `scan` as its turns one after another."""
     params = equation.params
     stacked: list[list[Value]] = []
     turns = range(params["length"])
@@ -293,4 +295,4 @@ def _programs(params: dict[str, Any]) -> list[Any]:
     return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
 
 
-IN_MEMORY |= {"scan": _scan, "while": _while}
+IN_MEMORY |= {"scan": _lower_scan, "while": _while}

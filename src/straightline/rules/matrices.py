@@ -21,7 +21,9 @@ def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float
     return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
 
 
-def _reduction(op: str, empty: float) -> Rule:
+def _reduce_by(op: str, empty: float) -> Rule:
+    """Return the rule that reduces along axes by `op`; over nothing the result is `empty`."""
+
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         terms = math.prod(inputs[0].shape[axis] for axis in axes)  # none of a sum over nothing
@@ -47,7 +49,9 @@ def _within(type: Type, number: float) -> float:
     return limits.max if greatest else limits.min
 
 
-def _cumulative(op: str) -> Rule:
+def _accumulate_by(op: str) -> Rule:
+    """Return the rule that accumulates along an axis by `op`."""
+
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axis, type = equation.params["axis"], result_type(equation)
         if not inputs[0].size:
@@ -67,6 +71,7 @@ def _arg(op: str) -> Rule:
     """Make a rule for the first index of the greatest or least entry; as in JAX, of the first NaN if there is one."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the index of the first largest (or smallest) entry along the axis, of NaN if there is one."""
         graph, type = lowering.graph, result_type(equation)
         x = np.moveaxis(inputs[0], equation.params["axes"][0], -1).reshape(
             -1, inputs[0].shape[equation.params["axes"][0]]
@@ -248,10 +253,10 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
 
 
 RULES |= {
-    "reduce_sum": _reduction("add", 0), "reduce_prod": _reduction("mul", 1), "reduce_or": _reduction("or", 0),
-    "reduce_and": _reduction("and", ALL_BITS), "reduce_xor": _reduction("xor", 0),
-    "reduce_max": _reduction("max", -np.inf), "reduce_min": _reduction("min", np.inf),
-    "cumsum": _cumulative("add"), "cumprod": _cumulative("mul"), "cummax": _cumulative("max"),
-    "cummin": _cumulative("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": write_product,
+    "reduce_sum": _reduce_by("add", 0), "reduce_prod": _reduce_by("mul", 1), "reduce_or": _reduce_by("or", 0),
+    "reduce_and": _reduce_by("and", ALL_BITS), "reduce_xor": _reduce_by("xor", 0),
+    "reduce_max": _reduce_by("max", -np.inf), "reduce_min": _reduce_by("min", np.inf),
+    "cumsum": _accumulate_by("add"), "cumprod": _accumulate_by("mul"), "cummax": _accumulate_by("max"),
+    "cummin": _accumulate_by("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": write_product,
     "cholesky": _each_matrix(_cholesky), "triangular_solve": _each_matrix(_triangular_solve),
 }  # fmt: skip

@@ -56,8 +56,11 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
     """
 
     def decorate(plain: Callable[P, R]) -> Callable[P, R]:
+        """Return the function as one operation of a program, whose native rule is `native`."""
+
         @cache
-        def program(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_Program, Any]:
+        def trace(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_Program, Any]:
+            """Trace the plain function for arguments of these kinds; return it with its result's structure."""
             form: list[Any] = []
 
             def leaves_of(function: Callable[..., R], *leaves: Any) -> list[Any]:
@@ -75,7 +78,7 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
             leaves, tree = jax.tree.flatten((args, kwargs))
             leaves = [jnp.asarray(leaf) for leaf in leaves]
             kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-            this, form = program(tree, kinds, bool(jnp.result_type(float) == np.float64))
+            this, form = trace(tree, kinds, bool(jnp.result_type(float) == np.float64))
             results: R = jax.tree.unflatten(form, _primitive.bind(*leaves, program=this, levels=(), sizes=()))
             return results
 

@@ -47,7 +47,9 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
     )
 
 
-def _of_entries(name: str) -> Rule:
+def _apply_by_row(name: str) -> Rule:
+    """Return the rule of an elementwise operation that computes long arrays row by row, in a loop."""
+
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
         if not is_long(inputs):
@@ -219,6 +221,7 @@ def _reduction(name: str) -> Rule:
     """Make a rule that reduces the first axis row after row, and other axes within each row."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        """Reduce short arrays at once, long ones row by row in a loop, which accumulates over rows if need be."""
         x, axes = inputs[0], equation.params["axes"]
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x)]))
@@ -249,7 +252,7 @@ def _reduction(name: str) -> Rule:
 
 
 REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")
-IN_MEMORY |= {name: _of_entries(name) for name in OF_ENTRIES}
+IN_MEMORY |= {name: _apply_by_row(name) for name in OF_ENTRIES}
 IN_MEMORY |= {name: _reduction(name) for name in REDUCTIONS}
 IN_MEMORY |= {"dot_general": _dot_general}
 RULES |= {"dot_general": _of_nodes}

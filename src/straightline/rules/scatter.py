@@ -21,6 +21,7 @@ def _scatter(op: str | None) -> Rule:
     """Make a rule that applies updates one after another; those outside the array are dropped."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Combine each update with the entry at its place, in order; places beyond the array are dropped or clipped."""
         x, indices, updates = inputs
         numbers = equation.params["dimension_numbers"]
         indices = narrowed(lowering, indices) if fills(equation) else indices

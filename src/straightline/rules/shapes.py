@@ -51,7 +51,8 @@ def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
     return [rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows))]
 
 
-def _pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Lower `pad`: entries go to their places in an array of the filling; negative padding cuts them off."""
     x, filling = inputs
     padded = np.empty(result_shape(equation), dtype=object)
     padded[...] = filling[()]
@@ -88,7 +89,8 @@ def chosen(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
     return selected
 
 
-def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Lower `dynamic_update_slice`: at known starts a copy, at one that data decide a choice among its few places."""
     x, update, starts = inputs[0], inputs[1], [lowering.scalar(s) for s in inputs[2:]]
     for axis, start in enumerate(starts):
         last = x.shape[axis] - update.shape[axis]
@@ -126,7 +128,7 @@ RULES |= {
     "rev": _moved(lambda x, params, shape: np.flip(x, params["dimensions"])),
     "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
     "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
-    "unstack": _unstack, "pad": _pad,
+    "unstack": _unstack, "pad": _lower_pad,
     "iota": _iota, "empty": _empty, "empty2": _empty,
-    "dynamic_update_slice": _dynamic_update_slice,
+    "dynamic_update_slice": _lower_dynamic_update_slice,
 }  # fmt: skip

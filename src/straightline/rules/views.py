@@ -65,7 +65,8 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     return parts
 
 
-def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Lower `dynamic_slice` of an array in memory to a view: starts that data decide become moves of its address."""
     sizes = equation.params["slice_sizes"]
     x = indexable(lowering, inputs[0], inputs[1:])
     if not isinstance(x, InMemory):
@@ -86,7 +87,7 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last = x.shape[axis] - size
         if start.op != "constant" and last >= FEW:
-            return _dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
+            return _lower_dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
         x = _window(lowering, x, axis, start, size) if last else x
     return [x]
 
@@ -198,5 +199,5 @@ VIEWS: dict[str, View] = {
 }  # fmt: skip
 IN_MEMORY |= {name: _viewed(name, view) for name, view in VIEWS.items()}
 RULES |= {"dynamic_slice": _dynamic_slice_of_nodes}
-IN_MEMORY |= {"split": _split, "dynamic_slice": _dynamic_slice, "gather": _gather, "concatenate": _concatenate}
+IN_MEMORY |= {"split": _split, "dynamic_slice": _lower_dynamic_slice, "gather": _gather, "concatenate": _concatenate}
 IN_MEMORY |= {name: RULES[name] for name in PASSED_ON}

@@ -109,10 +109,11 @@ def _of_any_size(x: Vector, value: Vector, name: str) -> Vector:
 
 def atan(x: Vector) -> Vector:
     """Arcus tangent: a known angle and that of (x - tan angle) / (1 + x tan angle)."""
-    return copy_sign(_positive_atan(abs(x)), x)
+    return copy_sign(_atan_of_positive(abs(x)), x)
 
 
-def _positive_atan(x: Vector) -> Vector:
+def _atan_of_positive(x: Vector) -> Vector:
+    """Compute atan x for x >= 0: atan x = a + atan t with the nearest tabulated a, t = (x - tan a) / (1 + x tan a)."""
     # A large x takes the place of infinity, which times 0 is none.
     x = select(x > 2.0**66, 2.0**66, x)
     over = tuple(map(x.like, (1.0, 0.0, 0.0, 1.0)))
@@ -136,7 +137,7 @@ def atan2(y: Vector, x: Vector) -> Vector:
     both = abs(x).equals(abs(y))
     # 0/0 and infinity/infinity: along an axis, or a diagonal.
     ratio = select(both, select(y.equals(0.0), y.like(0.0), 1.0), ratio)
-    angle = _positive_atan(ratio)
+    angle = _atan_of_positive(ratio)
     behind = x.as_type(format_of(x).word) < 0
     angle = select(behind, math.pi - (angle - PI_LOW[x.scalar]), angle)
     return copy_sign(select(_is_number(x) & _is_number(y), angle, math.nan), y)

@@ -117,11 +117,12 @@ def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
             readable, end = stack.enter_context(whole_part(path))
             got = f"one that was cut off after {end:,} bytes of whole records"
             cut = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
-        yield stack.enter_context(_reader(path, readable)), cut
+        yield stack.enter_context(_open_reader(path, readable)), cut
 
 
 @contextmanager
-def _reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
+def _open_reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
+    """Open a bag and yield its reader, which is closed at the end; one line if it cannot be opened."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 

@@ -71,10 +71,11 @@ class Layout:
     def _message(self, begin: int, kind: str, prefix: str) -> int:
         """Pass over a message from byte `begin` on; return where it ends, as all of these do."""
         for name, (node, of) in self._definitions[kind][1]:
-            begin = self._field(begin, str(node.name), of, prefix + name)
+            begin = self._place_field(begin, str(node.name), of, prefix + name)
         return begin
 
-    def _field(self, begin: int, node: str, of: Any, path: str) -> int:
+    def _place_field(self, begin: int, node: str, of: Any, path: str) -> int:
+        """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins."""
         # Parts, texts and single numbers.
         if node == "NAME":
             return self._message(begin, of, f"{path}.")
@@ -82,7 +83,7 @@ class Layout:
             begin = _align(begin, 4)
             return begin + 4 + self._length(begin)
         if node == "BASE":
-            return self._numbers(begin, of[0], 1, path, [path])
+            return self._place_numbers(begin, of[0], 1, path, [path])
         # Lists, of numbers or of anything else.
         (inner_node, inner), count = of
         if node == "SEQUENCE":
@@ -90,12 +91,15 @@ class Layout:
             count, begin = self._length(begin), begin + 4
         if inner_node.name == "BASE" and inner[0] in NUMBERS:
             near = any(name.startswith(f"{path}.") for name in self._paths)
-            return self._numbers(begin, inner[0], count, path, [f"{path}.{i}" for i in range(count if near else 0)])
+            return self._place_numbers(
+                begin, inner[0], count, path, [f"{path}.{i}" for i in range(count if near else 0)]
+            )
         for i in range(count):
-            begin = self._field(begin, inner_node.name, inner, f"{path}.{i}")
+            begin = self._place_field(begin, inner_node.name, inner, f"{path}.{i}")
         return begin
 
-    def _numbers(self, begin: int, kind: str, count: int, path: str, names: list[str]) -> int:
+    def _place_numbers(self, begin: int, kind: str, count: int, path: str, names: list[str]) -> int:
+        """Note where the wanted ones of `count` numbers in a row stand; return the byte behind the last."""
         size = NUMBERS.get(kind)
         if size is None:
             raise LayoutError
@@ -159,7 +163,9 @@ class Decoder:
             for rows, columns in self._iterate_layouts(batch[numbers[0]].connection, table):
                 for source, _, places in self._sources.of(topic):
                     ((node, at),) = places.items()
-                    read = _reading(np.array(numbers)[rows], columns, source, at, len(self._sources.names[node]))
+                    read = _convert_columns(
+                        np.array(numbers)[rows], columns, source, at, len(self._sources.names[node])
+                    )
                     results[node].append(read)
         return results
 
@@ -204,9 +210,14 @@ def _parts(path: str | Yaw) -> tuple[str, ...]:
     return path.parts if isinstance(path, Yaw) else (path,)
 
 
-def _reading(
+def _convert_columns(
     rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, outputs: int
 ) -> Readings:
+    """Convert the fields of many messages of one source to readings: times, counts and values by output.
+
+
+    Raises LayoutError where a stamp or a count is none, which reading message by message then names.
+    """
     none = np.full(len(rows), -1, dtype=np.int64)
     time = np.full(len(rows), NONE)
     values = np.full((len(rows), outputs), np.nan)

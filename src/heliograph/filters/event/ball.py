@@ -69,6 +69,7 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
     """
 
     def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
+        """Truncate one Gaussian: diagonalise what is seen, take its moments in the ball, carry them to all of x."""
         rows, centre = directions @ x.root, directions @ x.mean
         variance, turn = eigh(Columns(rows, x.variances).covariance)
         # What has no variance lies where it is.

@@ -124,6 +124,8 @@ class Search:
         return self.surface.possible(points, top.x)
 
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
+        """Maximise from each start, coordinates at an end held there, and keep the best point seen so far."""
+
         def seen(now: Maximum) -> None:
             here = _top(now, ends)
             if self.best is None or not here.total < self.best.total:

@@ -111,6 +111,7 @@ def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
 
 
 def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
+    """Tell whether two plants agree in law, or in mean and covariance where the filter uses no more."""
     if same(a, b):
         return True
     sizes = [(len(plant.states), len(plant.inputs), plant.angles) for plant in (a, b)]
@@ -141,6 +142,7 @@ def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> 
 
 
 def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
+    """Tell whether two sensors measure the same, and with noise of the same moments up to `order`."""
     if same(a, b):
         return True
     if a.angles != b.angles or len(a.outputs) != len(b.outputs) or not _same_noise(a.noise, b.noise, order):
@@ -200,6 +202,7 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
 
 
 def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None, loses: bool) -> bool:
+    """Tell whether two channels have the same law, or moments as far as a filter uses them (`order`, known `loses`)."""
     if same(a, b):
         return True
     if is_traced(a, b) or (a.outputs, a.inputs, a.past) != (b.outputs, b.inputs, b.past) or a.past:

@@ -31,6 +31,7 @@ def same_function(f: Callable[..., Any], g: Callable[..., Any], *shapes: tuple[i
 
 
 def _same_parameter(a: Any, b: Any) -> bool:
+    """Tell whether parameters of two operations are the same: programs by what they compute, others by value."""
     if isinstance(a, core.ClosedJaxpr) and isinstance(b, core.ClosedJaxpr):
         return same(list(a.consts), list(b.consts)) and _same_program(a.jaxpr, b.jaxpr)
     if isinstance(a, core.Jaxpr) and isinstance(b, core.Jaxpr):
@@ -41,6 +42,7 @@ def _same_parameter(a: Any, b: Any) -> bool:
 
 
 def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
+    """Tell whether two programs do the same operations in the same order, whatever their variables are called."""
     if len(a.eqns) != len(b.eqns):
         return False
     names: tuple[dict[Any, int], dict[Any, int]] = {}, {}

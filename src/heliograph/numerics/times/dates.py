@@ -145,10 +145,11 @@ def horizons_in(text: str) -> int | list[float | np.timedelta64 | np.datetime64]
     """
     if re.fullmatch(r"\s*\d+\s*", text):
         return int(text)
-    return [_horizon(part.strip()) for part in text.split(",")]
+    return [_parse_horizon(part.strip()) for part in text.split(",")]
 
 
-def _horizon(text: str) -> float | np.timedelta64 | np.datetime64:
+def _parse_horizon(text: str) -> float | np.timedelta64 | np.datetime64:
+    """Return a horizon from its text: a span or a date, a whole number of steps, or seconds."""
     if span := SPAN.fullmatch(text):
         return np.timedelta64(round(float(span["count"]) * NANOSECONDS[span["unit"]]), "ns")
     if looks_like_date(text):

@@ -44,13 +44,15 @@ class _Writer:
     def lines(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
         """Return the lines of a program, its variables numbered in their order."""
         numbers: dict[Var, int] = {}
-        head = [f"{self._write_definitions(numbers, jaxpr.constvars)} = {[self._value(value) for value in consts]}"]
+        head = [
+            f"{self._write_definitions(numbers, jaxpr.constvars)} = {[self._write_value(value) for value in consts]}"
+        ]
         head += [self._write_definitions(numbers, jaxpr.invars)]
         body = [self._line(numbers, equation) for equation in jaxpr.eqns]
         return "\n".join([*head, *body, self._write_uses(numbers, jaxpr.outvars)])
 
     def _line(self, numbers: dict[Var, int], equation: JaxprEqn) -> str:
-        used, how = self._write_uses(numbers, equation.invars), self._value(equation.params)
+        used, how = self._write_uses(numbers, equation.invars), self._write_value(equation.params)
         return f"{self._write_definitions(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
 
     def _write_definitions(self, numbers: dict[Var, int], variables: Sequence[Var]) -> str:
@@ -59,20 +61,21 @@ class _Writer:
         return " ".join(str(variable.aval) for variable in variables)
 
     def _write_uses(self, numbers: Mapping[Var, int], atoms: Sequence[Var | Literal]) -> str:
-        return " ".join(self._value(x.val) if isinstance(x, Literal) else str(numbers[x]) for x in atoms)
+        return " ".join(self._write_value(x.val) if isinstance(x, Literal) else str(numbers[x]) for x in atoms)
 
-    def _value(self, value: Any) -> str:
+    def _write_value(self, value: Any) -> str:
+        """Return the text of a parameter of an operation: arrays and inner programs by their hashes."""
         match value:
             case ClosedJaxpr():
                 return self._hash(value, value.jaxpr, value.consts)
             case Jaxpr():
                 return self._hash(value, value, ())
             case dict():
-                return "{" + ", ".join(f"{name}: {self._value(value[name])}" for name in sorted(value)) + "}"
+                return "{" + ", ".join(f"{name}: {self._write_value(value[name])}" for name in sorted(value)) + "}"
             case tuple() | list():
-                return "(" + ", ".join(map(self._value, value)) + ")"
+                return "(" + ", ".join(map(self._write_value, value)) + ")"
             case jax.Array() if jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key):
-                return f"key {self._value(np.asarray(jax.random.key_data(value)))}"
+                return f"key {self._write_value(np.asarray(jax.random.key_data(value)))}"
             case jax.Array() | np.ndarray():
                 return f"{value.dtype}{value.shape} {short_name(np.asarray(value))}"
         # A function makes a derivative, of which a step computes none; a type has its name.

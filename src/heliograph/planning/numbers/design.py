@@ -66,6 +66,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
 
 
 def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
+    """Return the limits of the transmitters' powers that a budget sets; none without a budget."""
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)

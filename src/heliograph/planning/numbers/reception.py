@@ -188,6 +188,7 @@ def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
 
 
 def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
+    """Return the modes of a channel that a filter is told, with what arrives in each, and whether they have memory."""
     if not memories(channel):
         cases = channel.list_outcomes()
         law = jnp.stack([jnp.asarray(case.probability) for case in cases])

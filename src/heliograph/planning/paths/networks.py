@@ -88,14 +88,15 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
         rows[:, -1] += np.asarray(head.noise.mean)
         head, *rest = rest
     if not isinstance(head, Stack):
-        return [_chain([head, *rest], rows, prefix)]
+        return [_make_chain([head, *rest], rows, prefix)]
     if rest:
         raise _unfit("a stack that is sent on")
     parts = enumerate(head.maps, 1)
     return [chain for i, affine in parts for chain in chains_of(affine, rows, f"{prefix}part{i}.")]
 
 
-def _chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> Chain:
+def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> Chain:
+    """Return a series of maps as a path: the row of outputs that it carries, kappa and alpha of each hop."""
     if parts[-1].outputs != 1:
         raise _unfit(f"one gain for {parts[-1].outputs} numbers")
     row, fading, moved = rows[0], 1.0, False
@@ -168,6 +169,7 @@ class _Step(NamedTuple):
 
 
 def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
+    """Describe the paths of all nodes at step k: what they carry, its powers, and the numbers of their hops."""
     step = _Step([], [], [], [], [], [], [], [])
     for name, node in nodes.items():
         if node.informed_by is not None:

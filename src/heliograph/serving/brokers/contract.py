@@ -129,7 +129,7 @@ class _Check:
 
         async def listen() -> None:
             while set(bodies) - set(received):
-                received.extend(await self._taken(await transport.receive(), acknowledge))
+                received.extend(await self._unpack(await transport.receive(), acknowledge))
                 await asyncio.sleep(0)  # a transport that never waits would let no time pass
 
         # A timeout, and not `wait_for`: Python 3.11's may lose the cancellation of what waits inside, and never end.
@@ -149,14 +149,15 @@ class _Check:
                 batch = await transport.receive()
         except TimeoutError:
             return []
-        return await self._taken(batch, acknowledge)
+        return await self._unpack(batch, acknowledge)
 
     async def _silent(self, transport: Transport) -> None:
         """Receive and acknowledge late copies until none arrive."""
         while await self._for_a_while(transport, acknowledge=True):
             pass
 
-    async def _taken(self, batch: Batch | None, acknowledge: bool) -> list[bytes]:
+    async def _unpack(self, batch: Batch | None, acknowledge: bool) -> list[bytes]:
+        """Check a batch that was received, acknowledge it if asked to, and return the bytes of its messages."""
         assert batch is not None, "receive: expected to wait for messages, got None, which says that all ends"
         assert batch.payloads, "receive: expected to wait for messages, got a batch of none"
         if acknowledge:

@@ -71,6 +71,7 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
 
 
 async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
+    """Note each message of a NATS server under its topic for some seconds."""
     import nats
     from nats.aio.msg import Msg
     from nats.errors import Error

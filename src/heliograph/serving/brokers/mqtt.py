@@ -111,6 +111,7 @@ class _Reader(_Connection):
         self.start()
 
     async def receive(self) -> Batch:
+        """Wait for messages, and return those that a service reads; the batch acknowledges them all."""
         batch, payloads = list[tuple[int, MQTTMessage, datetime]](), list[Payload]()
         # Wait until messages came of which there is something to give.
         while not payloads:  # the word that one came may come after the batch that took it

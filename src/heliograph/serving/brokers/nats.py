@@ -69,6 +69,7 @@ class Nats:
         self._retry, self._opening = Retry(str(address)), asyncio.Lock()
 
     async def receive(self) -> Batch | None:
+        """Wait for messages, connecting anew where needed; a gap in their count means that they are read again."""
         while True:
             raise_if_cancelled()
             # A request that times out is repeated; a broken connection gets a new consumer.

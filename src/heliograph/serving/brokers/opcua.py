@@ -118,11 +118,12 @@ class OpcUa:
         self.address, self._translator = parse_address, translator
         self._output, self._retry = Pipe(target=target), Retry(str(parse_address))
         self._came: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
-        self._make_client: Client | None = None
+        self._client: Client | None = None
         self._first: set[str] = set()  # variables of which the first value is still to come
         self.reporting: dict[str, Reporting] = {}
 
     async def receive(self) -> Batch | None:
+        """Wait for changes of the nodes that are subscribed to, and return what came together."""
         while True:
             await self._connected()
             try:
@@ -138,9 +139,9 @@ class OpcUa:
         await self._output.publish(outputs)
 
     async def close(self) -> None:
-        if self._make_client is not None:
+        if self._client is not None:
             with contextlib.suppress(*AWAY):
-                await asyncio.wait_for(self._make_client.disconnect(), WAIT)
+                await asyncio.wait_for(self._client.disconnect(), WAIT)
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
         """Translate a change; the first value of a subscription was there before, as a stored message."""
@@ -153,23 +154,24 @@ class OpcUa:
         """Connect and subscribe, again and again while the server is away."""
         while True:
             try:
-                if self._make_client is not None:
-                    await self._make_client.check_connection()
+                if self._client is not None:
+                    await self._client.check_connection()
                     return
                 await self._subscribe()
                 self._retry.worked()
                 return
             except AWAY as error:
-                if self._make_client is not None:
+                if self._client is not None:
                     with contextlib.suppress(*AWAY):
-                        await self._make_client.disconnect()
-                self._make_client = None
+                        await self._client.disconnect()
+                self._client = None
                 await self._retry.wait(error)
 
     async def _subscribe(self) -> None:
+        """Connect, and subscribe to each node of the sources."""
         client = _make_client(self.address)
         await client.connect()
-        self._make_client = client
+        self._client = client
         for name in self._translator.sources.subscribed:
             node = _find_node(client, name)
             self._first.add(node.nodeid.to_string())

@@ -37,6 +37,7 @@ class Pipe:
         self._rest, self._skipping = b"", False
 
     async def receive(self) -> Batch | None:
+        """Wait for lines of standard input, and return their messages; None at its end."""
         loop = asyncio.get_running_loop()
         while True:
             await _ready(self.source, loop.add_reader, loop.remove_reader)
@@ -76,6 +77,7 @@ class Pipe:
         return [line for line in lines if line.strip()]
 
     async def publish(self, outputs: Sequence[Output]) -> None:
+        """Write outputs to standard output, a line each, waiting while the pipe is full."""
         rest = memoryview(b"".join([output.body + b"\n" for output in outputs]))
         loop = asyncio.get_running_loop()
         with _set_nonblocking(self.target) as (target, at_once):

@@ -295,6 +295,7 @@ class TokenMiddleware:
         self.app, self.token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer only requests that bring the token, in their address (kept as a cookie then), a cookie or a header."""
         if scope["type"] != "http" or self.token is None or scope["path"] == HEALTH:
             await self.app(scope, receive, send)
             return

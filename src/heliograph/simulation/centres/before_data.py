@@ -137,7 +137,7 @@ def cross_covariances(
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _plan_filters(alone, horizon, inputs)
     with jax.enable_x64(True):
-        factors: SourceFactors = to_numpy(_factors(filters, u))
+        factors: SourceFactors = to_numpy(_compute_factors(filters, u))
     parts = factors.mean[0], factors.state, factors.mean[1:], *factors.errors
     return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
 
@@ -175,7 +175,8 @@ def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> t
 
 
 @quickly_compiled
-def _factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
+def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
+    """Return the joint covariance of all errors by its factors, along the steps of u, for the one informed fusion."""
     (centre,) = filters.informed
 
     separate, _, _, known, *_ = filters.init()
@@ -191,6 +192,8 @@ def _factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
 
 @quickly_compiled
 def _compute_fused(filters: AllFilters, u: np.ndarray) -> PyTree:
+    """Return the covariances of all fused estimates over the steps of u, which depend on no data."""
+
     def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         (states, known), (k, u_k) = carry, row
         published: dict[str, jax.Array] = {}

@@ -270,6 +270,7 @@ def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
 
 
 def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
+    """Raise unless plant and sensors are linear, and the gains of all filters depend on no data."""
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
     for name, (sensor, _, filter) in nodes.items():

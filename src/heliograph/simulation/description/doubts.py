@@ -128,7 +128,7 @@ def observability(plant: AbstractPlant, sensors: list[AbstractSensor]) -> Float[
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
     """Yield what the certificate of boundedness says of all nodes together, and of each alone."""
     # All nodes together, then each that has filters.
-    yield from _bound(network, "the mean error of every filter", True)
+    yield from _warn_if_unbounded(network, "the mean error of every filter", True)
     alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
     if len(network.nodes) == 1 or not alone:
         return
@@ -137,10 +137,13 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
         return
     for name in alone:
         node = network.nodes[name]
-        yield from _bound(Network(network.plant, {name: node}), f"the mean error of {name!r} alone", not network.fused)
+        yield from _warn_if_unbounded(
+            Network(network.plant, {name: node}), f"the mean error of {name!r} alone", not network.fused
+        )
 
 
-def _bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
+def _warn_if_unbounded(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
+    """Yield a warning where an error grows without end, or where this cannot be decided."""
     try:
         boundedness = certify_boundedness(network)
     except InputError as error:

@@ -147,10 +147,13 @@ class ErrorStatistics:
         if np.any(broken):
             undefined = np.full(outer.shape[-1], np.nan)
             return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), undefined)
-        halves = [self._ratio_on(np.arange(BATCHES) % 2 == side, outer, covariance) for side in (0, 1)]
+        halves = [self._estimate_worst_ratio(np.arange(BATCHES) % 2 == side, outer, covariance) for side in (0, 1)]
         return max(halves, key=lambda w: w.ratio)
 
-    def _ratio_on(self, held_out: np.ndarray, outer: np.ndarray, covariance: np.ndarray) -> "WorstDirection":
+    def _estimate_worst_ratio(
+        self, held_out: np.ndarray, outer: np.ndarray, covariance: np.ndarray
+    ) -> "WorstDirection":
+        """Find the direction of largest error over claim in one half of the runs; return its ratio in the other."""
         chosen = ~held_out & (self.count > 0)
         actual, claimed = outer[chosen].sum(axis=0), covariance[chosen].sum(axis=0)
         # Step and direction of the largest ratio in the other half of the batches.

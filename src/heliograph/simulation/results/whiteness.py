@@ -164,11 +164,13 @@ def score_innovations(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     if filter.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
-    likelihoods, white = compute_once(_innovations, _by_xla, (filter, *check_data(filter, data, inputs)))
+    likelihoods, white = compute_once(_whiten_innovations, _by_xla, (filter, *check_data(filter, data, inputs)))
     return likelihoods, white
 
 
-def _innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
+def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
+    """Run a filter; return each row's log-likelihood, and its innovation made white, NaN where nothing arrived."""
+
     def single(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = ~jnp.isnan(innovation.value)
         if innovation.weight is not None:  # what a filter left out, or nearly, does not count against it
@@ -180,4 +182,4 @@ def _innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
     return filter.scan(z, u, single)
 
 
-_by_xla = quickly_compiled(_innovations)
+_by_xla = quickly_compiled(_whiten_innovations)

@@ -126,6 +126,7 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
     into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
 
     def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
+        """Smooth rows `begin` to `stop` from the last one back; return the outputs of the first."""
         sweep: Sweep = static.filled(numbers)
         begin, stop = span
         last = stop - 1, history.step[stop - 1]

@@ -49,6 +49,7 @@ def _default() -> Path:
 
 
 def _make_private(path: Path) -> None:
+    """Make the folder so that nobody else can write to it; raise one line if it is another user's."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=PRIVATE, exist_ok=True)

@@ -54,11 +54,13 @@ class RunLanes:
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
-        recorded = self._init_lanes(runs, lanes) if self.wide else self._threads(runs, lanes)
+        recorded = self._run_on_devices(runs, lanes) if self.wide else self._run_in_threads(runs, lanes)
         used = np.concatenate(lanes)
         return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), used), *recorded)
 
-    def _threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+    def _run_in_threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+        """Run each lane in a thread of its own, carrying its sums on; return what is recorded of each run, by lane."""
+
         def go(lane: int) -> PyTree:
             with jax.enable_x64(True):
                 carry = self.start() if self.carries[lane] is None else self.carries[lane]
@@ -69,7 +71,8 @@ class RunLanes:
             self.pool = ThreadPoolExecutor(1 if self.one_by_one else min(self.count, os.cpu_count() or 1))
         return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
 
-    def _init_lanes(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+    def _run_on_devices(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+        """Run one lane on each device, carrying their sums on; return what is recorded of each run, by lane."""
         shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
             every = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))

@@ -154,6 +154,7 @@ def _program(
 
     # One run, from the key, the arrays and the run's number.
     def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
+        """Simulate one run from the program's arrays and the run's number; return what is summed, and what is kept."""
         *arrays, number = leaves
         items = iter(arrays)
         whole = [value if h else next(items) for value, h in zip(fixed, held, strict=True)]

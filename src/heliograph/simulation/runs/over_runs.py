@@ -35,7 +35,7 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
         raise fail("function over runs", "a function of one run's arrays", show_value(function))
     check_count("width", width)
     # Arrays of numbers with one leading axis.
-    values = [_numbers(a) for a in arrays]
+    values = [_read_numbers(a) for a in arrays]
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
     # Native code where it supports the function.
@@ -71,7 +71,8 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
     return whole
 
 
-def _numbers(value: PyTree) -> np.ndarray:
+def _read_numbers(value: PyTree) -> np.ndarray:
+    """Return numbers as an array, masked ones as NaN; raise one line of anything else."""
     try:
         values = np.asarray(fill_masked(value))
     except ValueError:  # rows of different lengths

@@ -134,6 +134,8 @@ def map_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]
 
 
 def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
+    """Apply a function of one run to arrays that hold one run only, without the cost of `vmap`."""
+
     def only(leaf: PyTree) -> PyTree:
         return jax.lax.squeeze(leaf, (0,)) if eqx.is_array(leaf) else leaf
 
