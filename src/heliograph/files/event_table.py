@@ -390,10 +390,7 @@ class EventTable:
         return events, judge(events, values, self._joint, *limits)
 
     def _inputs(self, held: Float[np.ndarray, "rows given"], times: np.ndarray) -> np.ndarray:
-        """Return the plant's inputs of each row, from those that are held after it, and the time since the row before.
-
-        Shapes: (rows, inputs).
-        """
+        """Return the plant's inputs (rows, inputs): those held after the row before, and the time since that row."""
         if self.steps:
             return held
         before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])

@@ -46,9 +46,8 @@ def columns_of(table: object, name: str = "table", only: Container[str] | None =
         named |= {column: frame[column] for column in header}
     else:
         raise fail(name, "a file, a DataFrame, or a dictionary of columns", show_value(table))
-    for column in named:
-        if not isinstance(column, str):
-            raise fail(f"{name}, columns", "names that are text", show_value(column))
+    for column in [column for column in named if not isinstance(column, str)]:
+        raise fail(f"{name}, columns", "names that are text", show_value(column))
     kept = {column: values for column, values in named.items() if only is None or column in only}
     return {column: _values(values, f"{name}, column {column!r}") for column, values in kept.items()}
 
@@ -103,9 +102,8 @@ def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
             raise TypeError
         return np.array([np.nan if value is None else float(value) for value in column])
     except (TypeError, ValueError, OverflowError):
-        raise fail(
-            name, "numbers or dates", show_value(str(texts[0]) if texts and isinstance(texts[0], str) else some)
-        ) from None
+        came = str(texts[0]) if texts and isinstance(texts[0], str) else some
+        raise fail(name, "numbers or dates", show_value(came)) from None
 
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
@@ -176,8 +174,7 @@ def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
 
 
 def _check_distinct(source: object, header: Sequence[object]) -> None:
-    twice = [name for name, count in Counter(header).items() if count > 1]
-    if twice:
+    if twice := [name for name, count in Counter(header).items() if count > 1]:
         raise fail(f"{source}, header", "distinct columns", f"{twice[0]!r} more than once")
 
 
@@ -252,9 +249,8 @@ def _exact(values: np.ndarray, cells: Sequence[str]) -> np.ndarray:
 def _split_row(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
     """Return the cells of a row; raise one line if it is a comment or has more or fewer than the header."""
     if line[0].lstrip().startswith("#"):
-        raise fail(
-            f"{path}, row {number}", "numbers", f"a comment, {show_value(line[0])}: {_rewriting(path, comment='#')}"
-        )
+        remedy = _rewriting(path, comment="#")
+        raise fail(f"{path}, row {number}", "numbers", f"a comment, {show_value(line[0])}: {remedy}")
     if len(line) != len(header):
         hint = ": numbers have a decimal point" if len(line) > len(header) else ""
         raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
@@ -285,9 +281,8 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
     """Raise one line if the header is a comment, has other separators, or a name twice."""
     line = ",".join(header)
     if line.startswith(COMMENTS):
-        raise fail(
-            f"{path}, header", "names of columns", f"a comment, {show_value(line)}: {_suggest_without_comments(path)}"
-        )
+        remedy = _suggest_without_comments(path)
+        raise fail(f"{path}, header", "names of columns", f"a comment, {show_value(line)}: {remedy}")
     check_separators(path, header)
     _check_distinct(path, header)
 
