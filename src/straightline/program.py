@@ -103,7 +103,7 @@ def _partly_known(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers:
 
 
 def needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
-    """Nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
+    """Return the nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
     results: dict[Any, None] = {}
     waiting: list[Any] = list(roots)
     while waiting:

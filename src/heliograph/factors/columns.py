@@ -70,7 +70,7 @@ def side_by_side(parts: Columns, weights: Array) -> Columns:
 
 
 def zero_covariance(n: int) -> Columns:
-    """Covariance of zero of n components: no columns."""
+    """Return the covariance of zero of n components: no columns."""
     return Columns(np.zeros((n, 0)), np.zeros(0))
 
 
@@ -106,18 +106,18 @@ def is_positive(x: jax.Array) -> jax.Array:
 
 
 def reciprocal_or_one(x: jax.Array) -> jax.Array:
-    """1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
+    """Return 1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
     return 1 / jnp.where(is_positive(x), x, 1.0)
 
 
 def reciprocal_or_zero(x: jax.Array) -> jax.Array:
-    """1 / x of a positive number, and 0 of 0."""
+    """Return 1 / x of a positive number, and 0 of 0."""
     positive = is_positive(x)
     return jnp.where(positive, 1 / jnp.where(positive, x, 1.0), 0.0)
 
 
 def square_root(x: jax.Array) -> jax.Array:
-    """Root of x, of slope 0 at 0: what is even in it has one there, and 0 times infinity would be none."""
+    """Return the root of x, of slope 0 at 0: what is even in it has one there, and 0 times infinity would be none."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
@@ -213,7 +213,7 @@ def factor_constant(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def columns_of(covariance: Array) -> Columns:
-    """Columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
+    """Return the columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
     if isinstance(covariance, np.ndarray):
         root = root_of(covariance)
         return Columns(root, np.ones(root.shape[1]))

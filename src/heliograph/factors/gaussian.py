@@ -67,13 +67,13 @@ class Gaussian(NamedTuple):
 
 
 def from_columns(mean: jax.Array, columns: Columns) -> Gaussian:
-    """Gaussian of a covariance that is a sum of squares W diag(w) W', by orthogonal rows: exact to eps^2."""
+    """Return the Gaussian of a covariance that is a sum of squares W diag(w) W', by orthogonal rows: exact to eps^2."""
     factors = triangularise(columns)
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
 def from_summed_covariance(mean: jax.Array, *parts: Columns) -> Gaussian:
-    """Gaussian of Cov = sum of the parts, by elimination of the summed matrix: faster, less exact."""
+    """Return the Gaussian of Cov = sum of the parts, by elimination of the summed matrix: faster, less exact."""
     total = parts[0].covariance
     for part in parts[1:]:
         total = total + part.covariance
@@ -81,13 +81,13 @@ def from_summed_covariance(mean: jax.Array, *parts: Columns) -> Gaussian:
 
 
 def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Gaussian:
-    """Gaussian of a covariance matrix that was summed of squares, by elimination."""
+    """Return the Gaussian of a covariance matrix that was summed of squares, by elimination."""
     factors = eliminate(covariance, len(covariance) * unit_of(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
 def from_covariance(mean: Array, covariance: Array) -> Gaussian:
-    """Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself."""
+    """Return the Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself."""
     if isinstance(covariance, np.ndarray):
         factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_constant(covariance))
         return Gaussian(*factors)
@@ -128,7 +128,7 @@ class Image(NamedTuple):
 
 
 def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: Columns | None = None) -> Image:
-    """Image of an f of which the slopes in xi are computed, affine where it has no curvature."""
+    """Return the image of an f of which the slopes in xi are computed, affine where it has no curvature."""
     rest = zero_covariance(len(mean)) if curvature is None else curvature
     return Image(mean, Columns(slopes, x.variances), np.ones(len(x.mean)), rest)
 
@@ -154,7 +154,7 @@ def sum_unexplained(image: Image, noise: Columns) -> Columns:
 
 
 def add_noise_to_image(image: Image, noise: Columns) -> Gaussian:
-    """Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
+    """Return the Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
 
     Slopes by orthogonal rows, as `predict_affine` does: a prior may tie what a precise measurement has to tell apart.
     """
@@ -177,7 +177,7 @@ class Innovations(NamedTuple):
         return self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
 
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
-        """log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
+        """Return log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
 
         A component that those before it determine, s_j = 0 to rounding, adds nothing where it agrees with them and
         -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation.
@@ -220,7 +220,7 @@ def condition_on_observation(
 
 
 def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
-    """Kalman's gain (n, m) of z = E z + slopes xi + v, of the factors N diag(r) N' of Cov v, N unit lower.
+    """Return Kalman's gain (n, m) of z = E z + slopes xi + v, of the factors N diag(r) N' of Cov v, N unit lower.
 
     With V the unit triangle by which a component's innovation, given those before it, enters those to come, these
     innovations are V^-1 N^-1 (z - E z), and the gain is that of them times V^-1 N^-1.
@@ -292,11 +292,11 @@ class BackwardGain(NamedTuple):
     lower: Float[jax.Array, "*time entries"]
 
     def mean_given(self, later: jax.Array) -> jax.Array:
-        """E x, from that of x+."""
+        """Return E x, from that of x+."""
         return self.left.mean + self.gain @ self.apply_inverse_factor((later - self.ahead)[:, None])[:, 0]
 
     def apply_inverse_factor(self, rows: jax.Array) -> jax.Array:
-        """L^-1 times rows (n, ...)."""
+        """Return L^-1 times rows (n, ...)."""
         return decorrelate(unit_lower(self.lower), rows)
 
 

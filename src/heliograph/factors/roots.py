@@ -21,13 +21,13 @@ class Observed(NamedTuple):
 
 
 def covariance_of_root(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarray, "*items n n"]:
-    """W W', symmetric to the last digit."""
+    """Return W W', symmetric to the last digit."""
     product = root @ root.swapaxes(-1, -2)
     return np.asarray(product + product.swapaxes(-1, -2)) / 2
 
 
 def roots_of(covariance: Float[np.ndarray, "*items n n"]) -> Float[np.ndarray, "*items n n"]:
-    """W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
+    """Return W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
 
     Of a matrix that rounding made indefinite, those of the nearest covariance: what is below zero counts as zero.
     """

@@ -109,7 +109,7 @@ class Columns:
 
 
 def _find_astray(time: np.ndarray) -> Bool[np.ndarray, " events"]:
-    """Mask of the stamps, in the order of their messages, of a clock that was not set.
+    """Return the mask of the stamps, in the order of their messages, of a clock that was not set.
 
     They are more than a year outside of all others, and a stretch of fewer messages than those before and after it,
     between which is less than a year; or, at the start, of the first year since 1970, where clocks begin to count, and

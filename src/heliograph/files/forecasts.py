@@ -67,7 +67,7 @@ def _joined(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarra
 
 
 def _outputs(prefix: str, forecast: "heliograph.forecasting.Forecast", rows: int) -> dict[str, np.ndarray]:
-    """Columns of what the sensor would measure, and of its deviations where there is a claim."""
+    """Return the columns of what the sensor would measure, and of its deviations where there is a claim."""
     if forecast.outputs is None:
         return {}
     columns = {}

@@ -199,7 +199,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
 
 @contextmanager
 def csv_lines(path: Path) -> Iterator[Iterator[list[str]]]:
-    """Lines of a CSV file that are not empty; ValueError for text that is no CSV in UTF-8."""
+    """Return the lines of a CSV file that are not empty; ValueError for text that is no CSV in UTF-8."""
     try:
         with open_text(path) as file:
             yield (line for line in csv.reader(file, strict=True) if line)
@@ -208,7 +208,7 @@ def csv_lines(path: Path) -> Iterator[Iterator[list[str]]]:
 
 
 def csv_header(path: Path) -> list[str]:
-    """Names of the columns of a CSV file; none of a file that is none."""
+    """Return the names of the columns of a CSV file; none of a file that is none."""
     try:
         with csv_lines(path) as lines:
             return [name.strip() for name in next(lines, [])]

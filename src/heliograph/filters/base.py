@@ -293,7 +293,7 @@ class HasStates(Protocol):
 
 
 def make_sizes(claim: Claim, like: HasStates, received: int) -> Sizes:
-    """Claim, and the sizes of a filter of the states and inputs of a plant, which receives so many numbers."""
+    """Return claim, and the sizes of a filter of the states and inputs of a plant, which receives so many numbers."""
     return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
 
 

@@ -41,16 +41,16 @@ class SteppedFilter(Protocol):
         """Number of steps that it covers."""
 
     def init(self) -> PyTree:
-        """State before the first row."""
+        """Return the state before the first row."""
 
     def predict(self, state: PyTree, u: ArrayLike, k: Array) -> PyTree:
-        """Prior of a row."""
+        """Return the prior of a row."""
 
     def correct(self, state: PyTree, z: ArrayLike, k: Array) -> tuple[PyTree, Innovation]:
-        """Posterior of a row, and its innovation."""
+        """Return the posterior of a row, and its innovation."""
 
     def after_step(self, state: PyTree, k: Array) -> Estimate:
-        """Estimate of a row."""
+        """Return the estimate of a row."""
 
 
 @readable

@@ -17,7 +17,7 @@ from heliograph.numerics.types import Array, Float
 def gaussian_innovation(
     z: "Float[Array, ' m']", expected: "Float[Array, ' m']", covariance: "Float[Array, 'm m']"
 ) -> "Innovation":
-    """z - expected and its Gaussian log-likelihood; NaN where a component did not arrive.
+    """Return z - expected and its Gaussian log-likelihood; NaN where a component did not arrive.
 
     Args:
         z: measurement (m,), NaN for a component that did not arrive.
@@ -41,7 +41,7 @@ def mixed_innovation(
     total: "Float[Array, 'parts m m']",
     density: "Float[Array, '']",
 ) -> "Innovation":
-    """Mean and covariance of the innovation of a mixture: within its components, and between their means.
+    """Return the mean and covariance of the innovation of a mixture: within its components, and between their means.
 
     Args:
         weight: prior probability (parts,) of each component.

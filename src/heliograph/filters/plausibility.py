@@ -54,7 +54,7 @@ INPUT = "with it the mean loses its digits to rounding"
 
 
 def greatest_distance(dtype: np.dtype) -> float:
-    """Squared distance beyond which an update loses its digits: LIMIT squared, 1 / eps where that is less."""
+    """Return squared distance beyond which an update loses its digits: LIMIT squared, 1 / eps where that is less."""
     return min(LIMIT**2, 1 / float(np.finfo(dtype).eps))
 
 
@@ -139,7 +139,7 @@ class Judgement(NamedTuple):
 
 
 def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
-    """e' S^-1 e of the components that arrived (infinite where S excludes them), and how many did."""
+    """Return e' S^-1 e of the components that arrived (infinite where S excludes them), and how many did."""
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
     present = ~jnp.isnan(value)
     total = jnp.where(present[:, None] & present, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
@@ -209,13 +209,13 @@ def _squared_distances_in_turn(
 
 
 def _is_finite_number(estimates: Estimate, claim: Claim) -> jax.Array:
-    """True if all means are finite numbers, and the covariances too where one is claimed."""
+    """Return whether all means are finite numbers, and the covariances too where one is claimed."""
     finite = ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.mean)))
     return finite if claim == "none" else finite & ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.covariance)))
 
 
 def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
-    """True if all is finite, and no variance is below zero by more than rounding of the covariance before."""
+    """Return whether all is finite, and no variance is below zero by more than rounding of the covariance before."""
     if claim == "none":
         return _is_finite_number(estimates, claim)
     left, whole = jnp.diagonal(jnp.asarray(estimates.covariance)), jnp.diagonal(jnp.asarray(before.covariance))
@@ -244,7 +244,7 @@ def _is_real_array(leaf: Array) -> bool:
 
 
 def _mask_rounded_away(estimates: Estimate) -> jax.Array:
-    """Mask of the states whose deviation is positive but below the rounding of their mean."""
+    """Return the mask of the states whose deviation is positive but below the rounding of their mean."""
     mean = jnp.asarray(estimates.mean)
     variance = jnp.diagonal(jnp.asarray(estimates.covariance))
     unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)

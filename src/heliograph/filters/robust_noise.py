@@ -40,7 +40,7 @@ class NoiseBranches(NamedTuple):
     least: jax.Array
 
     def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
-        """Mean and variance of the mixture, (m,) each."""
+        """Return the mean and variance of the mixture, (m,) each."""
         share = jnp.exp(self.log_share)
         center = jnp.sum(share * self.mean, axis=1)
         return center, jnp.sum(share * (self.variance + (self.mean - center[:, None]) ** 2), axis=1)
@@ -67,7 +67,7 @@ class ReceivedNoise(Module):
     degrees: Vector
 
     def law(self, sensed: jax.Array) -> NoiseBranches:
-        """Mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensed` (p,).
+        """Return the mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensed` (p,).
 
         Branch j of a noise before the gain arrives with mean E[g] m_j and variance
         E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's spread acts on the signal and on the branch's
@@ -199,7 +199,7 @@ def _combine_branches(sensed: Branches, late: Branches) -> tuple[Array, ...]:
 
 
 def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
-    """Degrees of freedom of each output's Student noise; NaN where the noise has another law."""
+    """Return the degrees of freedom of each output's Student noise; NaN where the noise has another law."""
     parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [
         component.degrees * np.ones(component.dimension) if isinstance(component, StudentT) and late is None

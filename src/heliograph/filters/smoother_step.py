@@ -107,7 +107,7 @@ class SmootherStep(Module):
         return after._replace(mean=point.mean + after.through((self.after.mean - before.ahead)[:, None])[:, 0])
 
     def reached(self, point: EarlierState) -> Gaussian:
-        """Mean and covariance of an earlier state given all data up to this step."""
+        """Return the mean and covariance of an earlier state given all data up to this step."""
         now = Columns(point.through(self.after.root), self.after.variances)
         return from_columns(point.mean, join_columns(now, point.noise))
 
@@ -117,7 +117,7 @@ class SmootherStep(Module):
         return replace(self, after=self.after._replace(mean=mean_after), before=before)
 
     def estimate_from(self, law: Gaussian) -> Estimate:
-        """Estimate of the plant's state from the law of the filter's."""
+        """Return the estimate of the plant's state from the law of the filter's."""
         mean, columns = law.mean, law.columns
         if self.projection is not None:
             mean, columns = self.projection @ mean, columns.through(self.projection)

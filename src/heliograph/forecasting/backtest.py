@@ -132,7 +132,7 @@ def backtest(
     truth: Rows = None,
     skip: int = 10,
 ) -> Backtest:
-    """Forecast from each row of a recording, and score what was said against what came: a rolling origin.
+    """Return the forecast from each row of a recording, and score what was said against what came: a rolling origin.
 
     Filters run over the rows once, as by `hg.run`; behind each row they predict as if nothing more arrived, with the
     inputs that the recording has. Scored is what arrived later, and the true states where they are known.
@@ -170,7 +170,7 @@ def backtest(
 
 
 def _with_filter(network: Network) -> set[tuple[str, str]]:
-    """Estimates that are those of a filter, which can be stepped by itself."""
+    """Return the estimates that are those of a filter, which can be stepped by itself."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
     return set(network.places) | central
 
@@ -198,7 +198,7 @@ def _score_filter(target: Target, record: Record, u: np.ndarray, ahead: list[int
 
 
 def _law(moments: Moments, number: int, horizon: int) -> Law:
-    """Law of one number at one horizon, from each row."""
+    """Return the law of one number at one horizon, from each row."""
     means, variances = np.asarray(moments.means), np.asarray(moments.covariances)
     return Law(np.asarray(moments.weights)[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 

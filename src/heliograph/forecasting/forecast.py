@@ -152,7 +152,7 @@ def _moved_alone(network: Network, estimate: Estimate) -> tuple[AbstractFilter, 
 
 
 def _sensor_of(network: Network, node: str) -> AnySensor | None:
-    """The sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary."""
+    """Return the sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary."""
     if node != FUSED:
         single = network.nodes[node]
         return single.sensor if isinstance(single, Node) else None
@@ -175,7 +175,7 @@ def check_covered(filter: AbstractFilter, step: int, count: int) -> None:
 
 
 def _one(target: Target, step: int, ahead: Ahead) -> Forecast:
-    """Forecast of one filter."""
+    """Return the forecast of one filter."""
     outlook, filter = target.outlook, target.outlook.filter
     check_ahead(filter.inputs, ahead, filter, step)
     states, outputs, received = (

@@ -67,7 +67,7 @@ def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: I
 
 
 def _in_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
-    """Horizons as numbers of steps."""
+    """Return the horizons as numbers of steps."""
     if is_whole(horizons):
         return np.arange(1.0, _count(horizons) + 1)
     steps = []
@@ -114,7 +114,7 @@ def _listed(horizons: object) -> list[object]:
 
 
 def _seconds(origin: Origin, one: object) -> float | None:
-    """Seconds ahead of a span of time or a date; None of a number."""
+    """Return the seconds ahead of a span of time or a date; None of a number."""
     if isinstance(one, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
         if unit != "s":
@@ -133,7 +133,7 @@ def _seconds(origin: Origin, one: object) -> float | None:
 def _inputs_of(
     origin: Origin, names: Sequence[str], others: Sequence[str], inputs: Inputs, count: int
 ) -> tuple[np.ndarray, InputsAhead]:
-    """Rows of inputs other than dt, and whether they were given or held."""
+    """Return the rows of inputs other than dt, and whether they were given or held."""
     if isinstance(inputs, str) and inputs != "held":
         raise fail("inputs ahead", 'an array, or "held"', repr(inputs))
     if not others:
@@ -157,7 +157,7 @@ def check_ahead(names: Sequence[str], ahead: Ahead, models: object, step: int) -
 
 
 def _clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
-    """Time of each horizon on the clock of the data."""
+    """Return the time of each horizon on the clock of the data."""
     spacing = 1.0 if continuous else origin.spacing
     if not isinstance(origin.time, np.datetime64):
         return np.asarray(origin.time + (1.0 if np.isnan(spacing) else spacing) * distances)

@@ -64,11 +64,11 @@ class Outlook(Module):
         return Moments(jnp.ones(1), jnp.asarray(estimate.mean)[None], known[None])
 
     def moments(self, state: PyTree) -> Moments:
-        """Moments of the states as they are now, as NumPy arrays."""
+        """Return the moments of the states as they are now, as NumPy arrays."""
         return _now(self, state)
 
     def measured(self, states: Moments, k: jax.Array) -> Moments | None:
-        """Moments of what the sensor would measure, part by part."""
+        """Return the moments of what the sensor would measure, part by part."""
         if self.sensor is None or self.plant is None:
             return None
         plant, sensor, start = at(self.plant, k), at(self.sensor, k), second_moments_at_start(self.plant)
@@ -95,7 +95,7 @@ class Outlook(Module):
 
 
 def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
-    """Outlook of a filter, by the plant and sensor that it believes in, or by these where it does not say."""
+    """Return outlook of a filter, by the plant and sensor that it believes in, or by these where it does not say."""
     premise = filter.premise
     plant = plant if premise is None else premise.plant
     believed = sensor if premise is None or premise.sensor is None else premise.sensor
@@ -116,7 +116,7 @@ def _now(outlook: Outlook, state: PyTree) -> Moments:
 
 
 def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int) -> tuple[Moments | None, ...]:
-    """Moments at each row ahead (rows, K, ...), by native code where it supports the filter."""
+    """Return the moments at each row ahead (rows, K, ...), by native code where it supports the filter."""
     arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
     moments: tuple[Moments | None, ...] = compute_once(_look_ahead, _by_xla, arguments)
     return moments
@@ -134,7 +134,7 @@ _by_xla = quickly_compiled(_look_ahead)
 
 
 def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles) -> Prediction:
-    """Prediction of these moments (horizons, K, ...), its angles between -pi and pi."""
+    """Return the prediction of these moments (horizons, K, ...), its angles between -pi and pi."""
     weights, means, covariances = map(np.asarray, moments)
     variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
     means = nearest(means, means[:, :1], angles)
@@ -149,7 +149,7 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
 
 
 def output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
-    """Claim of outputs: that of the states, by a linear sensor without angles; nominal by any other."""
+    """Return the claim of outputs: that of the states, by a linear sensor without angles; nominal by any other."""
     sensor = first(outlook.sensor)
     plain = isinstance(sensor, LinearSensor) and not sensor.circular
     return filter.claim if plain or filter.claim == "none" else weakest([filter.claim, "nominal"])

@@ -101,7 +101,7 @@ def _starts(target: Target, draws: int, generator: np.random.Generator) -> np.nd
 def _drawn(
     plant: AnyPlant, sensor: AnySensor | None, start: Array, u: Array, keys: jax.Array, step: Array
 ) -> tuple[jax.Array, jax.Array]:
-    """States and outputs of each path (draws, rows, ...)."""
+    """Return the states and outputs of each path (draws, rows, ...)."""
 
     def of_path(x: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draw one path from x: what plant and sensor do over the steps of u, with the draws of this key."""

@@ -94,7 +94,7 @@ class Prediction:
         return np.where(np.isnan(self.deviation), np.nan, self._below(limits))
 
     def _below(self, limits: np.ndarray) -> np.ndarray:
-        """Sum of weight_k P(part k < limit), a part without variance being its mean."""
+        """Return the sum of weight_k P(part k < limit), a part without variance being its mean."""
         away = limits[:, None] - self.part_means
         spread = np.sqrt(self.part_variances)
         certain = np.where(away > 0, np.inf, np.where(away < 0, -np.inf, 0.0))

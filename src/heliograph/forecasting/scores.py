@@ -24,7 +24,7 @@ class Law(NamedTuple):
 
 
 def below(law: Law, values: np.ndarray) -> np.ndarray:
-    """Probability that each lies below what came (rows,): uniform between 0 and 1 where the laws are right."""
+    """Return probability that each lies below what came (rows,): uniform between 0 and 1 where the laws are right."""
     return np.asarray(np.sum(law.weights * ndtr((values[:, None] - law.means) / np.sqrt(law.variances)), axis=1))
 
 
@@ -39,7 +39,7 @@ def log_score(law: Law, values: np.ndarray) -> np.ndarray:
 
 
 def crps(law: Law, values: np.ndarray) -> np.ndarray:
-    """Continuous ranked probability score (rows,), in the unit of what came: the smaller the better.
+    """Return the continuous ranked probability score (rows,), in the unit of what came: the smaller the better.
 
     E|X - z| - E|X - X'| / 2 of independent X and X' of the law; of one Gaussian s (t (2 Phi(t) - 1) + 2 phi(t) -
     pi^(-1/2)) with t = (z - m) / s.
@@ -55,7 +55,7 @@ def crps(law: Law, values: np.ndarray) -> np.ndarray:
 
 
 def _mean_size(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """E|Y| of a Gaussian Y."""
+    """Return E|Y| of a Gaussian Y."""
     deviation = np.sqrt(variance)
     t = mean / deviation
     return np.asarray(mean * (2 * ndtr(t) - 1) + 2 * deviation * np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi))
@@ -69,7 +69,7 @@ class Mean(NamedTuple):
 
 
 def overlapping_mean(values: np.ndarray, horizon: int) -> Mean:
-    """Mean of a series (rows,), NaN where nothing came, and its standard error.
+    """Return the mean of a series (rows,), NaN where nothing came, and its standard error.
 
     Forecasts from neighbouring rows share what happens in between, so errors of horizon h are correlated over h - 1
     rows at least. Var = n^-2 sum_l w_l sum_t d_t d_{t+l} with Bartlett's weights over max(h - 1, 1.3 sqrt n) lags.

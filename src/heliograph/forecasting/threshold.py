@@ -106,7 +106,7 @@ def crossing(
 
 
 def _values(paths: Paths, name: str) -> np.ndarray:
-    """Values of a state or an output along all paths (draws, times)."""
+    """Return the values of a state or an output along all paths (draws, times)."""
     if name in paths.states:
         return paths.x[:, :, paths.states.index(name)]
     if name in paths.outputs:

@@ -151,13 +151,13 @@ def residuals(
 
 
 def _pairs(e: np.ndarray, lag: int) -> np.ndarray:
-    """Products of residuals this far apart, of which both came."""
+    """Return the products of residuals this far apart, of which both came."""
     products = e[lag:] * e[: len(e) - lag]
     return np.asarray(products[~np.isnan(products)])
 
 
 def _autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
-    """r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came."""
+    """Return r_l = sum e_t e_(t+l) / sum e_t^2 over the pairs that came."""
     e = e - np.nanmean(e) if np.any(~np.isnan(e)) else e
     total = np.nansum(e**2)
     return np.array([_pairs(e, lag).sum() / total if total > 0 else np.nan for lag in range(1, lags + 1)])

@@ -78,13 +78,13 @@ class AllReports(AbstractInformedFusion):
 
 
 def lossless_links(nodes: int, n: int) -> ReportModel:
-    """Model of links that deliver what is sent, unchanged and at once."""
+    """Return the model of links that deliver what is sent, unchanged and at once."""
     zero = np.zeros((nodes, n))
     return ReportModel(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
 
 
 def initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
-    """State before the first report, for so many `delays` and `received` numbers per report.
+    """Return the state before the first report, for so many `delays` and `received` numbers per report.
 
     Every error is that of x_0 then, up to a constant; nothing has been sent.
     """
@@ -136,7 +136,7 @@ def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportMo
 
 
 def _square_mean(errors: ErrorMoments) -> Float[jax.Array, " n"]:
-    """E[x_i^2] before any data."""
+    """Return E[x_i^2] before any data."""
     return jnp.asarray(errors.state_mean**2 + jnp.diagonal(errors.state_covariance))
 
 
@@ -175,7 +175,7 @@ def correct_with_reports(
 def _gain_of_reports(
     x: Gaussian, output: Float[jax.Array, "M N"], past: PastReports, present: Bool[jax.Array, " M"]
 ) -> Float[jax.Array, "N M"]:
-    """Gain of what arrived, with quantizers' errors and rounding as noise of each report."""
+    """Return the gain of what arrived, with quantizers' errors and rounding as noise of each report."""
     one, shape = np.eye(past.noise.shape[-1]), past.offset.shape
     terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
     quantized = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
@@ -188,7 +188,7 @@ def _gain_of_reports(
 
 
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
-    """Estimate of x, with the covariance of its error or a bound on it."""
+    """Return the estimate of x, with the covariance of its error or a bound on it."""
     x = take_leading(state.gaussian, n)
     return x.mean, x.covariance if state.spill is None else _young_sum(x.covariance, state.spill[:n, :n])
 
@@ -212,7 +212,7 @@ def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel
 
 
 def _output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
-    """Output matrix of the reports: mean gains on x - e_i now, and on the reports of earlier steps."""
+    """Return the output matrix of the reports: mean gains on x - e_i now, and on the reports of earlier steps."""
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
     now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
@@ -222,7 +222,7 @@ def _output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
 
 
 def _measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Columns:
-    """Columns of K_i S_ij K_j', as many as measurements; S_ij is zero between nodes that share nothing."""
+    """Return the columns of K_i S_ij K_j', as many as measurements; S_ij is zero between nodes that share nothing."""
     nodes, _, m = gain.shape
     each = noise.ndim == 3
     received = _factor_each(jnp.asarray(noise)[None]) if each else columns_of(noise.reshape(nodes * m, nodes * m))
@@ -230,14 +230,14 @@ def _measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Colu
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> Columns:
-    """Factors of the covariance of noises that are independent of each other, of all reports together."""
+    """Return the factors of the covariance of noises that are independent of each other, of all reports together."""
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
     return Columns(_block_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
 
 
 def _block_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
-    """Block-diagonal matrix of these blocks."""
+    """Return the block-diagonal matrix of these blocks."""
     ages, nodes, rows, columns = blocks.shape
     items = jnp.arange(ages * nodes)
     empty = jnp.zeros((len(items), rows, len(items), columns))
@@ -246,7 +246,7 @@ def _block_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array
 
 
 def _cauchy_bound(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
-    """B with (B mu)(B mu)' <= B s diag(D) B' for |mu| <= D, s = sum D over what B uses (Cauchy)."""
+    """Return B with (B mu)(B mu)' <= B s diag(D) B' for |mu| <= D, s = sum D over what B uses (Cauchy)."""
     used = jnp.where(jnp.any(into != 0, axis=0), error, 0.0)
     return jnp.sum(used) * (into * used) @ into.T
 

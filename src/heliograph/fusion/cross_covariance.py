@@ -55,7 +55,7 @@ class ErrorMap(NamedTuple):
     errors: Float[jax.Array, "node n n"]
 
     def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
-        """F zeta of each column."""
+        """Return F zeta of each column."""
         nodes, n, _ = self.errors.shape
         x, e = columns[:n].reshape(n, -1), columns[n:].reshape(nodes, n, -1)
         after = self.errors @ e + self.of_state @ x
@@ -77,7 +77,7 @@ class ErrorStep(NamedTuple):
     received: Array
 
     def noise(self) -> Float[jax.Array, "N N"]:
-        """B Q B' + K E[nu nu'] K', the covariance of what the step adds."""
+        """Return B Q B' + K E[nu nu'] K', the covariance of what the step adds."""
         nodes, n, _ = self.gain.shape
         if self.received.ndim == 4:
             measured = jnp.einsum("iam,imjl,jbl->iajb", self.gain, self.received, self.gain)
@@ -135,7 +135,7 @@ def initial_errors(
 
 
 def error_step(filters: LinearStep, motion: Motion, observation: Observation) -> ErrorStep:
-    """Step of the errors of linear filters; `filters` has a leading axis of nodes."""
+    """Return the step of the errors of linear filters; `filters` has a leading axis of nodes."""
     gain, keep, n = jnp.asarray(filters.gain), filters.keep(), len(motion.shift)
     astray = gain @ _subtract(observation.gain, filters.output)
     moves = _subtract(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
@@ -155,7 +155,7 @@ def error_step(filters: LinearStep, motion: Motion, observation: Observation) ->
 def propagate_state(
     mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"], motion: Motion
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """E x and Cov x after the step."""
+    """Return E x and Cov x after the step."""
     matrix = jnp.asarray(motion.matrix)
     return matrix @ mean + motion.shift, symmetric(propagate_by_mode(matrix, covariance, motion.noise))
 
@@ -177,18 +177,18 @@ class ErrorSources(NamedTuple):
     independent: Float[Array, "node n n"]
 
     def covariances(self) -> Float[Array, "node n n"]:
-        """Cov e_i of each."""
+        """Return Cov e_i of each."""
         return self.shared @ self.shared.swapaxes(-1, -2) + self.independent
 
     def joint(self) -> Float[Array, "node n node n"]:
-        """Cov(e_i, e_j) of all pairs."""
+        """Return Cov(e_i, e_j) of all pairs."""
         count, n, _ = self.shared.shape
         flat = self.shared.reshape(count * n, -1)
         blocks = np.eye(count)[:, None, :, None] * self.independent[:, :, None]
         return (flat @ flat.T).reshape(count, n, count, n) + blocks
 
     def weigh(self, weights: Float[Array, "n node n"]) -> tuple[Float[Array, "n sources"], Float[Array, "n n"]]:
-        """Sources of the sum W e, and the covariance of its independent part."""
+        """Return the sources of the sum W e, and the covariance of its independent part."""
         xp = library(weights, *self)
         independent = xp.einsum("aib,ibc,dic->ad", weights, self.independent, weights)
         return xp.tensordot(weights, self.shared, axes=2), independent
@@ -220,7 +220,7 @@ class SourceFactors(NamedTuple):
 
 
 def initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
-    """Factors before the first step, with room for `sources` more: all is the deviation of x_0."""
+    """Return the factors before the first step, with room for `sources` more: all is the deviation of x_0."""
     nodes, n = errors.bias.shape
     state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))
     return SourceFactors(errors.mean, jnp.tile(state, (1 + nodes, 1)), jnp.zeros((nodes, n, n)))
@@ -245,11 +245,11 @@ def propagate_factors(factors: SourceFactors, step: ErrorStep, k: jax.Array) -> 
 
 
 def _subtract(a: Array, b: Array) -> jax.Array:
-    """a - b, zero where it is rounding, so that a filter with the right model has no error that depends on x."""
+    """Return a - b, zero where it is rounding, so that a filter with the right model has no error that depends on x."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     return jnp.where(jnp.abs(a - b) <= rounding(SAME, a) * (jnp.abs(a) + jnp.abs(b)), 0.0, a - b)
 
 
 def _apply(matrix: Array, vector: Array) -> jax.Array:
-    """Product of matrix and vector for each node."""
+    """Return the product of matrix and vector for each node."""
     return jnp.einsum("iab,ib->ia", matrix, vector)

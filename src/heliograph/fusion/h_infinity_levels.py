@@ -7,7 +7,7 @@ from heliograph.numerics.types import ArrayLike, Float
 
 
 def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
-    """Weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
+    """Return the weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
 
     By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
     linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
@@ -26,7 +26,7 @@ def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
 
 
 def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"]) -> float:
-    """sum_i c_i gamma_i: the level of a weighted fusion without quantization, for disturbances of equal norm.
+    """Return sum_i c_i gamma_i: the level of a weighted fusion without quantization, for disturbances of equal norm.
 
     The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
     the gamma_i, `weights` (N,) the c_i.

@@ -97,7 +97,7 @@ class AbstractJointWeights(AbstractInformedFusion):
         raise unwritten(self, "arrived")
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
+        """Return the weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
         chosen = self.arrived(believed.joint, believed.present)
@@ -136,11 +136,11 @@ class MatrixWeights(AbstractJointWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
-        """Matrix weights (n, node, n)."""
+        """Return the matrix weights (n, node, n)."""
         return matrix_weights(joint)
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
-        """Weights of those that are present."""
+        """Return the weights of those that are present."""
         return solve_regularised_weights(joint, present)
 
 
@@ -158,15 +158,15 @@ class DiagonalWeights(AbstractJointWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
-        """Diagonal weights (n, node, n)."""
+        """Return the diagonal weights (n, node, n)."""
         return diagonal_weights(joint)
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
-        """Weights of those that are present."""
+        """Return the weights of those that are present."""
         return solve_regularised_weights_by_component(joint, present)
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
+        """Return weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
         if believed.joint is None or self.with_mean or len(believed.present) > WRITTEN:
             return super().neighbour_weights(believed)
         chosen = component_weights(believed.joint, believed.present)
@@ -190,9 +190,9 @@ class ScalarWeights(AbstractJointWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
-        """Scalar weights times the identity (n, node, n)."""
+        """Return the scalar weights times the identity (n, node, n)."""
         return scalar_weights(joint)
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
-        """Weights of those that are present."""
+        """Return the weights of those that are present."""
         return solve_regularised_scalar_weights(joint, present)

@@ -23,7 +23,7 @@ def intersect(
     information: Float[jax.Array, "count n n"],
     weights: Float[jax.Array, " count"],
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, from information matrices J.
+    """Return x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, from information matrices J.
 
     Differences of the means are used, since the matrices that multiply them have lost the digits that nearly dependent
     components cost: the means themselves may be millions of deviations from zero.
@@ -37,7 +37,7 @@ _Progress = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # weights, slack,
 
 
 def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[jax.Array, " count"]:
-    """Weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
+    """Return the weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
 
     The gradient is g_k = -tr(P J_k P), and max_k tr(P J_k P) - tr P bounds the excess over the minimum (convexity); the
     iteration stops when this certificate is below GAP tr P.
@@ -126,7 +126,7 @@ def _longest_step(value: Float[jax.Array, " count"], move: Float[jax.Array, " co
 def intersect_inversely(
     a: Float[jax.Array, " n"], p: Float[jax.Array, "n n"], b: Float[jax.Array, " n"], q: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Inverse covariance intersection of (a, P) and (b, Q), with the weight w of least trace.
+    """Return the inverse covariance intersection of (a, P) and (b, Q), with the weight w of least trace.
 
     With C = (w P + (1 - w) Q)^-1 and V = (P^-1 + Q^-1 - C)^-1, tr V is convex in w, and its slope is
     -tr(V C (P - Q) C V). The weight is where the slope changes its sign, which is known to rounding; the least trace

@@ -137,7 +137,7 @@ def weigh_covariance(
 def solve_regularised_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Unbiased weights of least C (P + ridge D) C' for the estimates that arrived; the ridge keeps them bounded.
+    """Return unbiased weights of least C (P + ridge D) C' for the estimates that arrived; the ridge keeps them bounded.
 
     C = (E' U^-1 E)^-1 E' U^-1, E = [I; ...; I], U = P + RIDGE D, D the mean of the variances: the best weights of
     estimates with a little independent error more. Without it weights of nearly equal estimates, such as those of the
@@ -161,7 +161,7 @@ def solve_regularised_weights(
 def solve_regularised_weights_by_component(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Diagonal weights of those that are present: the best for each component of the state by itself."""
+    """Return the diagonal weights of those that are present: the best for each component of the state by itself."""
     degree, n = joint.shape[:2]
     if degree <= WRITTEN:
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
@@ -171,7 +171,7 @@ def solve_regularised_weights_by_component(
 def component_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "degree n"]:
-    """Diagonals c_i of the weights of each component by itself."""
+    """Return the diagonals c_i of the weights of each component by itself."""
     component = jnp.stack([joint[:, a, :, a] for a in range(joint.shape[1])])
     return jax.vmap(_weights_of_component, in_axes=(0, None), out_axes=1)(component, present.astype(joint.dtype))
 
@@ -179,7 +179,7 @@ def component_weights(
 def _weights_of_component(
     joint: Float[jax.Array, "degree degree"], there: Float[jax.Array, " degree"]
 ) -> Float[jax.Array, " degree"]:
-    """c = U^-1 1 / 1' U^-1 1 over those that are there, by the factor of U, as `solve_regularised_weights`."""
+    """Return c = U^-1 1 / 1' U^-1 1 over those that are there, by the factor of U, as `solve_regularised_weights`."""
     mean = jnp.sum(there * jnp.diagonal(joint)) / jnp.sum(there)
     # U, with those that are absent apart.
     apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
@@ -190,7 +190,7 @@ def _weights_of_component(
 def weigh_covariance_by_component(
     weights: Float[jax.Array, "degree n"], joint: Float[jax.Array, "degree n degree n"]
 ) -> Float[jax.Array, "n n"]:
-    """Covariance C P C' of diagonal weights, a sum over senders at a time."""
+    """Return the covariance C P C' of diagonal weights, a sum over senders at a time."""
     sums = jnp.einsum("iajb,jb->iab", joint, weights)
     return symmetric(jnp.einsum("ia,iab->ab", weights, sums))
 

@@ -107,12 +107,12 @@ Parameter = Float[Array, "..."]  # of all components, or of each
 
 
 def segment_of(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """Index, from 0, of the segment of [-amplitude, amplitude] that holds x."""
+    """Return the index, from 0, of the segment of [-amplitude, amplitude] that holds x."""
     return jnp.clip(jnp.floor((x / amplitude + 1) * levels / 2), 0, levels - 1)
 
 
 def midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """Midpoint of a segment; exactly zero for the middle one of an odd number.
+    """Return the midpoint of a segment; exactly zero for the middle one of an odd number.
 
     The quotient comes first: the product with many levels could overflow.
     """
@@ -192,7 +192,7 @@ class UniformQuantizer(AbstractQuantizer):
         )
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """Half of a segment's length."""
+        """Return half of a segment's length."""
         half = self.scale * self.amplitude / self.levels
         bound: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
         return bound
@@ -201,7 +201,7 @@ class UniformQuantizer(AbstractQuantizer):
 def _uniform_quantize(
     x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
 ) -> Quantized:
-    """Midpoint of the segment that holds x; d for values from d on and -d below -d, without a bound there."""
+    """Return midpoint of the segment that holds x; d for values from d on and -d below -d, without a bound there."""
     scaled = x / scale
     inside = midpoint(segment_of(scaled, amplitude, levels), amplitude, levels)
     value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, inside))
@@ -348,11 +348,11 @@ class EscapeQuantizer(AbstractQuantizer):
         return after, Quantized(value, error, known & beyond, escapes + 1)
 
     def _is_restart(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
-        """True where the value of this number is sent from the first amplitude again."""
+        """Return whether the value of this number is sent from the first amplitude again."""
         return number == 0 if self.interval is None else number % self.interval == 0
 
     def _present_amplitude(self, state: UplinkState, restart: Bool[Array, "*n"]) -> Float[Array, "*n"]:
-        """Amplitude for the present value: the first one at a restart, else that of the state."""
+        """Return the amplitude for the present value: the first one at a restart, else that of the state."""
         return jnp.where(restart, self.amplitude, state.amplitude)
 
     def claim(self, claim: Claim) -> Claim:

@@ -83,7 +83,7 @@ class EventSending(AbstractQuantizer):
         )
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """Thresholds as the error bound, where silence is interpreted; zero otherwise."""
+        """Return the thresholds as the error bound, where silence is interpreted; zero otherwise."""
         bound = library(self.threshold).broadcast_to(self.threshold, (n,))
         return bound if self.announced else np.zeros(n)
 
@@ -136,11 +136,11 @@ class ReportLink(Module):
             raise fail("channel of a report link", "one that forgets", f"{type(first(self.channel)).__name__}")
 
     def delivers(self, n: int) -> bool:
-        """True if every report of n numbers that is sent arrives as it is, after a fixed delay."""
+        """Return whether every report of n numbers that is sent arrives as it is, after a fixed delay."""
         return bool(np.max(self.delay) == 1) and (self.channel is None or same(self.channel, perfect(n)))
 
     def received(self, n: int) -> int:
-        """Number of received components of a report of n."""
+        """Return the number of received components of a report of n."""
         return n if self.channel is None else int(first(self.channel).outputs)
 
 

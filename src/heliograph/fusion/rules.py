@@ -65,7 +65,7 @@ class AbstractFusion(Module):
         """Raise ValueError if the rule cannot fuse this number of estimates."""
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Claim of the fused covariance, from the claims of the inputs."""
+        """Return the claim of the fused covariance, from the claims of the inputs."""
         raise unwritten(self, "claim")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -90,12 +90,12 @@ class AbstractFusion(Module):
         return self
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Weights of the neighbours' estimates that arrived, and the covariance of what is fused."""
+        """Return the weights of the neighbours' estimates that arrived, and the covariance of what is fused."""
         raise fail("fusion between neighbours", "a rule such as CovarianceIntersection() or MatrixWeights()",
                    type(self).__name__)  # fmt: skip
 
     def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
-        """Gains of one node's step: fuse what was believed, predict once, correct with what was measured."""
+        """Return the gains of one node's step: fuse what was believed, predict once, correct with what was measured."""
         return gains_of(self.neighbour_weights(believed), step)
 
 
@@ -147,7 +147,7 @@ class AbstractIntersection(AbstractFusion):
         return _combine_claims(claims, "upper")
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Weights on the simplex of estimates with these P_i and P_i^-1."""
+        """Return the weights on the simplex of estimates with these P_i and P_i^-1."""
         raise unwritten(self, "weights_of")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -168,7 +168,7 @@ class CovarianceIntersection(AbstractIntersection):
     """
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Weights of least trace."""
+        """Return the weights of least trace."""
         return trace_optimal_weights(information)
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
@@ -183,7 +183,7 @@ class EqualIntersection(AbstractIntersection):
     """
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Equal weights."""
+        """Return the equal weights."""
         return jnp.full(len(information), 1 / len(information))
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
@@ -246,7 +246,7 @@ class WeightedFusion(AbstractFusion):
         return weakest([*claims, "upper"])
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Sum with the given weights."""
+        """Return the sum with the given weights."""
         weights = jnp.asarray(self.weights)
         return weights @ means, jnp.tensordot(weights, covariances, axes=1)
 
@@ -273,7 +273,7 @@ class InverseCovarianceIntersection(AbstractFusion):
 
 
 def _combine_claims(claims: list[Claim], strongest: Claim) -> Claim:
-    """Weakest claim, for rules whose weights come from covariances."""
+    """Return the weakest claim, for rules whose weights come from covariances."""
     if "none" in claims:
         raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")
     return weakest([*claims, strongest])
@@ -374,11 +374,11 @@ class Fusion(Module):
         return spread_over_names("report links", ReportLink() if self.uplink is None else self.uplink, nodes)
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
-        """Quantizers of these nodes' reports, which do not vary over time; an empty list without."""
+        """Return the quantizers of these nodes' reports, which do not vary over time; an empty list without."""
         return [quantizer for quantizer in self._quantizers(nodes) if isinstance(quantizer, AbstractQuantizer)]
 
     def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
-        """Quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
+        """Return the quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
 
         Raises:
             ValueError: quantizers of different kinds.
@@ -386,7 +386,7 @@ class Fusion(Module):
         return None if self.quantizer is None else stack(self._quantizers(nodes))
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Claim of the fused covariance, from the claims of the filters."""
+        """Return the claim of the fused covariance, from the claims of the filters."""
         if self.quantizer is None:
             return self.rule.claim(claims)
         quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer

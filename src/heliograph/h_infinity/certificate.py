@@ -243,14 +243,14 @@ def _drop_absent(
 
 
 def _complete_multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
-    """Multipliers of f, f~, h, h~ from 2 or 4 for each step."""
+    """Return the multipliers of f, f~, h, h~ from 2 or 4 for each step."""
     if given.shape[1] not in (2, 4):
         raise fail("multipliers", "2 or 4 for each step", given.shape[1])
     return given if given.shape[1] == 4 else np.repeat(given, 2, axis=1)
 
 
 def _largest_eigenvalue(phi: Float[np.ndarray, "q q"]) -> float:
-    """Largest eigenvalue of a symmetric matrix."""
+    """Return the largest eigenvalue of a symmetric matrix."""
     return float(np.linalg.eigvalsh((phi + phi.T) / 2)[-1])
 
 
@@ -263,7 +263,7 @@ def is_negative(phi: Float[np.ndarray, "q q"]) -> bool:
 
 
 def _find_scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
-    """Largest eigenvalue after scaling the diagonal to -1; infinite where it is not negative."""
+    """Return the largest eigenvalue after scaling the diagonal to -1; infinite where it is not negative."""
     diagonal = np.diagonal(phi)
     if not np.all(diagonal < 0):
         return np.inf

@@ -93,7 +93,7 @@ def _best_gain(
 
 
 def _state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
-    """Next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
+    """Return the next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
 
     |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do.
     """

@@ -186,7 +186,7 @@ def horizon_design(
 def _first_failing(
     steps: Sequence[StepMatrices], solved: Sequence[Unknowns], weights: Sequence[np.ndarray], square: float
 ) -> int | None:
-    """Number of the first step, with these weights before each, at which an inequality does not hold."""
+    """Return the number of the first step, with these weights before each, at which an inequality does not hold."""
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
         fixed = step.target - square * step.energy
         fixed[: len(weights[k]), : len(weights[k])] -= weights[k]
@@ -245,12 +245,12 @@ class _Recursion:
 
 
 def _coupled_initial_weight(start: Float[np.ndarray, "w w"] | None, n: int) -> Float[np.ndarray, "w w"] | None:
-    """Initial weight if it couples x and e, as those of later steps do not; else None."""
+    """Return the initial weight if it couples x and e, as those of later steps do not; else None."""
     return None if start is None or not np.any(start[:n, n:]) else start
 
 
 def _checked_weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
-    """Initial weight diag(P1, P2) of these sizes; raise ValueError for another shape."""
+    """Return the initial weight diag(P1, P2) of these sizes; raise ValueError for another shape."""
     return symmetric_weight("initial weight P_0", array("initial weight P_0", initial, (2 * n, 2 * n)))
 
 
@@ -265,12 +265,12 @@ def _inequality_holds(
 
 
 def _gain_correction(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:
-    """K - K0 = P2^-1 Y."""
+    """Return K - K0 = P2^-1 Y."""
     return np.asarray(np.linalg.solve(unknowns.error, unknowns.product))
 
 
 def _next_weight(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
-    """diag(P1, P2)."""
+    """Return diag(P1, P2)."""
     zero = np.zeros_like(unknowns.state)
     return np.block([[unknowns.state, zero], [zero, unknowns.error]])
 
@@ -284,7 +284,7 @@ def _unsolved_design(system: GrowthSystem, separate: bool, level: float, status:
 
 
 def _bisect_level(works: Callable[[float], bool], guess: float) -> float | None:
-    """Smallest level that works, to SEARCH_ACCURACY, by doubling and bisection of its logarithm."""
+    """Return the smallest level that works, to SEARCH_ACCURACY, by doubling and bisection of its logarithm."""
     high = guess
     while not works(high):
         high *= 2.0

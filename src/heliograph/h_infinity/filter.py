@@ -72,7 +72,7 @@ class HInfinityFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Pending) -> Estimate:
-        """Mean of the state, without a covariance."""
+        """Return the mean of the state, without a covariance."""
         n = state.mean.shape[0]
         return Estimate(state.mean, jnp.full((n, n), jnp.nan), self.claim)
 

@@ -199,7 +199,7 @@ class _SlopesAndRatios:
         self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
-        """Norm of the Jacobian at each point; infinite where it is no number."""
+        """Return the norm of the Jacobian at each point; infinite where it is no number."""
         values = np.asarray(self.jacobian(points))
         finite = np.isfinite(values).all(axis=(-2, -1))
         safe = np.where(finite[:, None, None], values, 0.0)
@@ -210,7 +210,7 @@ class _SlopesAndRatios:
         return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
 
     def ratio(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
-        """Ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
+        """Return the ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
         apart = distance > NEARBY * self.width / 2
@@ -218,7 +218,7 @@ class _SlopesAndRatios:
         return np.where(apart, np.where(np.isfinite(change), change, np.inf) / np.where(apart, distance, 1), 0)
 
     def at_zero(self, n: int) -> float:
-        """Size |f(0)|, infinite where it is no number."""
+        """Return the size |f(0)|, infinite where it is no number."""
         size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
         return size if np.isfinite(size) else np.inf
 
@@ -246,7 +246,7 @@ def _make_finding(
     pairs: np.ndarray,
     differences: bool,
 ) -> GrowthFinding:
-    """Finding from the points and pairs that a search ended at, with a bound unless it is refuted."""
+    """Return the finding from the points and pairs that a search ended at, with a bound unless it is refuted."""
     slopes, ratios = tools.slope(points), tools.ratio(pairs)
     best, pair = int(np.argmax(slopes)), int(np.argmax(ratios))
     x, y = np.split(pairs[pair], 2)
@@ -267,7 +267,7 @@ def _climb_at_random(
     high: Float[np.ndarray, "n"],
     random: np.random.Generator,
 ) -> Float[np.ndarray, "climbers n"]:
-    """The best starts, each moved to the best of random moves around it, again and again, inside the box."""
+    """Return the best starts, each moved to the best of random moves around it, again and again, inside the box."""
     best = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
     size = (high - low) / 2
     for _ in range(ROUNDS):
@@ -347,7 +347,7 @@ def _bound_slopes(
 
 
 def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every box in two, across its widest side, in shares of the whole box's."""
+    """Return every box in two, across its widest side, in shares of the whole box's."""
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))
     middle = (low[rows, sides] + high[rows, sides]) / 2

@@ -65,7 +65,7 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
 
 
 def point_interval(value: object) -> Interval:
-    """Interval that holds a single value."""
+    """Return the interval that holds a single value."""
     array = np.asarray(value)
     return Interval(array, array)
 
@@ -80,7 +80,7 @@ def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
 
 
 def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
-    """Interval of an operation's result."""
+    """Return the interval of an operation's result."""
     name, params = equation.primitive.name, equation.params
     # arithmetic, and functions of a single number
     if name in ARITHMETIC:
@@ -118,7 +118,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
 
 
 def _decide(interval: Interval, continuous: bool) -> Interval:
-    """Interval of a decision, refused where it is open and the function has to be continuous."""
+    """Return the interval of a decision, refused where it is open and the function has to be continuous."""
     if continuous and not np.array_equal(interval.low, interval.high):
         raise UnknownError("a decision that depends on where in the region x is")
     return interval
@@ -138,7 +138,7 @@ def _bound(equation: Any, ends: list[Numbers]) -> list[Numbers]:
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
-    """Interval of truth values of a comparison of a and b."""
+    """Return the interval of truth values of a comparison of a and b."""
     if name in ("gt", "ge"):
         return _compare({"gt": "lt", "ge": "le"}[name], b, a)
     if name == "ne":
@@ -153,7 +153,7 @@ def _compare(name: str, a: Interval, b: Interval) -> Interval:
 
 
 def _select_case(x: list[Interval]) -> Interval:
-    """Interval of cases[which]: where that is open, from the lowest of the possible cases to the highest."""
+    """Return the interval of cases[which]: where that is open, from the lowest of the possible cases to the highest."""
     which, cases = x[0], x[1:]
     lows, highs = [np.broadcast_arrays(*ends) for ends in ([c.low for c in cases], [c.high for c in cases])]
     first, last = which.low.astype(int), which.high.astype(int)
@@ -202,7 +202,7 @@ def _absolute(a: Interval) -> Interval:
 def _rising(
     function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
-    """Interval version of a function that never falls, whose values stay between `low` and `high`."""
+    """Return the interval version of a function that never falls, whose values stay between `low` and `high`."""
 
     def call(a: Interval) -> Interval:
         values = round_outward(function(a.low), function(a.high), ULPS)
@@ -212,7 +212,7 @@ def _rising(
 
 
 def _cosine(a: Interval) -> Interval:
-    """Interval of cos: 1 if an even multiple of pi is inside or a hair outside, -1 if an odd one is."""
+    """Return the interval of cos: 1 if an even multiple of pi is inside or a hair outside, -1 if an odd one is."""
     ends = np.cos(a.low), np.cos(a.high)
     cosine = round_outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
@@ -231,7 +231,7 @@ def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
 
 
 def _dot(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
-    """Interval of a contraction: products first, then their sum."""
+    """Return the interval of a contraction: products first, then their sum."""
     (left, right), (left_batch, right_batch) = dimensions
 
     def laid(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:

@@ -58,7 +58,7 @@ def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
 def all_multipliers(
     system: GrowthSystem, given: Float[np.ndarray, "*steps present"], separate: bool
 ) -> Float[np.ndarray, "*steps count"]:
-    """Multipliers with zeros for functions that were left out, in the order f, f~, h, h~ or f, h."""
+    """Return the multipliers with zeros for functions that were left out, in the order f, f~, h, h~ or f, h."""
     items = 2 if separate else 1
     present = [not growth.absent for growth in (system.growth, system.output_growth) for _ in range(items)]
     full = np.zeros((*given.shape[:-1], len(present)))
@@ -69,7 +69,7 @@ def all_multipliers(
 def _matrices_of_step(
     system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool
 ) -> StepMatrices:
-    """Matrices of step k."""
+    """Return the matrices of step k."""
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y = system.channel[k], system.states, system.output.shape[1]
     w, h = 0 if system.growth.absent else n, 0 if system.output_growth.absent else y
@@ -100,7 +100,7 @@ def _matrices_of_step(
 
 
 def _growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
-    """sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta."""
+    """Return sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta."""
     diagonal = np.zeros(q)
     for value, argument, constant in parts:
         diagonal[value] -= 1.0
@@ -109,7 +109,7 @@ def _growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.nd
 
 
 def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
-    """Quadratic form E[V_next] + sum_i lambda_i N_i of eta, linear in the unknowns."""
+    """Return the quadratic form E[V_next] + sum_i lambda_i N_i of eta, linear in the unknowns."""
     X, E, U = step.state, step.error, step.received
     p1, p2, Y, Z, multipliers = unknowns
     cross = E.T @ Y @ U
@@ -152,7 +152,7 @@ class UnknownsLayout(NamedTuple):
 
 
 def _from_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
-    """Symmetric matrix (n, n) of the entries of its lower triangle."""
+    """Return the symmetric matrix (n, n) of the entries of its lower triangle."""
     matrix = np.zeros((n, n))
     rows, columns = _triangle_places(n)
     matrix[rows, columns] = matrix[columns, rows] = entries
@@ -189,7 +189,7 @@ def linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
 
 
 def weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
-    """Linear map from the vector of unknowns to diag(P1, P2), written row by row."""
+    """Return the linear map from the vector of unknowns to diag(P1, P2), written row by row."""
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     upper, lower = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
     return np.array([(np.kron(upper, u.state) + np.kron(lower, u.error)).ravel() for u in units]).T
@@ -198,7 +198,7 @@ def weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
 def independent_parts(
     step: StepMatrices, forms: LinearForms, start: Float[np.ndarray, "w w"] | None = None
 ) -> list[Int[np.ndarray, "_"]]:
-    """Index sets of eta that Phi never couples: a smaller inequality for each says the same.
+    """Return the index sets of eta that Phi never couples: a smaller inequality for each says the same.
 
     `start`: the weight before the step, where it is not diag(P1, P2).
     """
@@ -226,7 +226,7 @@ class Coordinates(NamedTuple):
     plain: bool
 
     def ratio(self, k: int) -> tuple[float, float]:
-        """Sizes of x and e, the larger one 1, where they are numbers; (1, 1) where S1 and S2 are matrices."""
+        """Return sizes of x and e, the larger one 1, where they are numbers; (1, 1) where S1 and S2 are matrices."""
         if self.plain:
             return 1.0, 1.0
         x, e = float(self.states[k, 0, 0]), float(self.states[k, -1, -1])
@@ -242,17 +242,17 @@ class Coordinates(NamedTuple):
         return _symmetrise(self.states[0].T @ weight @ self.states[0]) / self.unit**2
 
     def gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
-        """Gain of step k in the user's units."""
+        """Return the gain of step k in the user's units."""
         n = len(scaled)
         return np.asarray(self.states[k + 1, n:, n:] @ scaled / self.received[k])
 
     def multipliers(self, unknowns: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
-        """Multipliers of step k in the user's units."""
+        """Return the multipliers of step k in the user's units."""
         return np.asarray(self.unit**2 * unknowns.multipliers / self.forms[k])
 
 
 def _symmetrise(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
-    """(A + A') / 2."""
+    """Return (A + A') / 2."""
     return np.asarray((a + a.T) / 2)
 
 
@@ -287,12 +287,12 @@ def scale_steps(
 
 
 def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Power of 4 nearest to a size, by which numbers are scaled without rounding."""
+    """Return the power of 4 nearest to a size, by which numbers are scaled without rounding."""
     return np.asarray(4.0 ** np.round(np.log(size) / np.log(4.0)))
 
 
 def _scales_of_errors(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
-    """Scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
+    """Return scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
     if plain:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
     return np.diag(
@@ -309,13 +309,13 @@ def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray
 
 
 def _powers_of_four_near(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Powers of 4 near the sizes; a component of size zero takes the smallest of the others."""
+    """Return the powers of 4 near the sizes; a component of size zero takes the smallest of the others."""
     positive = size[size > 0]
     return _nearest_power_of_four(np.where(size > 0, size, positive.min() if positive.size else 1.0))
 
 
 def _signal_covariance(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """Covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
+    """Return the covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
     n, y, q = system.states, system.output.shape[1], len(step.energy)
     total, at = np.zeros((q, q)), 2 * n
     total[:n, :n], total[n:at, n:at] = x, e
@@ -331,7 +331,7 @@ def _signal_covariance(system: GrowthSystem, k: int, step: StepMatrices, x: np.n
 def _propagate(
     step: StepMatrices, spread: np.ndarray, given: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Covariances of x+, of e+ with the given or the best gain and of what is received, and that gain."""
+    """Return the covariances of x+, of e+ with the given or the best gain and of what is received, and that gain."""
     received = step.received @ spread @ step.received.T + np.einsum(
         "jai,ik,jbk->ab", step.spreads, spread, step.spreads
     )
@@ -370,7 +370,7 @@ def _rescale_step(
     forms: np.ndarray,
     nominal: np.ndarray,
 ) -> StepMatrices:
-    """Step in scaled coordinates, with errors about the nominal gain."""
+    """Return the step in scaled coordinates, with errors about the nominal gain."""
     n = step.state.shape[0]
     return StepMatrices(
         np.linalg.solve(after[:n, :n], step.state @ unit),

@@ -141,7 +141,7 @@ def growth_system(
 def _repeat_over(
     steps: int, name: str, value: Varying, shape: tuple[int | None, ...]
 ) -> Float[np.ndarray, "steps ..."]:
-    """Matrix of every step, (steps, *shape)."""
+    """Return the matrix of every step, (steps, *shape)."""
     if not isinstance(value, OverTime):
         matrix: np.ndarray = array(name, value, shape)
         return np.broadcast_to(matrix, (steps, *matrix.shape))
@@ -152,7 +152,7 @@ def _repeat_over(
 
 
 def _moments_of_links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
-    """Joint moments of the channel's gain and noise sources at every step; refuse channels that remember."""
+    """Return the joint moments of the channel's gain and noise sources at every step; refuse channels that remember."""
     check_maps("channel", [first(channel)])
     if first(channel).remembers:
         expected = (
@@ -170,7 +170,7 @@ def _moments_of_links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]
 
 
 def _check_growth(steps: int, name: str, value: Constants) -> Growth:
-    """Growth constants at every step from a number, or from a pair (of the function, of its differences)."""
+    """Return the growth constants at every step from a number, or from a pair (of the function, of its differences)."""
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
         raise fail(name, "a number, or a pair (of the function, of its differences)", value)
@@ -182,7 +182,7 @@ def _check_growth(steps: int, name: str, value: Constants) -> Growth:
 
 
 def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
-    """Initial weight (2n, 2n) from a number or a positive definite matrix."""
+    """Return the initial weight (2n, 2n) from a number or a positive definite matrix."""
     name, size = "initial weight", 2 * n
     single = rank(name, value) == 0
     matrix: np.ndarray = scalar(name, value) * np.eye(size) if single else array(name, value, (size, size))
@@ -207,6 +207,6 @@ def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float
 
 
 def smallest_eigenvalue(matrix: Float[np.ndarray, "w w"], units: Float[np.ndarray, "w"] | None = None) -> float:
-    """Smallest eigenvalue after scaling the diagonal to 1 or -1, so that units do not decide its sign."""
+    """Return the smallest eigenvalue after scaling the diagonal to 1 or -1, so that units do not decide its sign."""
     unit = standard_deviations(matrix) if units is None else units
     return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])

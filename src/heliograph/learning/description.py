@@ -203,7 +203,7 @@ class Description:
         return self.at({parameter.name: plain_number(parameter.start) for parameter in self.parameters.every})
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
-        """Network at a point (p,) of the line, of plain numbers."""
+        """Return the network at a point (p,) of the line, of plain numbers."""
         return self.at(self.parameters.known(x))
 
 

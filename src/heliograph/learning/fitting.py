@@ -82,7 +82,7 @@ class Fit:
         return tuple(row for solution in reversed(self.solutions) for row in solution.rows())
 
     def rows(self, method: Method = "cosines", form: Form | None = None, level: float = LEVEL) -> tuple[Row, ...]:
-        """Table of one form with intervals by another method.
+        """Return the table of one form with intervals by another method.
 
         Args:
             method: "cosines" (the default) and "bartlett" allow for scores that are correlated over time, as they are
@@ -130,7 +130,7 @@ class Fit:
         )
 
     def __str__(self) -> str:
-        """Table and sentences as text."""
+        """Return the table and sentences as text."""
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})  ({row.form})" for row in self.table]
         late = [f"{node}: {delays}" for node, delays in self.delays.items()]
@@ -229,7 +229,7 @@ def _search_forms(
 
 
 def _rows_and_delays(recording: Any) -> tuple[object, dict[str, Delays]]:
-    """Rows of tables of events, and the laws of their delays by node; other recordings are rows."""
+    """Return the rows of tables of events, and the laws of their delays by node; other recordings are rows."""
     several = recording if isinstance(recording, list) else [recording]
     tables = [table for table in several if hasattr(table, "lateness")]
     if not tables:
@@ -243,7 +243,7 @@ def _rows_and_delays(recording: Any) -> tuple[object, dict[str, Delays]]:
 
 
 def _choose_starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
-    """Starts at which the likelihood is finite: the given one, and others around it.
+    """Return the starts at which the likelihood is finite: the given one, and others around it.
 
     Raises:
         ValueError: a start that is impossible, or a number on which nothing depends.
@@ -285,7 +285,7 @@ def _report_climbs(surface: Surface, say: Progress) -> Callable[[Maximum], None]
 
 
 def _describe_climb(fitted: Fit) -> list[str]:
-    """Sentences on searches that were stopped, did not converge, or ended below the best."""
+    """Return the sentences on searches that were stopped, did not converge, or ended below the best."""
     sentences = []
     if fitted.stopped:
         sentences.append("Stopped before the end: this is the best so far.")
@@ -303,7 +303,7 @@ def _describe_climb(fitted: Fit) -> list[str]:
 
 
 def _describe_boundaries(best: Solution) -> list[str]:
-    """Sentences on numbers at the end of their domain."""
+    """Return the sentences on numbers at the end of their domain."""
     return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
 
 

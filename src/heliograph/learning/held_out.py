@@ -109,7 +109,7 @@ def compare_filters(
 def transform_held_out(
     network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Uniformity]:
-    """Probability integral transforms of each node: by its laws where known, else by its first filter."""
+    """Return the probability integral transforms of each node: by its laws where known, else by its first filter."""
     uniform = []
     for name, z in measurements.items():
         of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
@@ -122,7 +122,7 @@ def transform_held_out(
 
 
 def _integrate_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
-    """Transforms of measurements by the laws of its gains in full; None of laws without nodes or with memory."""
+    """Return transforms of measurements by the laws of its gains in full; None of laws without nodes or with memory."""
     parts = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in parts) or first(node.channel).remembers:
         return None

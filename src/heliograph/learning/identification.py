@@ -56,11 +56,11 @@ class Identifiability:
         return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
 
     def at(self, solution: "Solution") -> "Identifiability":
-        """Identifiability with estimates and intervals of what is identified."""
+        """Return the identifiability with estimates and intervals of what is identified."""
         return replace(self, sentences=describe_unidentified(self, solution))
 
     def __str__(self) -> str:
-        """Sentences, a line for each."""
+        """Return the sentences, a line for each."""
         return "\n".join(self.sentences) or "All free numbers are identified."
 
 
@@ -95,7 +95,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
 
 def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
-    """Identifiability by a recording, at three points around a start."""
+    """Return the identifiability by a recording, at three points around a start."""
     points = _points_around(start, seed)
     late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
@@ -123,7 +123,7 @@ def _judge_identifiability(parameters: Parameters, points: list[np.ndarray], ran
 
 
 def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
-    """Sentences on what is not identified, and on what is in its place."""
+    """Return the sentences on what is not identified, and on what is in its place."""
     names = identifiability.parameters.coordinates
     lines = [_describe_group(identifiability.parameters, group, solution) for group in identifiability.groups]
     if solution is not None and any(
@@ -173,7 +173,7 @@ def _count_in_words(count: int, what: str) -> str:
 def _format_interval(
     parameters: Parameters, group: Confounded, row: np.ndarray, solution: "Solution | None", log: bool
 ) -> str:
-    """Interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum."""
+    """Return the interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum."""
     if solution is None or not all(solution.active[i] for i in group.places):
         return ""
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)

@@ -9,13 +9,13 @@ from heliograph.numerics.types import Bool, Float
 
 
 def long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
-    """Standard deviation of the sum over the root of the length, by Bartlett's weights."""
+    """Return the standard deviation of the sum over the root of the length, by Bartlett's weights."""
     total = bartlett([values[:, None] - values.mean()]).covariance
     return float(np.sqrt(max(total[0, 0], 0.0) / len(values)))
 
 
 def mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float, float]:
-    """Mean of a series (steps,), and its standard error."""
+    """Return the mean of a series (steps,), and its standard error."""
     return float(values.mean()), long_run_deviation(values) / float(np.sqrt(len(values)))
 
 
@@ -36,12 +36,12 @@ class LongRun(NamedTuple):
 
 
 def count_cosines(steps: int) -> int:
-    """Number of cosines, nu = floor(0.4 T^(2/3))."""
+    """Return the number of cosines, nu = floor(0.4 T^(2/3))."""
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
 
 def find_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
-    """Numbers (k,) whose information lies in a few of the nu stretches of the data.
+    """Return the numbers (k,) whose information lies in a few of the nu stretches of the data.
 
     (sum_b V_b)^2 / sum_b V_b^2, of V_b in stretch b, is the number of stretches if all tell the same, and 1 if one
     tells all. Scores vary over time only where they are told of: cosines that hardly change there see next to nothing.
@@ -84,7 +84,7 @@ def cosines(scores: Scores) -> LongRun:
 
 
 def bartlett(scores: Scores) -> LongRun:
-    """sum_|l| <= L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)).
+    """Return sum_|l| <= L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)).
 
     Source: Newey and West (1987).
     """
@@ -97,12 +97,12 @@ def bartlett(scores: Scores) -> LongRun:
 
 
 def white(scores: Scores) -> LongRun:
-    """sum_t s_t s_t'."""
+    """Return sum_t s_t s_t'."""
     return LongRun(np.sum([s.T @ s for s in scores], axis=0), np.inf)
 
 
 def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
-    """Sums of scores over blocks drawn anew, of T^(1/3) times two steps each, about their mean.
+    """Return the sums of scores over blocks drawn anew, of T^(1/3) times two steps each, about their mean.
 
     Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
     """
@@ -119,7 +119,7 @@ def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draw
 
 
 def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) -> LongRun:
-    """Covariance of the sum of scores by a method."""
+    """Return the covariance of the sum of scores by a method."""
     match method:
         case "bootstrap":
             return LongRun(np.atleast_2d(np.cov(block_sums(scores, DRAWS, 0).T)), np.inf)
@@ -133,7 +133,7 @@ def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) 
 
 
 def quantile(freedom: float, level: float = LEVEL) -> float:
-    """Number of standard errors that an interval reaches to each side."""
+    """Return the number of standard errors that an interval reaches to each side."""
     return float(scipy.stats.t.ppf((1 + level) / 2, freedom))
 
 
@@ -143,6 +143,6 @@ def allowed_fall(level: float) -> float:
 
 
 def sandwich(hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """H^-1 J H^-1."""
+    """Return H^-1 J H^-1."""
     half = np.linalg.solve(hessian, scores)
     return np.asarray(np.linalg.solve(hessian, half.T))

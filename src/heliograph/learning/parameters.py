@@ -37,16 +37,16 @@ class Parameter:
         return tuple(f"{self.name}[{','.join(map(str, at))}]" for at in places)
 
     def read(self, value: Array) -> Array:
-        """Vector of the entries of a value."""
+        """Return the vector of the entries of a value."""
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
     def values(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
-        """Entries at a point of the line."""
+        """Return the entries at a point of the line."""
         with jax.enable_x64(True):
             return np.asarray(self._read_at(np.asarray(x)))
 
     def derivatives(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Derivatives of the entries at a point of the line."""
+        """Return the derivatives of the entries at a point of the line."""
         if self.domain.kind == "interval":
             return np.diag(unlink_slope(self.domain, x))
         with jax.enable_x64(True):
@@ -117,7 +117,7 @@ class Parameters:
         )
 
     def values(self, x: Array) -> dict[str, Array]:
-        """Numbers at a point of the line, by name."""
+        """Return the numbers at a point of the line, by name."""
         ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
         return {
             parameter.name: map_from_line(parameter.domain, parameter.start.shape, x[a:b])
@@ -125,16 +125,16 @@ class Parameters:
         }
 
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
-        """Numbers at a point of the line by name, as plain numbers and arrays."""
+        """Return the numbers at a point of the line by name, as plain numbers and arrays."""
         with jax.enable_x64(True):
             return {name: plain_number(value) for name, value in self.values(np.asarray(x)).items()}
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
-        """Values of the entries."""
+        """Return the values of the entries."""
         return np.concatenate([parameter.values(single) for parameter, single in self._parts(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Derivatives of the entries."""
+        """Return the derivatives of the entries."""
         return np.asarray(block_diag(*(parameter.derivatives(single) for parameter, single in self._parts(x))))
 
     def _parts(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
@@ -142,7 +142,7 @@ class Parameters:
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Derivatives of the entries, each on the scale where its interval is symmetric."""
+        """Return the derivatives of the entries, each on the scale where its interval is symmetric."""
         pairs = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):
             return np.stack([slope(entry.domain, value) * row for entry, value, row in pairs])

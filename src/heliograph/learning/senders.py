@@ -68,7 +68,7 @@ class SenderFit:
         return {"conditional": self.total}
 
     def rows(self) -> tuple[Row, ...]:
-        """The table."""
+        """Return the table."""
         return self.table
 
     @property
@@ -79,7 +79,7 @@ class SenderFit:
         return () if self.converged else ("The search did not converge: the estimates are the best points found.",)
 
     def __str__(self) -> str:
-        """The table and the sentences."""
+        """Return the table and the sentences."""
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.value:>10}" + (f"  ({row.interval})" if row.low == row.low else "")
                  for row in self.table]  # fmt: skip
@@ -99,7 +99,7 @@ def fit_sender(
     starts: int,
     seed: int,
 ) -> SenderFit:
-    """The maximum of the likelihood of `event_filter`, with its silences, and its profile for each number.
+    """Return the maximum of the likelihood of `event_filter`, with its silences, and its profile for each number.
 
     In delta the likelihood has steps, where a value that came would have been silent: so it is searched without
     derivatives (Nelder and Mead), from the start and from others around it. The interval of a number is where twice
@@ -169,7 +169,7 @@ def _search_starts(
 
 
 def filter_at(network: Network) -> AbstractFilter:
-    """The filter whose likelihood counts."""
+    """Return the filter whose likelihood counts."""
     (node,) = network.nodes.values()
     if not isinstance(node, Node) or node.trigger is None:
         raise fail("node to be learned", "one whose sender decides", type(node).__name__)
@@ -183,7 +183,7 @@ def _climb_simplex(
     size: float = 0.2,
     digits: float = DIGITS,
 ) -> tuple[Float[np.ndarray, " p"], float, bool]:
-    """The maximum that is reached from a start by a simplex of this size, or the first point above `enough`."""
+    """Return the maximum that is reached from a start by a simplex of this size, or the first point above `enough`."""
     first = likelihood(start)
     if not len(start) or first > enough:
         return start, first, True
@@ -203,7 +203,7 @@ def _climb_simplex(
 
 
 def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
-    """The estimate, with no interval."""
+    """Return the estimate, with no interval."""
     estimate = float(description.parameters.entries_at(x)[index])
     return Row(description.parameters.entries[index].name, estimate, np.nan, np.nan, np.nan, "conditional", False, True)
 
@@ -211,7 +211,7 @@ def _row_without_ends(description: Description, x: Float[np.ndarray, " p"], inde
 def _make_row(
     row: Row, description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int
 ) -> Row:
-    """The row of an estimate, with how far the profile stays near its maximum to either side."""
+    """Return the row of an estimate, with how far the profile stays near its maximum to either side."""
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
 

@@ -184,7 +184,7 @@ class Solution:
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
-        """Covariance of the active coordinates along the identified directions, and degrees of freedom.
+        """Return the covariance of the active coordinates along the identified directions, and degrees of freedom.
 
         Of numbers of which a few stretches of the data tell the scores' covariance is the model's.
         """
@@ -198,7 +198,7 @@ class Solution:
         return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
-        """Table by this form, computed at the first call."""
+        """Return the table by this form, computed at the first call."""
         key = method, level
         if key not in self._tables:
             self._tables[key] = self._make_rows(method, level)
@@ -230,7 +230,7 @@ class Solution:
         method: Method,
         level: float,
     ) -> tuple[float, float]:
-        """Ends of an interval on the scale where the domain is symmetric.
+        """Return the ends of an interval on the scale where the domain is symmetric.
 
         A logarithm or a logit that is hardly known has no symmetric interval: it is cut out of the likelihood.
         """
@@ -248,7 +248,7 @@ class Solution:
         return center - half, center + half
 
     def _make_row(self, entry: Entry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """The row of an identified number, with its interval."""
+        """Return the row of an identified number, with its interval."""
         least, most = sorted(float(unlink(entry.domain, end)) for end in ends)
         slope = abs(float(unlink_slope(entry.domain, link(entry.domain, value))))
         return Row(entry.name, value, least, most, error * slope, self.form, False, True)
@@ -260,13 +260,13 @@ class Solution:
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
     def _draw_ends(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Ends of an interval by blocks of scores drawn anew, less the estimate."""
+        """Return the ends of an interval by blocks of scores drawn anew, less the estimate."""
         drawn = np.linalg.solve(self.hessian, block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
         return ends
 
     def _make_boundary_row(self, entry: Entry, value: float, level: float) -> Row:
-        """Row of a number at the end of its domain: from there to where the profile has fallen so far.
+        """Return the row of a number at the end of its domain: from there to where the profile has fallen so far.
 
         The square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.
         """
@@ -283,7 +283,7 @@ class Solution:
 
 
 def rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:
-    """Rank of the second half's information, with as many flat directions as there are ridges.
+    """Return the rank of the second half's information, with as many flat directions as there are ridges.
 
     What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.
     """

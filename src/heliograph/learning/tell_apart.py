@@ -88,7 +88,7 @@ def samples_to_tell(
 
 
 def _only_node(network: Network) -> tuple[str, Node]:
-    """The network's only node, which receives its sensor through a channel."""
+    """Return the network's only node, which receives its sensor through a channel."""
     instance("network", network, Network, "a Network")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(received) != 1 or len(network.nodes) != 1:
@@ -97,7 +97,7 @@ def _only_node(network: Network) -> tuple[str, Node]:
 
 
 def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
-    """Channel with `law` in the place of the gain in question."""
+    """Return the channel with `law` in the place of the gain in question."""
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     leaves = jax.tree.leaves(single, is_leaf=_is_law_leaf)
     laws = [leaf for leaf in leaves if _is_law_leaf(leaf) and leaf.constant is None]
@@ -129,7 +129,7 @@ def _draw_likelihood_ratios(
     seed: int,
     nodes: int,
 ) -> np.ndarray:
-    """Log-likelihood ratio log p_true - log p_other of each run and step, of data drawn under the true law."""
+    """Return log-likelihood ratio log p_true - log p_other of each run and step, of data drawn under the true law."""
     plain = Node(node.sensor, true, {"open_loop": open_loop_filter(network.plant)})
     world = Network(network.plant, {name: plain})
     z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]

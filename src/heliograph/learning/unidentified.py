@@ -44,7 +44,7 @@ class Rank(NamedTuple):
 
 
 def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
-    """Rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
+    """Return rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
     diagonal = np.diag(information)
     there = diagonal > 0
     unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 1.0)
@@ -57,7 +57,7 @@ def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
 def find_confounded(
     parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]
 ) -> list[Confounded]:
-    """Groups of coordinates that the data do not separate at any of the points, with what they identify."""
+    """Return the groups of coordinates that the data do not separate at any of the points, with what they identify."""
     count = min(rank.flat.shape[1] for rank in ranks)
     if not count:
         return []
@@ -75,7 +75,7 @@ def find_confounded(
 
 
 def _derivatives_by_coordinate(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives dv/dx and d log|v|/dx of each coordinate that is a number itself; 1 for the others."""
+    """Return the derivatives dv/dx and d log|v|/dx of each coordinate that is a number itself; 1 for the others."""
     slopes, log = np.ones(len(x)), np.ones(len(x))
     for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
         if entry.coordinate is not None:
@@ -85,13 +85,13 @@ def _derivatives_by_coordinate(parameters: Parameters, x: Float[np.ndarray, " p"
 
 
 def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
-    """Orthonormal columns."""
+    """Return the orthonormal columns."""
     left, size, _ = np.linalg.svd(vectors, full_matrices=False)
     return np.asarray(left[:, size > 1e-12 * max(size.max(initial=0.0), 1e-300)])
 
 
 def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
-    """Coordinates connected by flat directions at any point."""
+    """Return the coordinates connected by flat directions at any point."""
     joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
     count, labels = connected_components(joined, directed=False)
     groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
@@ -99,7 +99,7 @@ def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
 
 
 def _make_confounded(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
-    """A group, with what the data do identify: products of whole powers if those fit all points, else sums."""
+    """Return A group, with what the data do identify: products of whole powers if those fit all points, else sums."""
     places = list(group)
     size = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
     none = np.zeros((0, len(group)))
@@ -112,14 +112,14 @@ def _make_confounded(group: tuple[int, ...], logs: list[np.ndarray], plain: list
 
 
 def _rows_known_everywhere(bases: list[np.ndarray]) -> np.ndarray:
-    """Rows orthogonal to the flat directions of all points, reduced."""
+    """Return the rows orthogonal to the flat directions of all points, reduced."""
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))
     return _reduce_to_echelon(right[rank:])
 
 
 def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
-    """Row echelon form, leading entries 1."""
+    """Return the row echelon form, leading entries 1."""
     reduced, lead, pivot = rows.copy(), 0, 0
     for row in range(len(reduced)):
         # pivot: the largest entry of the next column that has one
@@ -142,7 +142,7 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
 
 
 def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
-    """Text of a product: a * b^2 / c."""
+    """Return the text of a product: a * b^2 / c."""
     above = [_format_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
     below = [_format_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
     top = " * ".join(above) or "1"
@@ -150,7 +150,7 @@ def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> s
 
 
 def sum_text(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
-    """Text of a sum: a + 0.64 b."""
+    """Return the text of a sum: a + 0.64 b."""
     text = ""
     for name, weight in zip(names, weights, strict=True):
         if weight:
@@ -160,5 +160,5 @@ def sum_text(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
 
 
 def _format_power(name: str, exponent: float) -> str:
-    """A factor of a product as text: a, a^2, a^0.5."""
+    """Return a factor of a product as text: a, a^2, a^0.5."""
     return name if exponent == 1 else f"{name}^{exponent:g}"

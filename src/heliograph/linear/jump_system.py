@@ -93,7 +93,7 @@ class JumpSystem(NamedTuple):
         return (after + after.swapaxes(-1, -2)) / 2
 
     def adjoint(self, weights: Float[np.ndarray, "time n n"], forever: bool) -> Float[np.ndarray, "time M n n"]:
-        """Derivative L of sum_k <W_k, sum_j X_k,j> by each X_k,j, through all later steps.
+        """Return the derivative L of sum_k <W_k, sum_j X_k,j> by each X_k,j, through all later steps.
 
         L_k,i = W_k + sum_l T_k+1,il F_k+1,l' L_k+1,l F_k+1,l, from zero behind the last step, or around a period.
         """

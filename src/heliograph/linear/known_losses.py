@@ -62,7 +62,7 @@ class KnownLossSystem(NamedTuple):
 
 
 def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
-    """The spectral radius of the operator under any gains, wherever they come from; infinite without a witness.
+    """Return the spectral radius of the operator under any gains, wherever they come from; infinite without a witness.
 
     Below 1, E P stays bounded under these gains, hence under the best. The witness is V > 0 with V - V+ > 0 without
     noise, checked by multiplication: a map that keeps covariances has one exactly where its radius is below 1.
@@ -130,13 +130,13 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
 
 
 def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
-    """Covariances that grow by the spectral radius: a positive map has such an eigenvector."""
+    """Return the covariances that grow by the spectral radius: a positive map has such an eigenvector."""
     parts = unpack_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
     return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
 
 def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
-    """Gains that are best for U of the V given, of all modes together if V is."""
+    """Return the gains that are best for U of the V given, of all modes together if V is."""
     results: list[np.ndarray] = []
     before: Parts = mix_modes(system.chain, parts)
     for s, c in enumerate(system.outputs):
@@ -149,7 +149,7 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
 
 
 def _relative_change(before: KindGains, after: KindGains) -> float:
-    """Change of the bounds, relative to the larger one."""
+    """Return the change of the bounds, relative to the larger one."""
     size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
     gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
     return float(gap / size) if size > 0 else 0.0
@@ -214,12 +214,12 @@ def _mode_sets_without_observation(
 
 
 def _modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) -> Iterable[int]:
-    """Modes whose output matrix C_i maps the whole subspace to zero."""
+    """Return the modes whose output matrix C_i maps the whole subspace to zero."""
     return (i for i, c in enumerate(outputs) if _unobservable_part(c, space).shape[1] == space.shape[1])
 
 
 def _unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
-    """Part of a subspace that the rows of an output do not observe, each row taken at its own size."""
+    """Return the part of a subspace that the rows of an output do not observe, each row taken at its own size."""
     sizes = np.linalg.norm(output, axis=1)
     rows = output[sizes > 0] / sizes[sizes > 0][:, None]
     if not len(rows):
@@ -230,7 +230,7 @@ def _unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
 
 
 def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
-    """True if the noise excites every one of these directions within n steps (controllable subspace)."""
+    """Return whether the noise excites every one of these directions within n steps (controllable subspace)."""
     basis, columns = np.zeros((len(matrix), 0)), noise
     for _ in range(len(matrix)):
         size = np.linalg.norm(columns, 2) if columns.size else 0.0

@@ -59,7 +59,7 @@ class SteadyMoments:
         self._last: Moments | None = None
 
     def is_steady(self, moments: Moments) -> bool:
-        """True if the moments are those of the call before, to rounding."""
+        """Return whether the moments are those of the call before, to rounding."""
         before, self._last = self._last, moments
         if before is None or self._tolerance < 0:
             return False
@@ -74,7 +74,7 @@ def lift_modes(
     moments: Float[np.ndarray, " monomials"],
     projection: Float[np.ndarray, "n L"],
 ) -> LinearSystem:
-    """The system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), measured by those of z.
+    """Return the system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), measured by those of z.
 
     E[Y+ 1{j}] = sum_i Pi_ij M Y 1{i} and E[Z | Y, modes] = sum_j K_j Y 1{j}, with M and K_j the moments of the plant
     and of the route in mode j. Noises, with B = E[Y Y']:
@@ -132,7 +132,7 @@ def _mean_noise(
 def _keep_if_unchanged(
     law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
 ) -> Float[np.ndarray, " modes"]:
-    """Law of the modes after a step; the law before where it differs by rounding only."""
+    """Return the law of the modes after a step; the law before where it differs by rounding only."""
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
@@ -229,7 +229,7 @@ def _lift_steps(
 
 
 def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:
-    """True if two models, or two of their steps, are one object or have equal numbers."""
+    """Return whether two models, or two of their steps, are one object or have equal numbers."""
     return left is right or bool(eqx.tree_equal(left, right))
 
 
@@ -254,14 +254,14 @@ class LiftedMap:
         self.highest[~known[:, None] & ~known] = 2 * degree
 
     def push(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
-        """E[mono(z)] from E[mono(y)], both of twice the degree."""
+        """Return E[mono(z)] from E[mono(y)], both of twice the degree."""
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             if self.whole is not None:
                 return np.asarray(self.whole @ np.asarray(moments))
             return np.asarray(push_moments(self.route, 2 * self.degree, moments))
 
     def conditional_spread(self, moments: Float[Array, "M"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
-        """E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
+        """Return E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
 
         Where the outputs in Z_i have a known gain, every term of Z_i - E[Z_i | y] has an n: it is a polynomial of y of
         degree deg Z_i - 1, and lowers that of Cov(Z_i, Z_j | y) by one, as Z_j does. Moments of y of a higher degree,
@@ -295,12 +295,12 @@ def mean_and_spread(
 def affine(
     homogeneous: Float[np.ndarray, "m n"],
 ) -> tuple[Float[np.ndarray, "m-1 n-1"], Float[np.ndarray, "m-1"]]:
-    """Matrix and offset of a homogeneous matrix [[A, a], [0, 1]]."""
+    """Return the matrix and offset of a homogeneous matrix [[A, a], [0, 1]]."""
     return homogeneous[:-1, :-1], homogeneous[:-1, -1]
 
 
 def linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
-    """Rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
+    """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
     places = {powers: i for i, powers in enumerate(exponents(variables + 1, degree))}
     rows = np.zeros((variables if expected is None else expected, len(places) - 1))
     for i, row in enumerate(rows):
@@ -309,7 +309,7 @@ def linear_rows(variables: int, degree: int, expected: int | None = None) -> Flo
 
 
 def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
-    """E[mono_order(x_0)]."""
+    """Return E[mono_order(x_0)]."""
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     shift = np.eye(len(plant.states) + 1)
     shift[:-1, -1] = plant.initial_mean - law.mean
@@ -329,7 +329,7 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
 
 
 def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
-    """The maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
+    """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
     plants = _maps_of_models(each_step(plant, horizon), order)
     sensors, channels = each_step(sensor, horizon), each_step(channel, horizon)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
@@ -342,7 +342,7 @@ def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: in
 def _measurement_maps(
     sensors: Sequence[AnySensor], channels: Sequence[AbstractRandomAffine], order: int
 ) -> list[AbstractRandomAffine]:
-    """Maps from the state to z; a sum of links whose sensors' noises are independent is one of x itself."""
+    """Return the maps from the state to z; a sum of links whose sensors' noises are independent is one of x itself."""
     apart = list[AbstractRandomAffine]()
     for sensor, channel in zip(sensors, channels, strict=True):
         assert isinstance(sensor, LinearSensor)  # checked before
@@ -369,7 +369,7 @@ def _maps_of_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
 
 
 def each_step(model: T | OverTime, horizon: int) -> list[T]:
-    """A plant, sensor or channel at each of `horizon` steps."""
+    """Return A plant, sensor or channel at each of `horizon` steps."""
     check_horizon(horizon)
     check_horizon(horizon, steps_covered(model))
     return list_steps(model, horizon)

@@ -89,7 +89,7 @@ def _take_moments_by_mode(items: list[tuple[np.ndarray, np.ndarray]]) -> Moments
 def _propagate_modes(
     move: Moments, rows: np.ndarray, moments: np.ndarray
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
-    """F, Cov(w) and E[y~+ y~+' 1{j}]."""
+    """Return F, Cov(w) and E[y~+ y~+' 1{j}]."""
     mean, spread = move
     modes, size = len(moments), moments.shape[-1]
     whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)

@@ -75,7 +75,7 @@ def quadratic_system_with_linear_estimate(
 
 
 def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
-    """[[A, a], [0, 1]] of x -> A x + a."""
+    """Return [[A, a], [0, 1]] of x -> A x + a."""
     return np.block([[matrix, offset[:, None]], [np.zeros((1, matrix.shape[1])), np.ones((1, 1))]])
 
 
@@ -97,7 +97,7 @@ class _MomentCache:
         self.wide: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
     def move(self, plant: GainAndNoise, m: int) -> GainAndNoise:
-        """(x, q, z) -> (x+, q)."""
+        """Return (x, q, z) -> (x+, q)."""
         n = plant.inputs
         if self.joint is None or plant.noise is not self.noise:
             still = Gaussian(np.zeros((n, n)))
@@ -107,7 +107,7 @@ class _MomentCache:
         return GainAndNoise(Constant(1.0), matrix, self.joint)
 
     def append_measurement(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Moments of order 2 and 4 of (x+, q, z+) from those of (x+, q)."""
+        """Return the moments of order 2 and 4 of (x+, q, z+) from those of (x+, q)."""
         if route is not self.route:
             wide = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
             self.route, self.wide = route, (np.asarray(wide.moments(2).matrix), np.asarray(wide.moments(4).matrix))
@@ -115,7 +115,7 @@ class _MomentCache:
 
 
 def _make_received_products(n: int, m: int) -> np.ndarray:
-    """Rows that read (monomials of z up to degree 2, z_i q_j) off all products of (x, q, z)."""
+    """Return the rows that read (monomials of z up to degree 2, z_i q_j) off all products of (x, q, z)."""
     total = 2 * n + m
     places = {powers: i for i, powers in enumerate(exponents(total + 1, 2))}
     expected = [(*(0,) * (2 * n), *powers) for powers in exponents(m + 1, 2)[:-1]]
@@ -225,7 +225,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
 
 
 def _product_positions(variables: int) -> dict[tuple[int, ...], int]:
-    """Positions of y_i and of y_i y_j among the monomials of degree 2."""
+    """Return the positions of y_i and of y_i y_j among the monomials of degree 2."""
     index = {powers: i for i, powers in enumerate(exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)
     places: dict[tuple[int, ...], int] = {

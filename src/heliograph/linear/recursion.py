@@ -38,7 +38,7 @@ class RecursionStep(NamedTuple):
 
 
 def take_noise_roots(s: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
-    """Roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
+    """Return roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
     reach = np.abs(s.output) @ np.sqrt(size)
     return NoiseRoots(_root_with_rounding(s.process, size), _root_with_rounding(s.noise, reach**2))
 
@@ -60,7 +60,7 @@ def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: NoiseRoots
 
 
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
-    """The best linear filter of x = W y from z_1 ... z_k: an ordinary Kalman recursion, since w and v are white.
+    """Return the best linear filter of x = W y from z_1 ... z_k: an ordinary Kalman recursion, since w and v are white.
 
     `claim` is what the covariance is worth: "exact" if the system's moments are the world's. It is lowered to
     "nominal", with a warning, where rounding in the system's own covariances reaches a visible part of the error's.
@@ -117,7 +117,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
 
 
 def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
-    """True if a covariance and its rounding are steady, to STILL of each entry's own scale.
+    """Return whether a covariance and its rounding are steady, to STILL of each entry's own scale.
 
     A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
     and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
@@ -149,7 +149,7 @@ def _support_claim(claim: Claim, lost: float, step: int) -> Claim:
 
 
 def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
-    """E[(x - xhat)(x - xhat)'] of a schedule run on a system that it need not have been designed for.
+    """Return E[(x - xhat)(x - xhat)'] of a schedule run on a system that it need not have been designed for.
 
     Joint moments of (y, s) are propagated; nothing is assumed of the gains.
 

@@ -63,7 +63,7 @@ def critical_arrival(
     lost = np.zeros((0, len(a)))
 
     def gain_at(arrival: float) -> Float[np.ndarray, "n m"] | None:
-        """A certified gain, or None."""
+        """Return a certified gain, or None."""
         # Independent losses as a chain of two modes with equal rows: arrived, lost.
         chain = np.array([[arrival, 1 - arrival]] * 2)
         system = KnownLossSystem(a, q, chain, chain[0], np.array([0, 1]), (c, lost), (r, np.zeros((0, 0))))
@@ -100,7 +100,7 @@ def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lowe
 def plant_matrices(
     plant: AnyPlant, what: str = "boundedness"
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
-    """A and Cov(w) of a constant linear plant, for `what` needs them."""
+    """Return A and Cov(w) of a constant linear plant, for `what` needs them."""
     if (
         not isinstance(plant, LinearPlant)
         or not isinstance(plant.noise, AbstractNoise)
@@ -114,7 +114,7 @@ def plant_matrices(
 def sensor_matrices(
     sensor: AnySensor, states: int, what: str = "boundedness"
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
-    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them."""
+    """Return C and Cov(v) of a constant linear sensor of so many states, for `what` needs them."""
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
         raise fail(what, "a LinearSensor that does not vary", _describe_type(sensor))
     check_sensor(sensor, states)

@@ -95,7 +95,7 @@ class LinearSystem(Module):
         return len(self.steps.drift)
 
     def step(self, k: int) -> Steps:
-        """The matrices of one step, without time axis."""
+        """Return the matrices of one step, without time axis."""
         return Steps(*(field[k] for field in self.steps))
 
     @property
@@ -110,13 +110,13 @@ class LinearSystem(Module):
 
 
 def repeat_last(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
-    """Parts of the first steps, of which all that follow are as the last, for every step of the horizon."""
+    """Return the parts of the first steps, of which all that follow are as the last, for every step of the horizon."""
     values = np.array(parts)
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
 
 
 def _rounding_or_zero(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Rounding as an array of this shape, zeros where none is given."""
+    """Return the rounding as an array of this shape, zeros where none is given."""
     numbers: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
     return numbers
 
@@ -237,7 +237,7 @@ class Schedule(Module):
 
 
 def _fill_unknown(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of the given shape, NaN where it is not known."""
+    """Return an array of the given shape, NaN where it is not known."""
     unknown = np.isnan(value)
     checked = array(name, np.where(unknown, 0.0, value), shape)
     return np.where(unknown, np.nan, checked)

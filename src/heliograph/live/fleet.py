@@ -295,7 +295,7 @@ class Fleet:
     def trial(
         self, plants: Sequence[PlantState | None], given: Float[np.ndarray, "plant given"]
     ) -> Float[np.ndarray, "plant outputs"]:
-        """Estimates of each plant (None: one that has not begun) with these inputs, NaN: as they were.
+        """Return the estimates of each plant (None: one that has not begun) with these inputs, NaN: as they were.
 
         The prediction covers one step from the newest row, or one unit of continuous time. A plant that is None has not
         begun yet. An input that is NaN keeps its value.

@@ -142,7 +142,7 @@ def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count
 
 
 def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:
-    """Mask of the numbers that changed by more than rounding."""
+    """Return the mask of the numbers that changed by more than rounding."""
     with np.errstate(invalid="ignore"):
         close = np.abs(after - before) <= SETTLED * np.maximum(np.abs(before), np.abs(after))
     moving: np.ndarray = ~(close | (before == after) | (np.isnan(before) & np.isnan(after)))

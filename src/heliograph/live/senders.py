@@ -43,7 +43,7 @@ class LossChain(NamedTuple):
 
     @staticmethod
     def of_channel(channel: Channel) -> "LossChain":
-        """Losses of a link."""
+        """Return the losses of a link."""
         modes = joint_modes(first(channel))
         loss = [sum(float(o.probability) for o in m.list_outcomes() if not o.arrived.any()) for m in modes.maps]
         return LossChain(np.array(loss), np.asarray(modes.transition), np.asarray(modes.initial))
@@ -71,7 +71,7 @@ def sender_status(trigger: AbstractTrigger, losses: LossChain, last: int | None,
 
 
 def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
-    """Transmissions that were due in the silent steps; the first value is due at once.
+    """Return the transmissions that were due in the silent steps; the first value is due at once.
 
     Between two heartbeats the sender may have transmitted on an event that was lost too: then the next one is due
     later. So of the silent steps at least every `heartbeat` steps one transmission was.

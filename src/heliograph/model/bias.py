@@ -76,7 +76,7 @@ def with_bias(
 def _gauss_markov(
     plant: AbstractPlant, names: list[str], deviation: ArrayLike, time: ArrayLike, dt: ArrayLike | str
 ) -> LinearPlant:
-    """Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2."""
+    """Return the Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2."""
     count = len(names)
     sizes = [
         scalar("deviation of a bias", x, 0.0) for x in _spread_over_biases("deviation of a bias", deviation, count)
@@ -115,14 +115,14 @@ class Driven(Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """The state after a step."""
+        """Return the state after a step."""
         n = len(self.plant.states)
         moved = self.plant.transition(x[:n], u) + jnp.asarray(self.coupling) @ x[n:]
         return jnp.concatenate([moved, self.bias.transition(x[n:], u[np.array(self.places, int)])])
 
 
 def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
-    """The plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
+    """Return the plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
     models = plant, bias
     if set(bias.inputs) - set(plant.inputs):
         raise fail("bias", f"a plant whose inputs are some of {list(plant.inputs)}", list(bias.inputs))
@@ -145,7 +145,7 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
 
 
 def _blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
-    """[[A, E], [0, F]] and [B; B_b], functions of the inputs where some part is one; `pick` takes those of b."""
+    """Return [[A, E], [0, F]] and [B; B_b], functions of the inputs where some part is one; `pick` takes those of b."""
     below = np.zeros((len(bias.states), len(plant.states)))
     if not any(isinstance(value, OfInputs) for model in (plant, bias) for value in vars(model).values()):
         xp = library(plant.matrix, coupling, bias.matrix, plant.input_matrix, bias.input_matrix)
@@ -170,12 +170,12 @@ class Biased(Module):
     states: int = eqx.field(static=True)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """The expected outputs."""
+        """Return the expected outputs."""
         return self.sensor.measure(x[: self.states]) + jnp.asarray(self.loading) @ x[self.states :]
 
 
 def _bias_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
-    """The sensor of [x; b]."""
+    """Return the sensor of [x; b]."""
     if not isinstance(sensor, LinearSensor):
         return Sensor(Biased(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
     stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
@@ -183,7 +183,7 @@ def _bias_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> Li
 
 
 def _spread_over_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
-    """Values of the biases, from one or from as many."""
+    """Return the values of the biases, from one or from as many."""
     given: Any = value
     values = list(given) if rank(name, value) else [given] * count
     if len(values) != count:
@@ -192,6 +192,6 @@ def _spread_over_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
 
 
 def _rate(time: Any) -> Any:
-    """1 / T, 0 of an infinite one."""
+    """Return 1 / T, 0 of an infinite one."""
     constant = not is_traced(time) and isinstance(time, float | np.floating) and time == np.inf
     return 0.0 if constant else 1 / scalar("time of a bias", time, TINY)

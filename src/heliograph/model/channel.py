@@ -109,7 +109,7 @@ def hop(
 
 
 def perfect(dimension: int = 1) -> GainAndNoise:
-    """The channel that delivers y as it is: z = y.
+    """Return the channel that delivers y as it is: z = y.
 
     Args:
         dimension: number of components of y (default 1).
@@ -139,7 +139,7 @@ def silent(
 
 
 def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """Chain `hops` through relays that amplify what they receive, noise included: z = H_N ... H_2 H_1 y.
+    """Return the chain `hops` through relays that amplify what they receive, noise included: z = H_N ... H_2 H_1 y.
 
     Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Each hop may
     be late, and the delays add up; a relay with a random delay may forward one value twice, with one noise m.
@@ -195,7 +195,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
 
 
 def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
-    """A channel whose packet is lost with probability 1 - arrival; the receiver knows, and reads NaN.
+    """Return a channel whose packet is lost with probability 1 - arrival; the receiver knows, and reads NaN.
 
     Filters skip what is NaN, so give a filter the channel inside, without the erasure. A relay forwards NaN as NaN.
 
@@ -210,7 +210,7 @@ def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
 
 
 def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine) -> Stack:
-    """The relayed signal and the direct one, both received: z = (z_relay, z_direct), independent given y.
+    """Return the relayed signal and the direct one, both received: z = (z_relay, z_direct), independent given y.
 
     Args:
         relayed: channel through the relay.
@@ -250,7 +250,7 @@ def _place_links(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAf
 
 
 def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool = False) -> Superposed:
-    """Links that transmit at once, of which the receiver gets the sum z = sum_i (G_i y_i + n_i) + n.
+    """Return the links that transmit at once, of which the receiver gets the sum z = sum_i (G_i y_i + n_i) + n.
 
     Link i carries its own part of y, as in `parallel` (`joint_sensor` makes one sensor of several); `same=True`: all
     carry all of y, as relays of one signal do. Links are independent: what is common to them, as one first hop that
@@ -298,7 +298,7 @@ def _check_added(name: str, link: AbstractRandomAffine) -> None:
 
 
 def mean_gain(channel: Channel) -> Channel:
-    """The channel that most people would design for: every gain taken as its mean, with the noise as it is.
+    """Return the channel that most people would design for: every gain taken as its mean, with the noise as it is.
 
     Args:
         channel: of random gains; it may vary over time.

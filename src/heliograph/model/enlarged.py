@@ -108,7 +108,7 @@ class Stamped(AbstractSensor):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """h(x) - o dh/dt; h(x) where the clock is right."""
+        """Return h(x) - o dh/dt; h(x) where the clock is right."""
         state = jnp.asarray(x)[: self.states]
         if self.motion is None:
             return self.base.measure(state)
@@ -168,7 +168,7 @@ def _step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
 
 
 def _drifts(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
-    """Offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start."""
+    """Return offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start."""
     spread, wander, start_at, states = [], [], [], []
     for name, clock in clocks.items():
         instance(f"clock of {name!r}", clock, Clock, "a Clock")
@@ -224,7 +224,7 @@ class JointSensor(AbstractSensor):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """All of them."""
+        """Return all of them."""
         return jnp.concatenate([sensor.measure(x) for sensor in self.parts])
 
 

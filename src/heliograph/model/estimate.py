@@ -85,7 +85,7 @@ def check_claim(claim: object) -> None:
 
 
 def weakest(claims: list[Claim]) -> Claim:
-    """The strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them.
+    """Return the strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them.
 
     Args:
         claims: at least one.
@@ -120,7 +120,7 @@ def is_sound(estimate: Estimate) -> np.ndarray:
 
 
 def _is_semidefinite(correlations: np.ndarray) -> np.ndarray:
-    """Mask of the matrices (..., n, n) whose eigenvalues are not below zero, to rounding.
+    """Return the mask of the matrices (..., n, n) whose eigenvalues are not below zero, to rounding.
 
     Where C + tol I has a Cholesky factor for all, which takes a sixth of the time, none has an eigenvalue below -tol.
     """

@@ -100,7 +100,7 @@ def autoregressive_fading(
     dimension: int = 1,
     name: str | None = None,
 ) -> Faded:
-    """A link z = g y + n whose gain drifts: Gaussian, stationary, with `correlation` from one step to the next.
+    """Return a link z = g y + n whose gain drifts: Gaussian, stationary, with `correlation` from one step to the next.
 
     `noise` is as for a hop, with `dimension` components where it is a variance. Links of one `name` drift together,
     each with its own mean and deviation.
@@ -184,7 +184,7 @@ def shared(link: Channel, name: str) -> Channel:
 
 
 def without_memory(channel: Channel) -> Channel:
-    """The channel whose modes are drawn anew at each step: what a filter believes that assumes no memory.
+    """Return the channel whose modes are drawn anew at each step: what a filter believes that assumes no memory.
 
     Each step's draws have the law that they have in the channel (of one that does not vary: in the long run); no two
     steps depend on each other. A channel that forgets is itself.

@@ -103,7 +103,7 @@ def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
 
 
 def _functions(plant: AbstractPlant) -> dict[str, MatrixOfInputs]:
-    """Functions of the inputs alone, by name: matrices, and the covariance of the noise."""
+    """Return the functions of the inputs alone, by name: matrices, and the covariance of the noise."""
     every: dict[str, MatrixOfInputs] = {}
     if isinstance(plant, LinearPlant):
         if isinstance(plant.matrix, OfInputs):

@@ -17,7 +17,7 @@ LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | 
 
 
 def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":
-    """Limits of so many received numbers; those of another node as they are; None where there are none."""
+    """Return the limits of so many received numbers; those of another node as they are; None where there are none."""
     codes = _read_numbers("invalid values", invalid)
     if isinstance(limits, Limits):
         if len(limits.low) != received or codes.size:

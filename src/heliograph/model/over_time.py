@@ -117,7 +117,7 @@ def _entry(values: PyTree, k: PyTree) -> object:
 
 
 def steps_covered(tree: object) -> int | None:
-    """Smallest number of steps that the time-varying parts of `tree` cover; None if nothing varies."""
+    """Return the smallest number of steps that the time-varying parts of `tree` cover; None if nothing varies."""
     leaves = jax.tree.leaves(tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
     steps = [leaf.steps for leaf in leaves if isinstance(leaf, OverTime)]
     return min(steps) if steps else None
@@ -150,5 +150,5 @@ def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
 
 
 def first(model: object) -> PyTree:
-    """A plant, sensor or channel at its first step."""
+    """Return A plant, sensor or channel at its first step."""
     return at(model, 0) if isinstance(model, OverTime) else model

@@ -88,7 +88,7 @@ class AbstractPlant(Module):
         return tuple(self.states.index(name) for name in self.circular)
 
     def difference(self, x: A, other: A) -> A:
-        """x - other of states (..., n), angles between -pi and pi."""
+        """Return x - other of states (..., n), angles between -pi and pi."""
         return wrap_angles(x - other, self.angles)
 
     def near(self, x: A, other: Array) -> A:
@@ -96,21 +96,21 @@ class AbstractPlant(Module):
         return nearest(x, other, self.angles)
 
     def moves(self, u: jax.Array, center: jax.Array) -> Callable[[jax.Array], jax.Array]:
-        """x -> f(x, u) with angles continued from those at `center`, as moments are made of it."""
+        """Return x -> f(x, u) with angles continued from those at `center`, as moments are made of it."""
         return continue_angles(lambda x: self.transition(x, u), center, self.angles, self.angles)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """f(x, u): shapes (n,), (inputs,) -> (n,)."""
+        """Return f(x, u): shapes (n,), (inputs,) -> (n,)."""
         raise unwritten(self, "transition")
 
     def noise_covariance(self, u: jax.Array) -> jax.Array:
-        """Covariance of w, (n, n); it may depend on the input (a time step, a distance travelled)."""
+        """Return the covariance of w, (n, n); it may depend on the input (a time step, a distance travelled)."""
         if isinstance(self.noise, AbstractNoise):
             return jnp.asarray(self.noise.covariance)
         return as_real(self.noise(u))
 
     def noise_mean(self) -> jax.Array:
-        """Mean of w, (n,)."""
+        """Return the mean of w, (n,)."""
         if isinstance(self.noise, AbstractNoise | JointNoise):
             return jnp.asarray(self.noise.mean)
         return jnp.zeros(self.initial_mean.shape)
@@ -146,7 +146,7 @@ class JointNoise(Module):
         return [(plant, jnp.asarray(u)[np.array(at, int)]) for plant, at in zip(self.plants, self.places, strict=True)]
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Covariance under the input u."""
+        """Return the covariance under the input u."""
         return jnp.asarray(jax.scipy.linalg.block_diag(*(plant.noise_covariance(own) for plant, own in self._each(u))))
 
     @property
@@ -209,7 +209,7 @@ class Plant(AbstractPlant):
         check_turns("plant", self.transition, self.initial_mean, self.angles, self.angles, u)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """f(x, u)."""
+        """Return f(x, u)."""
         return as_real(self.function(x, u))
 
 
@@ -276,15 +276,15 @@ class LinearPlant(AbstractPlant):
         return OfInputs(value, name, self.inputs)
 
     def transition_matrix(self, u: jax.Array) -> jax.Array:
-        """A (n, n) under the input u (inputs,)."""
+        """Return A (n, n) under the input u (inputs,)."""
         return matrix_of(self.matrix, u)
 
     def shift(self, u: jax.Array) -> jax.Array:
-        """B u + E w (n,) under the input u (inputs,)."""
+        """Return B u + E w (n,) under the input u (inputs,)."""
         return matrix_of(self.input_matrix, u) @ u + self.noise_mean()
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """A x + B u."""
+        """Return A x + B u."""
         return self.transition_matrix(u) @ x + matrix_of(self.input_matrix, u) @ u
 
 
@@ -328,7 +328,7 @@ _values_by_xla = quickly_compiled(_values_at)
 
 
 def _initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, AbstractNoise | None]:
-    """Mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
+    """Return the mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]
     if not isinstance(spread, AbstractNoise):

@@ -89,7 +89,7 @@ class RelayNetwork(Module):
         return all(observed) and not any(first(hop).erases for hops in observed for hop in hops.values())
 
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n,) and covariance (n, n) of x_0."""
+        """Return the mean (n,) and covariance (n, n) of x_0."""
         plant = first(self.plant)
         return np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
 
@@ -99,7 +99,7 @@ class RelayNetwork(Module):
         check_horizon(horizon, covered)
 
     def steps(self, horizon: int) -> "RelaySteps":
-        """Matrices and moments of each step, the first leading from x_0 to x_1.
+        """Return the matrices and moments of each step, the first leading from x_0 to x_1.
 
         Raises:
             ValueError: a horizon beyond what varies over time; links with uncertain probabilities.

@@ -44,7 +44,7 @@ class AbstractSensor(Module):
         return tuple(self.outputs.index(name) for name in self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """h(x): shapes (n,) -> (len(outputs),)."""
+        """Return h(x): shapes (n,) -> (len(outputs),)."""
         raise unwritten(self, "measure")
 
     def check_states(self, states: int) -> None:
@@ -100,7 +100,7 @@ class Sensor(AbstractSensor):
         self.circular = _circular(self.outputs, circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """h(x)."""
+        """Return h(x)."""
         return as_real(self.function(x))
 
 
@@ -133,7 +133,7 @@ class LinearSensor(AbstractSensor):
         self.circular = _circular(self.outputs, circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """C x."""
+        """Return C x."""
         return jnp.asarray(self.matrix) @ x
 
     def check_states(self, states: int) -> None:

@@ -92,7 +92,7 @@ def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
 
 
 def _mean_of(law: object, memory: AbstractMemory) -> ArrayLike:
-    """Mean of a law of numbers; zeros, the first mode, of a memory."""
+    """Return the mean of a law of numbers; zeros, the first mode, of a memory."""
     if law is None:
         raise fail("typical numbers", "numbers as they may come, where there is no law", "none")
     if isinstance(law, AbstractLaw):

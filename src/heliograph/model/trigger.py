@@ -87,7 +87,7 @@ class AbstractTrigger(Module):
         """Raise ValueError unless the rule's numbers fit so many components."""
 
     def start(self, outputs: int) -> Sender:
-        """A sender that has transmitted nothing yet."""
+        """Return a sender that has transmitted nothing yet."""
         nothing = jnp.zeros(outputs, dtype=int)
         begun = jnp.full(outputs, not self.needs_reference)
         return Sender(jnp.zeros(outputs), nothing, begun, nothing, nothing)
@@ -104,7 +104,7 @@ class AbstractTrigger(Module):
         return SendReason.EVENT
 
     def after(self, sender: Sender, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> Sender:
-        """The sender after it transmitted what has a reason, of which `arrived` arrived."""
+        """Return the sender after it transmitted what has a reason, of which `arrived` arrived."""
         sent = reason > 0
         arrived = arrived & sent
         renewed = arrived if self.reference == "acknowledged" else sent
@@ -116,7 +116,7 @@ class AbstractTrigger(Module):
     def transmit(
         self, sender: Sender, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[Sender, jax.Array]:
-        """The sender that follows, and what the receiver gets where the channel would make z of y."""
+        """Return the sender that follows, and what the receiver gets where the channel would make z of y."""
         reason, there = self.reasons(sender, y, key, k), ~jnp.isnan(z)
         items = self.region == "each"
         arrived = there if items else jnp.full(len(y), jnp.any(there))
@@ -125,7 +125,7 @@ class AbstractTrigger(Module):
         return self.after(sender, y, reason, arrived), received
 
     def known_losses(self, sender: Sender, reason: jax.Array, arrived: jax.Array) -> jax.Array:
-        """Numbers about losses that arrive behind z, from the sender before this step."""
+        """Return the numbers about losses that arrive behind z, from the sender before this step."""
         sent = reason > 0
         if self.losses == "numbered":
             flags = jnp.where(arrived & sent, sender.lost.astype(float), jnp.nan)
@@ -140,7 +140,7 @@ class AbstractThreshold(AbstractTrigger):
     delta: eqx.AbstractVar[Float[Array, "..."]]
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """|y - reference| > delta, of a component, of any of them, or of all as a vector."""
+        """Return |y - reference| > delta, of a component, of any of them, or of all as a vector."""
         delta = jnp.asarray(self.delta)
         if self.region == "ball":
             return jnp.full(len(error), jnp.sum(error**2) > delta**2)
@@ -250,12 +250,12 @@ class StochasticTrigger(AbstractTrigger):
         self.region, self.heartbeat = "box", None
 
     def matrix(self, outputs: int) -> jax.Array:
-        """W as a matrix (m, m)."""
+        """Return W as a matrix (m, m)."""
         weight = jnp.asarray(self.weight)
         return weight * jnp.eye(outputs) if weight.ndim == 0 else weight
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """A draw that exceeds exp(-e' W e / 2)."""
+        """Return a draw that exceeds exp(-e' W e / 2)."""
         silent = jnp.exp(-error @ self.matrix(len(error)) @ error / 2)
         return jnp.full(len(error), jax.random.uniform(key, dtype=float) > silent)
 
@@ -292,7 +292,7 @@ class Periodic(AbstractTrigger):
         self.reference, self.losses, self.region, self.heartbeat = "zero", "unknown", "box", None
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """k = phase (mod period)."""
+        """Return k = phase (mod period)."""
         return jnp.full(len(error), k % self.period == self.phase)
 
     def _event_reason(self) -> int:
@@ -300,7 +300,7 @@ class Periodic(AbstractTrigger):
 
 
 def threshold(delta: ArrayLike) -> Float[Array, "..."]:
-    """A delta, which is positive, or one for each component."""
+    """Return A delta, which is positive, or one for each component."""
     report_domain("delta", delta, POSITIVE)
     checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
     if not is_traced(checked) and not np.all(checked > 0):

@@ -23,7 +23,7 @@ LOG_TURN = float(np.log(2 * np.pi))
 def log_density(
     value: "Float[jax.Array, ' m']", covariance: "Float[jax.Array, 'm m']", size: "Float[jax.Array, ' m']"
 ) -> "Float[jax.Array, '']":
-    """log N(value; 0, covariance) of the components that are not NaN, 0 if all are.
+    """Return log N(value; 0, covariance) of the components that are not NaN, 0 if all are.
 
     Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
     covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf

@@ -14,7 +14,7 @@ A = TypeVar("A", jax.Array, np.ndarray)
 
 
 def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Eigenvalues and eigenvectors of a symmetric matrix; of a batch one after another.
+    """Return the eigenvalues and eigenvectors of a symmetric matrix; of a batch one after another.
 
     A batch at once is dealt out to the processor's threads by a call that waits for them on one of them: programs that
     run side by side on as many threads then wait for each other for ever.
@@ -24,7 +24,7 @@ def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.
 
 
 def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
-    """A^+ B for a positive semidefinite A, by its correlation matrix, so that units do not matter; NumPy or JAX.
+    """Return A^+ B for a positive semidefinite A, by its correlation matrix, so that units do not matter; NumPy or JAX.
 
     Directions with an eigenvalue below `tolerance` of the largest are skipped, as are rows of zeros.
     """
@@ -39,7 +39,7 @@ def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
 
 
 def spectral_radius(matrix: Float[np.ndarray, "N N"]) -> float:
-    """The largest modulus of an eigenvalue."""
+    """Return the largest modulus of an eigenvalue."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 

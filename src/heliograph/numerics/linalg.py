@@ -21,7 +21,7 @@ OFF_VALUE = 1e-9  # of its size: how far a component that the others determine m
 
 
 def symmetric(a: jax.Array) -> jax.Array:
-    """A symmetric matrix from what is symmetric but for rounding: its upper triangle, mirrored.
+    """Return a symmetric matrix from what is symmetric but for rounding: its upper triangle, mirrored.
 
     Native code does not compute the lower one.
     """
@@ -44,12 +44,12 @@ def scale(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def contract(tensor: Array, matrix: Array) -> jax.Array:
-    """sum_ab T_ijab W_ab."""
+    """Return sum_ab T_ijab W_ab."""
     return jnp.einsum("ijab,ab->ij", tensor, matrix)
 
 
 def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) -> float:
-    """A relative tolerance, or so many units of an array's rounding where its precision does not allow that."""
+    """Return a relative tolerance, or so many units of an array's rounding where its precision does not allow that."""
     return max(tolerance, units * float(np.finfo(like.dtype).eps))
 
 
@@ -163,7 +163,7 @@ def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
-    """x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
+    """Return x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
 
     A component that those before it determine, or that is known to its rounding, counts 1, what is expected of it in
     the limit, where x says what they say, and is infinite where it does not; `size` (n,) is what x is a difference of,
@@ -175,7 +175,7 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
 def squared_distances(
     a: jax.Array, x: jax.Array, size: Array | float = 0.0, roundings: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """The terms of `squared_distance`, each given those before it, and which of them these determine.
+    """Return the terms of `squared_distance`, each given those before it, and which of them these determine.
 
     `roundings` of its size: a component with no larger deviation counts as determined.
     """
@@ -192,6 +192,6 @@ def squared_distances(
 
 
 def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
-    """L^-1 x for a positive semidefinite A = L L'; NaN for a component that those before it determine."""
+    """Return L^-1 x for a positive semidefinite A = L L'; NaN for a component that those before it determine."""
     lower, scales = factor(a)
     return jnp.where(scales == 0, jnp.nan, _substitute(lower, scales, x[:, None])[:, 0] * scales)

@@ -107,7 +107,7 @@ def _repr(self: object) -> str:
 
 
 def _html(self: object) -> str:
-    """A table of the parts; what has parts itself opens where it stands."""
+    """Return a table of the parts; what has parts itself opens where it stands."""
     return _table(self, DEPTH)
 
 
@@ -146,7 +146,7 @@ def _ours(value: object) -> bool:
 
 
 def _parts(value: object) -> Iterable[tuple[str, object]]:
-    """Names and values of what an object holds and anybody may use."""
+    """Return the names and values of what an object holds and anybody may use."""
     if isinstance(value, Mapping):
         return ((repr(key), entry) for key, entry in value.items())
     if is_dataclass(value):

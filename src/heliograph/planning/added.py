@@ -46,13 +46,13 @@ class SummedLinks(NamedTuple):
     present: Vector
 
     def information(self, amplitudes: Vector) -> Float[np.ndarray, "n n"]:
-        """J of a step."""
+        """Return J of a step."""
         heard = amplitudes @ self.rows
         noise = float(amplitudes @ self.noise @ amplitudes) + self.floor
         return np.outer(heard, heard) / noise if noise > 0 else np.zeros((len(heard),) * 2)
 
     def best_information(self, total: float) -> Float[np.ndarray, "n n"]:
-        """B' (D + N T / P)^-1 B, which no amplitudes of this total power exceed."""
+        """Return B' (D + N T / P)^-1 B, which no amplitudes of this total power exceed."""
         noise = self.noise + np.diag(self.floor * self.unit / total)
         bound: np.ndarray = self.rows.T @ np.linalg.solve(noise, self.rows)
         return bound
@@ -67,7 +67,7 @@ def adds_up(network: object) -> bool:
 
 
 def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
-    """Powers of the least steady error within the budget: closed forms of one signal, a search of several.
+    """Return the powers of the least steady error within the budget: closed forms of one signal, a search of several.
 
     Raises:
         ValueError: parts that the formulas do not cover; `hg.design` of a function of free numbers does.
@@ -117,7 +117,7 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
 
 
 def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
-    """The links of a node's sum, and the sum with all amplitudes 1."""
+    """Return the links of a node's sum, and the sum with all amplitudes 1."""
     sensor, channel = node.sensor, node.channel
     if not isinstance(sensor, LinearSensor) or sensor.circular:
         raise _unfit("a sensor that varies, is not linear or has angles")
@@ -154,7 +154,7 @@ def _unfit(got: str) -> ValueError:
 def steady_error(
     matrix: Float[np.ndarray, "n n"], process: Float[np.ndarray, "n n"], information: Float[np.ndarray, "n n"]
 ) -> Float[np.ndarray, "n n"]:
-    """Steady covariance after each step of a filter that learns this information at each."""
+    """Return the steady covariance after each step of a filter that learns this information at each."""
     values, vectors = np.linalg.eigh(information)
     used = values > ALIKE * max(values[-1], 0.0)
     if not used.any():
@@ -196,7 +196,7 @@ def solve_closed_form(links: SummedLinks, total: float, caps: Vector) -> Vector 
 
 
 def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
-    """a_i = min(theta b_i / D_i, cap_i) at the theta at which theta b' a = a' D a + N."""
+    """Return a_i = min(theta b_i / D_i, cap_i) at the theta at which theta b' a = a' D a + N."""
     ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
 
     def at(theta: float) -> Vector:
@@ -220,7 +220,7 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
 def search_amplitudes(
     links: SummedLinks, total: float, caps: Vector, value: Callable[[Vector], float], starts: int, seed: int
 ) -> Vector:
-    """Amplitudes of the least error that searches from random starts find; signs matter."""
+    """Return the amplitudes of the least error that searches from random starts find; signs matter."""
     generator, best, found = np.random.default_rng(seed), links.present, np.inf
     scale = np.minimum(caps, np.sqrt(total / links.unit))
     if not np.all(np.isfinite(scale)):

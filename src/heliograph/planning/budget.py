@@ -48,7 +48,7 @@ class Budget(Module):
 
 
 def check_budget(value: object) -> Budget:
-    """Budget from one, or from a number: that of the total power."""
+    """Return the budget from one, or from a number: that of the total power."""
     if isinstance(value, Budget):
         return value
     try:
@@ -94,7 +94,7 @@ class PowerLimits(NamedTuple):
         return powers
 
     def even(self, on: Bool[np.ndarray, "time free"]) -> Powers:
-        """Largest allowed powers that are equal wherever `on` and no narrower limit binds."""
+        """Return the largest allowed powers that are equal wherever `on` and no narrower limit binds."""
         limit = np.where(on, np.minimum(self.peak, self.mean), 0.0)  # a limit of the mean, at every step
         total = self.total * len(on)
         if not np.isfinite(total):
@@ -109,7 +109,7 @@ class PowerLimits(NamedTuple):
         return limit
 
     def clip(self, powers: Powers) -> Powers:
-        """Powers scaled down where rounding, or a solver's accuracy, puts them above a limit."""
+        """Return the powers scaled down where rounding, or a solver's accuracy, puts them above a limit."""
         powers = np.clip(powers, 0.0, self.peak)
         mean = powers.mean(axis=0)
         powers = powers * np.divide(self.mean, mean, out=np.ones_like(mean), where=mean > self.mean)
@@ -117,7 +117,7 @@ class PowerLimits(NamedTuple):
         return powers * (self.total / total) if total > self.total else powers
 
     def rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
-        """Finite limits of means over time as rows @ powers.ravel() <= 1, or <= 0 where nothing may be sent."""
+        """Return finite limits of means over time as rows @ powers.ravel() <= 1, or <= 0 where nothing may be sent."""
         steps, count = self.peak.shape
         rows = np.concatenate([np.tile(np.eye(count), steps), np.ones((1, steps * count))]) / steps
         most = np.append(self.mean, self.total)
@@ -127,14 +127,14 @@ class PowerLimits(NamedTuple):
 
 
 def make_unlimited(steps: int, count: int) -> PowerLimits:
-    """Limits that exclude nothing."""
+    """Return the limits that exclude nothing."""
     return PowerLimits(np.full((steps, count), np.inf), np.full(count, np.inf), np.inf)
 
 
 def power_limits(
     budget: Budget, names: Sequence[str], free: Bool[np.ndarray, "hop"], powers: Float[np.ndarray, "time hop"]
 ) -> PowerLimits:
-    """Limits that the budget leaves to the free transmitters, while the others send their `powers`.
+    """Return the limits that the budget leaves to the free transmitters, while the others send their `powers`.
 
     Raises:
         ValueError: limits for transmitters that there are not, powers of the others above the budget.

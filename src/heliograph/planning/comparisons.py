@@ -44,7 +44,7 @@ class Front(NamedTuple):
 
 
 def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: Advance = _silent) -> Front:
-    """Least error at each of several total powers.
+    """Return the least error at each of several total powers.
 
     Args:
         problem: the design problem; its other limits of power stay.
@@ -70,7 +70,7 @@ def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: A
 
 
 def totals_about(total: float) -> list[float]:
-    """Totals on both sides of a design's."""
+    """Return the totals on both sides of a design's."""
     return [float(power) for power in total * np.geomspace(1 / SPAN, SPAN, POINTS)]
 
 
@@ -96,7 +96,7 @@ def error_over_sites(
     y: "Float[ArrayLike, ' rows']",
     advance: Advance = _silent,
 ) -> "SiteMap":
-    """Least error at a design's total power, with its network standing elsewhere.
+    """Return the least error at a design's total power, with its network standing elsewhere.
 
     Args:
         best: the design.
@@ -168,7 +168,7 @@ def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: 
 
 
 def _changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
-    """Problems of the changed networks, by the change."""
+    """Return the problems of the changed networks, by the change."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     bare = {name: Node(node.sensor, node.channel, {}) for name, node in nodes.items()}
     free = None if problem.free is None else tuple(problem.free)
@@ -198,7 +198,7 @@ def _node(transmitter: str) -> str:
 
 
 def _halfway(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
-    """Channel in which a relay stands halfway of one hop."""
+    """Return the channel in which a relay stands halfway of one hop."""
 
     def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractRandomAffine:
         if hop_name != name or not isinstance(hop, GainAndNoise):

@@ -71,14 +71,14 @@ class Programme:
         self.size = max(value, 1e-12) if np.isfinite(value) else 1.0
 
     def at(self, z: Vector) -> Evaluation | None:
-        """Evaluation at a point; the last one is cached."""
+        """Return the evaluation at a point; the last one is cached."""
         key = z.tobytes()
         if key != self._last[0]:
             self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
         return self._last[1]
 
     def value(self, z: Vector) -> tuple[float, Vector]:
-        """Error, or mean total power where there is a target, and its derivative."""
+        """Return the error, or mean total power where there is a target, and its derivative."""
         now = self.at(z)
         if now is None:
             return np.inf, np.zeros_like(z)
@@ -97,7 +97,7 @@ class Programme:
         return left if target is None else np.append(left, 1 - now.error / target)
 
     def room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
-        """Derivative of the room."""
+        """Return the derivative of the room."""
         rows, most, target, _ = self.limits
         now = self.at(z)
         if now is None:
@@ -110,7 +110,7 @@ class Programme:
         return self.at(z) is not None and bool(np.all(self.room(z) >= -FEASIBLE))
 
     def merit(self, z: Vector) -> float:
-        """Value of a feasible point, else infinite."""
+        """Return the value of a feasible point, else infinite."""
         return self.value(z)[0] if self.feasible(z) else np.inf
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
@@ -124,7 +124,7 @@ class Programme:
         return end if self.merit(end) < before else z
 
     def _excess(self, z: Vector) -> tuple[float, Vector]:
-        """Squared excess over the limits, for a way back into them."""
+        """Return the squared excess over the limits, for a way back into them."""
         broken = np.minimum(self.room(z), 0.0)
         return float(broken @ broken), 2 * broken @ self.room_slope(z)
 
@@ -198,7 +198,7 @@ class Programme:
 
 
 def search(problem: Problem, limits: Limits, starts: Sequence[Vector]) -> Vector | None:
-    """Best of the descents from these points, refined and polished; None where no limits are met from any."""
+    """Return best of the descents from these points, refined and polished; None where no limits are met from any."""
     points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:

@@ -90,7 +90,7 @@ class Error(Module):
         return np.asarray(matrix)
 
     def criterion(self, states: tuple[str, ...]) -> "Criterion":
-        """Number for a plant with these states, as a function of covariances."""
+        """Return the number for a plant with these states, as a function of covariances."""
         shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
         weight = np.tile(self.matrix(states), (self.steps, 1, 1))
         return Criterion(weight, shares, SHARPER[-1] if self.worst else None)
@@ -120,7 +120,7 @@ class Criterion(NamedTuple):
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
     def supporting(self, p: Matrices) -> "Criterion":
-        """Linear function <V, P> that touches the number at p and is a lower bound of it everywhere."""
+        """Return the linear function <V, P> that touches the number at p and is a lower bound of it everywhere."""
         if self.sharpness is None:
             return self
         weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_root(self.weight))
@@ -128,11 +128,11 @@ class Criterion(NamedTuple):
         return self._replace(weight=weights / size[:, None, None], sharpness=None)
 
     def sharper(self) -> "list[Criterion]":
-        """Criteria from the smoothest to this one."""
+        """Return the criteria from the smoothest to this one."""
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
-        """f and its derivative at each step."""
+        """Return f and its derivative at each step."""
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
         # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.
@@ -146,7 +146,7 @@ class Criterion(NamedTuple):
 
 
 def _root(weight: Matrices) -> Matrices:
-    """W^1/2."""
+    """Return W^1/2."""
     values, vectors = np.linalg.eigh(weight)
     scale = np.sqrt(np.maximum(values, 0.0))
     return np.asarray((vectors * scale[:, None, :]) @ np.swapaxes(vectors, 1, 2))

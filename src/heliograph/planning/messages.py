@@ -72,7 +72,7 @@ def simulate_rate(
     horizon: int = 400,
     seed: int = 0,
 ) -> MessageRate:
-    """Rate and error of `event_filter` behind a rule, by simulation: any plant, any link.
+    """Return the rate and error of `event_filter` behind a rule, by simulation: any plant, any link.
 
     Means over the last three quarters of the steps.
 
@@ -190,7 +190,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
 
 
 def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
-    """The rate by two grids, however small."""
+    """Return the rate by two grids, however small."""
     a, r, delta = system.a, system.r / system.c**2, delta / abs(system.c)  # in units of the state
     if not abs(a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
@@ -201,7 +201,7 @@ def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
 
 
 def _rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
-    """The rate by a grid of cells of at most a share of the lesser noise's deviation, and the cells' length."""
+    """Return the rate by a grid of cells of at most a share of the lesser noise's deviation, and the cells' length."""
     a, q, _, r = system
     deviation = np.sqrt(q / (1 - a * a))
     # Cells that hold both noises, and reach over what is measured.
@@ -249,7 +249,7 @@ def _cells(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
 
 
 def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
-    """The delta with which send-on-delta transmits at a rate, by bisection of `send_on_delta_rate`.
+    """Return the delta with which send-on-delta transmits at a rate, by bisection of `send_on_delta_rate`.
 
     Args:
         plant: a linear plant of one state.
@@ -277,7 +277,7 @@ def _threshold(rate: float, of: Callable[[float], float], system: _Scalar, accur
 
 
 def _scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
-    """A linear plant and sensor of one state and one output."""
+    """Return a linear plant and sensor of one state and one output."""
     linear = isinstance(plant, LinearPlant) and isinstance(sensor, LinearSensor)
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor) or len(plant.states) != 1:
         got = "several states" if linear else f"{type(plant).__name__} and {type(sensor).__name__}"

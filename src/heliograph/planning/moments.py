@@ -29,7 +29,7 @@ def check_stable(transition: Float[np.ndarray, "n n"]) -> None:
 
 
 def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Solution of X = A X A' + Q, the covariance of a stable plant in the long run.
+    """Return the solution of X = A X A' + Q, the covariance of a stable plant in the long run.
 
     Args:
         transition: A, shape (n, n).
@@ -57,7 +57,7 @@ def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n 
 
 
 def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
-    """Plant and noise of the first step; ValueError unless it is linear and its noise depends on no inputs."""
+    """Return plant and noise of the first step; ValueError unless it is linear and its noise depends on no inputs."""
     start = first(plant)
     if not isinstance(start, LinearPlant):
         raise fail("plant", "a LinearPlant", type(start).__name__)
@@ -76,7 +76,7 @@ def check_design_plant(plant: AnyPlant) -> LinearPlant:
 
 
 def steady_moment(plant: AnyPlant) -> Float[Array, "n1 n1"]:
-    """Second moment E (x, 1)(x, 1)' in the steady state of a plant without inputs.
+    """Return the second moment E (x, 1)(x, 1)' in the steady state of a plant without inputs.
 
     Raises:
         ValueError: a plant that varies or is not stable.
@@ -118,7 +118,7 @@ def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
 
 
 def _noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
-    """Mean and covariance of w; the noise may be a function of the inputs in operations of JAX."""
+    """Return the mean and covariance of w; the noise may be a function of the inputs in operations of JAX."""
     if isinstance(plant.noise, AbstractNoise):
         return plant.noise.mean, plant.noise.covariance
     with jax.enable_x64(True):
@@ -126,7 +126,7 @@ def _noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, A
 
 
 def measurement_moment(sensor: AnySensor, second: Float[Array, "n1 n1"], step: int = 0) -> Float[Array, "m1 m1"]:
-    """Second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
+    """Return the second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
     now = at(sensor, step)
     c, offset, noise = now.matrix, now.noise.mean, now.noise.covariance
     rows = _extend(c, offset)
@@ -135,7 +135,7 @@ def measurement_moment(sensor: AnySensor, second: Float[Array, "n1 n1"], step: i
 
 
 def _extend(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
-    """Matrix of (x, 1) -> (M x + shift, 1)."""
+    """Return the matrix of (x, 1) -> (M x + shift, 1)."""
     last = np.eye(1, matrix.shape[1] + 1, matrix.shape[1])
     xp = library(matrix, shift)
     extended: Array = xp.concatenate([xp.concatenate([matrix, shift[:, None]], axis=1), last])

@@ -133,7 +133,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
 
 
 def _free(paths: Paths, free: Sequence[str] | None) -> Bool[np.ndarray, "hop"]:
-    """Mask of the free transmitters."""
+    """Return the mask of the free transmitters."""
     if free is None:
         names: Sequence[str] = paths.names
     else:
@@ -191,7 +191,7 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
 
 
 def _running(relays: RelayNetwork, gains: Gains) -> Network:
-    """Relays with their gains over COVERED steps and more, and the best receiver behind them."""
+    """Return the relays with their gains over COVERED steps and more, and the best receiver behind them."""
     slots, n = len(relays.slots), len(relays.states)
     times = -(-COVERED // slots)
     over_time = {name: np.tile(gain, (times, 1, 1)) for name, gain in gains.items()}

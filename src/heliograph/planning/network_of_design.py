@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "steps"]], error: Error) -> Network:
-    """Network whose transmitters send these powers, with the best linear filters behind them.
+    """Return the network whose transmitters send these powers, with the best linear filters behind them.
 
     Every node has the filter "best" behind its channel, and with several nodes "best" is also that of all that they
     receive together. Codes of sensors stay; limits of received numbers stay where a node's powers do, since others move
@@ -72,7 +72,7 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
 
 
 def repeat_network(network: Network) -> Network:
-    """Network with everything in it that is OverTime repeated, over as many steps as a run may have."""
+    """Return the network with everything in it that is OverTime repeated, over as many steps as a run may have."""
 
     def again(leaf: object) -> object:
         if not isinstance(leaf, OverTime):
@@ -85,7 +85,7 @@ def repeat_network(network: Network) -> Network:
 
 
 def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Powers by transmitter, of all steps."""
+    """Return the powers by transmitter, of all steps."""
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
     given = table("powers of a network", powers, "powers")
     if unknown := sorted(set(given) - known):
@@ -110,5 +110,5 @@ def _select_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k:
 
 
 def _make_over_time(steps: Sequence[T]) -> T | OverTime:
-    """A single object for ever, or an object for each step."""
+    """Return a single object for ever, or an object for each step."""
     return steps[0] if len(steps) == 1 else over_time(steps)

@@ -141,13 +141,13 @@ def _sources(network: Network) -> Sources:
 
 
 def _feedback_filters(network: Network) -> dict[str, AbstractFilter]:
-    """Filters that send their prediction back to the sensor, by node."""
+    """Return the filters that send their prediction back to the sensor, by node."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     return {name: node.filters[node.informed_by] for name, node in nodes.items() if node.informed_by is not None}
 
 
 def _innovation_moments(filter: AbstractFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> Moments:
-    """C P C' + R of the filter's prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
+    """Return C P C' + R of the filter's prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
         raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
@@ -165,7 +165,7 @@ def _innovation_moments(filter: AbstractFilter, inputs: Float[np.ndarray, "steps
 
 
 def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Powers of relays that filter: exact for schedules made as if a relay's estimate were everybody's."""
+    """Return the powers of relays that filter: exact for schedules made as if a relay's estimate were everybody's."""
     relays = network.relays
     assert relays is not None
     filters = {name: network.nodes[name].filters[Network.LOCAL] for name in relays.relays}
@@ -191,7 +191,7 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
 def _draw_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], runs: int, seed: int
 ) -> dict[str, Moments]:
-    """E (y, 1)(y, 1)' of each sensor over each batch of drawn trajectories."""
+    """Return E (y, 1)(y, 1)' of each sensor over each batch of drawn trajectories."""
     keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
     sensors = {name: sensor for name, (sensor, _) in sources.items()}
     return {name: np.asarray(y) for name, y in _average_draws(plant, sensors, jnp.asarray(inputs), keys).items()}

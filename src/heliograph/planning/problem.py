@@ -54,7 +54,7 @@ class DesignProblem:
         return Error() if self.error is None else self.error
 
     def replace_total(self, total: float) -> "DesignProblem":
-        """Problem of the least error with this total power, other limits of the budget staying.
+        """Return the problem of the least error with this total power, other limits of the budget staying.
 
         Args:
             total: largest mean power of all transmitters together.

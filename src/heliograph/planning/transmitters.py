@@ -35,7 +35,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
 
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
-    """Names of the transmitters, in order of appearance."""
+    """Return the names of the transmitters, in order of appearance."""
     names: dict[str, None] = {}
 
     def note(name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
@@ -47,7 +47,7 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
 
 
 def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
-    """Mask of the names that are chosen, by name or by what stands before a dot.
+    """Return the mask of the names that are chosen, by name or by what stands before a dot.
 
     Raises:
         ValueError: a choice that is there under no name.
@@ -75,7 +75,7 @@ def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int
 
 
 def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
-    """Power of each transmitter in the long run, whatever modes the channel began with."""
+    """Return the power of each transmitter in the long run, whatever modes the channel began with."""
     joint = joint_modes(channel, order=2)
     unchanged = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
     return powers_of_law(channel, second, joint.initial if unchanged else stationary(joint.transition))
@@ -103,7 +103,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
 
 
 def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:
-    """Conditional mean; zero where the condition never holds."""
+    """Return the conditional mean; zero where the condition never holds."""
     if is_traced(probability):
         quotient: Scalar = total / library(probability).where(probability == 0, 1.0, probability)
         return quotient
@@ -113,7 +113,7 @@ def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:
 def allocate(
     channel: AbstractRandomAffine, second: Second, powers: Mapping[str, float], step: int = 0
 ) -> AbstractRandomAffine:
-    """Channel whose named transmitters send these powers: each amplifies what it receives to its power.
+    """Return the channel whose named transmitters send these powers: each amplifies what it receives to its power.
 
     Raises:
         ValueError: a transmitter that receives nothing which it could amplify.

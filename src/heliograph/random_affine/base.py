@@ -145,7 +145,7 @@ class AbstractRandomAffine(Module):
         return stack_parts([m.moments(order).matrix for m in self.extremes()])
 
     def moment_interval(self, order: int) -> Interval:
-        """Lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
+        """Return the lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
 
         Up to CORNERS corner laws the ends are attained, since every entry is linear in each uncertain law; above, the
         intervals of the parts are multiplied: sound but not attained.
@@ -233,7 +233,7 @@ class AbstractRandomAffine(Module):
         raise fail("mixture filter", "maps made of hops, series, stacks, sums and mixtures", type(self).__name__)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Joint moments of the gain and of the gains of the noise sources, in the order of the signal's way.
+        """Return the joint moments of the gain and of the gains of the noise sources, in the order of the signal's way.
 
         A noise of covariance R counts as rank(R) sources of unit size, and its mean as their disturbance: a mean that
         they cannot make is refused. Uncertain probabilities count as nominal.

@@ -96,7 +96,7 @@ class AbstractMemory(Module):
         raise unwritten(self, "state_from_number")
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """Points and weights for the next state's law given this one (None: for the law at the first use).
+        """Return the points and weights for the next state's law given this one (None: for the law at the first use).
 
         Exact for polynomials of twice the `degree` in the state.
         """
@@ -180,15 +180,15 @@ class MarkovChain(AbstractMemory):
         return draw_index(jnp.asarray(self.transition)[state], key)
 
     def nodes(self, degree: int) -> Nodes:
-        """The modes."""
+        """Return the modes."""
         return Nodes(np.arange(self.modes), self.initial, self.transition, self.radius)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
-        """The nearest mode from below."""
+        """Return the nearest mode from below."""
         return jnp.clip(jnp.asarray(number).astype(int), 0, self.modes - 1)
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """The modes with their probabilities."""
+        """Return the modes with their probabilities."""
         law = jnp.asarray(self.initial) if state is None else jnp.asarray(self.transition)[state]
         return jnp.arange(self.modes), law
 
@@ -241,7 +241,7 @@ class Autoregression(AbstractMemory):
         return jax.random.normal(key, dtype=float)
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
-        """rho c + sqrt(1 - rho^2) e."""
+        """Return rho c + sqrt(1 - rho^2) e."""
         rho = jnp.asarray(self.correlation)
         return rho * state + jnp.sqrt(1 - rho**2) * jax.random.normal(key, dtype=float)
 
@@ -257,11 +257,11 @@ class Autoregression(AbstractMemory):
         return Nodes(x, w, (hermite * powers) @ hermite.T * w)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
-        """The number."""
+        """Return the number."""
         return number
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x; x itself at the first use."""
+        """Return rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x; x itself at the first use."""
         x, w, _ = _hermite_quadrature(degree + 1)
         rho = jnp.asarray(self.correlation)
         return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
@@ -284,7 +284,7 @@ class Autoregression(AbstractMemory):
 
 
 def stationary(transition: Rows) -> Law:
-    """The law p = p Pi of a chain that has only one."""
+    """Return the law p = p Pi of a chain that has only one."""
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:
@@ -303,7 +303,7 @@ def identify_memory(name: str | None) -> str:
 
 
 def _binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
-    """Probabilities of 0, ..., n successes."""
+    """Return the probabilities of 0, ..., n successes."""
     k = np.arange(n + 1)
     ways = np.array([comb(n, i) for i in k], dtype=float)
     binomial: jax.Array | np.ndarray = ways * p**k * (1 - p) ** (n - k)
@@ -319,7 +319,7 @@ def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Memories without repetition, told apart by their labels, in order of appearance."""
+    """Return the memories without repetition, told apart by their labels, in order of appearance."""
     results: dict[str, AbstractMemory] = {}
     for memory in held:
         known = results.setdefault(memory.identity, memory)

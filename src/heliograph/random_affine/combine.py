@@ -53,12 +53,12 @@ class AbstractCombination(AbstractComposite):
         return self.maps[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """The maps' states."""
+        """Return the maps' states."""
         keys = jax.random.split(key, len(self.maps))
         return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
 
     def degree_in(self, identity: str) -> int:
-        """Largest degree of a map, since they stand side by side."""
+        """Return the largest degree of a map, since they stand side by side."""
         return max(affine.degree_in(identity) for affine in self.maps)
 
     def covers_maps(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
@@ -70,7 +70,7 @@ class AbstractCombination(AbstractComposite):
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
     ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
-        """Next state and one H of each map."""
+        """Return the next state and one H of each map."""
         states = state if self.remembers else ((),) * len(self.maps)
         pairs = [m.draw(s, k) for m, s, k in zip(self.maps, states, keys, strict=True)]
         return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
@@ -79,7 +79,7 @@ class AbstractCombination(AbstractComposite):
 def _join_outcomes(
     a: list[Outcome], b: list[Outcome], join: Callable[[Outcome, Outcome], tuple[AbstractRandomAffine, np.ndarray]]
 ) -> list[Outcome]:
-    """Losses of independent parts: probabilities multiply."""
+    """Return the losses of independent parts: probabilities multiply."""
     if len(a) * len(b) > OUTCOME_LIMIT:
         raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
     return [Outcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
@@ -113,7 +113,7 @@ class Series(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> Moments:
-        """E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
+        """Return E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
         matrix = reduce(lambda done, affine: affine.moments(order).matrix @ done, self.maps[1:],
                         self.maps[0].moments(order).matrix)  # fmt: skip
@@ -121,7 +121,7 @@ class Series(AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Products of the parts' corners."""
+        """Return the products of the parts' corners."""
         first, *rest = (m.corner_moments(order) for m in self.maps)
         for corners in rest:
             products = corners @ first[:, None]
@@ -129,7 +129,7 @@ class Series(AbstractCombination):
         return first
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Products of the parts' intervals."""
+        """Return the products of the parts' intervals."""
         intervals = [m.moment_interval(order) for m in self.maps]
         return reduce(lambda before, after: multiply_matrices(after, before), intervals)
 
@@ -139,19 +139,19 @@ class Series(AbstractCombination):
         return [m for affine in self.maps for m in affine.in_series]
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Those that are known behind each map in turn."""
+        """Return those that are known behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_known_gains(before), self.maps, known)
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those that are angles behind each map in turn."""
+        """Return those that are angles behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_angles(before), self.maps, sent)
 
     def degree_in(self, identity: str) -> int:
-        """Sum of the maps' degrees, since they are multiplied."""
+        """Return the sum of the maps' degrees, since they are multiplied."""
         return sum(affine.degree_in(identity) for affine in self.maps)
 
     def condition_on_arrival(self) -> AbstractRandomAffine:
-        """The same series of maps through which everything arrives."""
+        """Return the same series of maps through which everything arrives."""
         return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
 
     def _outcomes(self) -> list[Outcome]:
@@ -159,15 +159,15 @@ class Series(AbstractCombination):
         return reduce(partial(_join_outcomes, join=_join_in_series), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[Component]:
-        """Every atom of each map, one after another."""
+        """Return every atom of each map, one after another."""
         return combine([affine.list_atoms() for affine in self.maps], Component.then)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Those of each map, then of the next."""
+        """Return those of each map, then of the next."""
         return reduce(DisturbedGain.then, (affine.disturb_gain() for affine in self.maps))
 
     def in_words(self) -> str:
-        """The maps in words, with arrows between them."""
+        """Return the maps in words, with arrows between them."""
         return ARROW.join(filter(None, (affine.in_words() for affine in self.maps)))
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
@@ -187,7 +187,7 @@ class Series(AbstractCombination):
         return self.rebuilt(*visited), position
 
     def carry_signal(self, signal: Signal) -> Signal:
-        """The signal behind each map in turn."""
+        """Return the signal behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_signal(before), self.maps, signal)
 
 
@@ -199,7 +199,7 @@ def _join_in_series(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.nd
 
 
 def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
-    """The product of two drawn maps, where NaN rows of the first are lost: what has no gain on them is not."""
+    """Return the product of two drawn maps, where NaN rows of the first are lost: what has no gain on them is not."""
     lost = jnp.isnan(first).any(axis=1)
     reached = jnp.any((second != 0) & lost, axis=1) | jnp.isnan(second).any(axis=1)
     return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
@@ -228,7 +228,7 @@ class Stack(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> Moments:
-        """E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
+        """Return E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
         check_forgets("moments of a map", self)
         refuse_if_too_large(
             count_monomials(self.outputs + 1, order),
@@ -242,7 +242,7 @@ class Stack(AbstractCombination):
         )
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Products of the parts' interval polynomials, row by row."""
+        """Return the products of the parts' interval polynomials, row by row."""
         tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
         rows = stack_parts(stack_rows(self, order, tables, multiply_rows))
         return rows[:, 0], rows[:, 1]
@@ -257,17 +257,17 @@ class Stack(AbstractCombination):
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Those of the maps, one after another."""
+        """Return those of the maps, one after another."""
         return np.concatenate([affine.carry_known_gains(known) for affine in self.maps])
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those of the maps, whose outputs stand one after another."""
+        """Return those of the maps, whose outputs stand one after another."""
         starts = np.cumsum([0, *(affine.outputs for affine in self.maps)])
         items = zip(starts, self.maps, strict=False)
         return tuple(int(start) + i for start, affine in items for i in affine.carry_angles(sent))
 
     def condition_on_arrival(self) -> AbstractRandomAffine:
-        """The same stack of maps through which everything arrives."""
+        """Return the same stack of maps through which everything arrives."""
         return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
 
     def _outcomes(self) -> list[Outcome]:
@@ -275,15 +275,15 @@ class Stack(AbstractCombination):
         return reduce(partial(_join_outcomes, join=_join_in_stack), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[Component]:
-        """Every atom of each map, one above another."""
+        """Return every atom of each map, one above another."""
         return combine([affine.list_atoms() for affine in self.maps], Component.above)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Those of the maps, one above another."""
+        """Return those of the maps, one above another."""
         return stack_gains([affine.disturb_gain() for affine in self.maps], self.inputs)
 
     def in_words(self) -> str:
-        """The maps in words, between bars."""
+        """Return the maps in words, between bars."""
         return list_in_words(self.maps)
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:

@@ -34,7 +34,7 @@ class AbstractComposite(AbstractRandomAffine):
         return tuple(self.rebuilt(*parts) for parts in product(*(affine.extremes() for affine in self.parts)))
 
     def corner_count(self) -> int:
-        """Product of the parts' counts."""
+        """Return the product of the parts' counts."""
         return prod(affine.corner_count() for affine in self.parts)
 
     def mean_gain(self) -> AbstractRandomAffine:
@@ -56,7 +56,7 @@ class AbstractWrapper(AbstractComposite):
         return self.parts[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the part."""
+        """Return the state of the part."""
         return self.parts[0].init(key)
 
 
@@ -76,7 +76,7 @@ class AbstractUniform(AbstractRandomAffine):
         return self.maps[0].inputs
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those of every map: all choices must agree."""
+        """Return those of every map: all choices must agree."""
         results = {affine.carry_angles(sent) for affine in self.maps}
         if len(results) > 1:
             raise refuse_gain_on_angles(type(self).__name__)

@@ -73,12 +73,12 @@ class DelayLine(AbstractDelayLine):
         return self.steps
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those of the map, from the angles of what was sent at each of the steps that may arrive."""
+        """Return those of the map, from the angles of what was sent at each of the steps that may arrive."""
         size = signal_size(self)
         return self.line.carry_angles(tuple(t * size + i for t in range(1 + self.past) for i in sent))
 
     def in_words(self) -> str:
-        """The map in words."""
+        """Return the map in words."""
         return self.plain.in_words()
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
@@ -141,11 +141,11 @@ class Delayed(AbstractDelayLine):
         return isinstance(self.delay, GainAndNoise)
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those of the link; a time stamp stands after them."""
+        """Return those of the link; a time stamp stands after them."""
         return self.link.carry_angles(sent)
 
     def in_words(self) -> str:
-        """The link in words, and how late it is."""
+        """Return the link in words, and how late it is."""
         late = f"{'/'.join(map(str, self.times))} steps late{', timestamped' if self.timestamped else ''}"
         return f"{self.link.in_words() or DIRECT}, {late}"
 
@@ -155,7 +155,7 @@ class Delayed(AbstractDelayLine):
         return replace_inner_maps(self, [link, self.delay]), position
 
     def carry_signal(self, signal: Signal) -> Signal:
-        """The signal behind the link, as if it were not late."""
+        """Return the signal behind the link, as if it were not late."""
         return self.link.carry_signal(signal)
 
     def given(self, d: int) -> AbstractRandomAffine:
@@ -186,7 +186,7 @@ def _selection_matrix(d: int, longest: int, size: int, timestamped: bool) -> Gai
 
 
 def place_on_delay_line(channel: T) -> T:
-    """The channel (or all channels in a tree) as a plain map of the line."""
+    """Return the channel (or all channels in a tree) as a plain map of the line."""
 
     def plain(leaf: object) -> object:
         return leaf.line if isinstance(leaf, AbstractDelayLine) else leaf
@@ -196,12 +196,12 @@ def place_on_delay_line(channel: T) -> T:
 
 
 def signal_size(channel: AbstractRandomAffine) -> int:
-    """Numbers that are sent to a channel at each step."""
+    """Return the numbers that are sent to a channel at each step."""
     return channel.inputs // (1 + channel.past)
 
 
 def place_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
-    """The channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
+    """Return the channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
     longest, size = channel.past, signal_size(channel)
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
     chosen = Series([known(np.eye((1 + past) * total)[rows]), place_on_delay_line(channel) if longest else channel])
@@ -275,7 +275,7 @@ class Relayed(AbstractDelayLine):
         return whole
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those that are angles behind each stage in turn."""
+        """Return those that are angles behind each stage in turn."""
         return reduce(lambda before, stage: stage.carry_angles(before), self.stages, sent)
 
     @property

@@ -38,7 +38,7 @@ class Erasure(AbstractWrapper):
         return state, h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
 
     def condition_on_arrival(self) -> AbstractRandomAffine:
-        """What arrives through the map."""
+        """Return what arrives through the map."""
         return self.base.condition_on_arrival()
 
     def _outcomes(self) -> list[Outcome]:
@@ -48,11 +48,11 @@ class Erasure(AbstractWrapper):
         return [*listed, Outcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those of the map: what is lost is none."""
+        """Return those of the map: what is lost is none."""
         return self.base.carry_angles(sent)
 
     def in_words(self) -> str:
-        """The map in words, and how much of it is lost."""
+        """Return the map in words, and how much of it is lost."""
         return f"{self.base.in_words() or DIRECT}, {percent_in_words(1 - self.arrival)} lost"
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
@@ -61,7 +61,7 @@ class Erasure(AbstractWrapper):
         return self.rebuilt(base), position
 
     def carry_signal(self, signal: Signal) -> Signal:
-        """The signal behind the map, of what arrives."""
+        """Return the signal behind the map, of what arrives."""
         signal = self.base.carry_signal(signal)
         return signal._replace(arrives=signal.arrives * plain(self.arrival))
 

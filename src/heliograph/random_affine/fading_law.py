@@ -125,7 +125,7 @@ class Nakagami(AbstractLaw):
         )
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """(2 m - 1) log(g) - m g^2 / power."""
+        """Return (2 m - 1) log(g) - m g^2 / power."""
         m = jnp.asarray(self.shape)
         return (2 * m - 1) * jnp.log(g) - m * jnp.square(g) / self.power
 
@@ -165,7 +165,7 @@ class LogNormal(AbstractLaw):
         return True
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """-log(g) - (log(g) - log_mean)^2 / (2 log_deviation^2)."""
+        """Return -log(g) - (log(g) - log_mean)^2 / (2 log_deviation^2)."""
         return -jnp.log(g) - jnp.square((jnp.log(g) - self.log_mean) / self.log_deviation) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:

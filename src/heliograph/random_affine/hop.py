@@ -125,7 +125,7 @@ class GainAndNoise(AbstractHop):
         return tuple(GainAndNoise(law, self.matrix, self.noise) for law in self.law.extremes())
 
     def corner_count(self) -> int:
-        """Number of extreme laws of the gain."""
+        """Return the number of extreme laws of the gain."""
         return len(self.law.corner_moments(0))
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
@@ -150,13 +150,13 @@ class GainAndNoise(AbstractHop):
         return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Those that take nothing but known inputs, by a constant gain."""
+        """Return those that take nothing but known inputs, by a constant gain."""
         takes = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
         rows: KnownGains = (self.law.constant is not None) & ~np.any(takes & ~known, axis=1)
         return rows
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those that take one angle each by a gain of 1, and with it whole numbers of turns."""
+        """Return those that take one angle each by a gain of 1, and with it whole numbers of turns."""
         if not sent:
             return ()
         if is_traced(self.matrix):
@@ -179,12 +179,12 @@ class GainAndNoise(AbstractHop):
         return [Component(p * q, g * self.matrix, c, r) for p, g in gains for q, c, r in noises]
 
     def disturb_gain(self) -> DisturbedGain:
-        """Those of [g A, N], N a root of the noise's covariance."""
+        """Return those of [g A, N], N a root of the noise's covariance."""
         root = noise_gain(np.asarray(self.noise.mean), np.asarray(self.noise.covariance))
         return disturb_hop(np.asarray(self.matrix), (float(self.law.moment(1)), float(self.law.moment(2))), root)
 
     def in_words(self) -> str:
-        """The law, the gain where that is one known number, and whether the hop adds noise."""
+        """Return the law, the gain where that is one known number, and whether the hop adds noise."""
         matrix = np.asarray(self.matrix)
         silent = not (np.any(np.asarray(self.noise.covariance)) or np.any(np.asarray(self.noise.mean)))
         if not matrix.any():
@@ -223,7 +223,7 @@ class GainAndNoise(AbstractHop):
 
 
 def affine_matrix(matrix: Matrix) -> Matrix:
-    """[[A, 0], [0, 1]], which maps (y, 1) to (A y, 1)."""
+    """Return [[A, 0], [0, 1]], which maps (y, 1) to (A y, 1)."""
     outputs, inputs = matrix.shape
     right, below = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
     xp = library(matrix)

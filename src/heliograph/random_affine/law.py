@@ -62,7 +62,7 @@ class AbstractLaw(Module):
         return stack_parts([stack_parts([law.moment(k) for k in range(order + 1)]) for law in self.extremes()])
 
     def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
-        """Lowest and highest E[g^order] over the possible laws, those of the `extremes`."""
+        """Return the lowest and highest E[g^order] over the possible laws, those of the `extremes`."""
         ends = self.corner_moments(order)[:, order]
         return plain(ends.min()), plain(ends.max())
 
@@ -75,7 +75,7 @@ class AbstractLaw(Module):
         raise fail("mixture filter", "gains of finitely many values", type(self).__name__)
 
     def quantile(self, probability: Vector) -> np.ndarray:
-        """Gains below which these probabilities lie; by default those of DRAWS samples.
+        """Return the gains below which these probabilities lie; by default those of DRAWS samples.
 
         Raises:
             ValueError: a law that cannot be sampled.
@@ -130,7 +130,7 @@ class Constant(AbstractLaw):
         return plain(self.value**order)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
-        """The value, which is certain."""
+        """Return the value, which is certain."""
         return [(1.0, plain(self.value))]
 
 
@@ -155,7 +155,7 @@ class Discrete(AbstractLaw):
         return plain(self.probabilities @ self.values**order)
 
     def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
-        """Lowest and highest E[g^order], also where the corners are too many to list."""
+        """Return the lowest and highest E[g^order], also where the corners are too many to list."""
         powers = self.values**order
         return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
 
@@ -166,7 +166,7 @@ class Discrete(AbstractLaw):
         return within(own.probabilities, own.radius, self.probabilities, self.radius)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
-        """The values, with their probabilities."""
+        """Return the values, with their probabilities."""
         return [(plain(p), plain(v)) for p, v in zip(self.probabilities, self.values, strict=True)]
 
     def worst(self, payoff: ArrayLike) -> float:
@@ -185,7 +185,7 @@ class Discrete(AbstractLaw):
         return total
 
     def extremes(self) -> tuple[AbstractLaw, ...]:
-        """Laws at all corners of the polytope.
+        """Return the laws at all corners of the polytope.
 
         Raises:
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
@@ -193,13 +193,13 @@ class Discrete(AbstractLaw):
         return tuple(Discrete(self.values, corner) for corner in self.corners())
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
-        """E[g^k], k = 0, ..., order, of each of the `extremes`."""
+        """Return E[g^k], k = 0, ..., order, of each of the `extremes`."""
         corners = self.corners()
         return stack_parts([corners @ self.values**k for k in range(order + 1)]).T
 
     @cache_by_object
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
-        """Corners of the polytope of probabilities: each but one at an end of its interval.
+        """Return the corners of the polytope of probabilities: each but one at an end of its interval.
 
         Raises:
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
@@ -238,7 +238,7 @@ class CertainDiscrete(Discrete):
         self.values, self.probabilities, self.radius = law.values, law.probabilities, law.radius
 
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
-        """The probabilities alone."""
+        """Return the probabilities alone."""
         return self.probabilities[None]
 
 

@@ -64,7 +64,7 @@ def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array |
 
 
 def is_modal(leaf: object) -> bool:
-    """True for a map whose law depends on the state of a memory."""
+    """Return True for a map whose law depends on the state of a memory."""
     return isinstance(leaf, AbstractWithMemory)
 
 
@@ -98,7 +98,7 @@ def align_memories_over_time(maps: Sequence[T]) -> list[T]:
 
 
 def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
-    """The map with other memories in place of those of these identities."""
+    """Return the map with other memories in place of those of these identities."""
 
     def replaced(leaf: PyTree) -> PyTree:
         if not is_modal(leaf) or leaf.memory.identity not in twins:

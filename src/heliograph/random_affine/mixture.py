@@ -52,7 +52,7 @@ class Mixture(AbstractUniform, AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> Moments:
-        """sum_i p_i E[Sym^k(H_i)]."""
+        """Return sum_i p_i E[Sym^k(H_i)]."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix for m in self.maps]
         matrix = library(parts, self.choice.probabilities).tensordot(
@@ -61,7 +61,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         return Moments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Extreme weights combined with the extremes of each map."""
+        """Return the extreme weights combined with the extremes of each map."""
         corners = [law for law in self.choice.extremes() if isinstance(law, Discrete)]
         return tuple(
             Mixture(parts, law.probabilities)
@@ -71,7 +71,7 @@ class Mixture(AbstractUniform, AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """The corners of the weights, with every combination of the maps' corners."""
+        """Return the corners of the weights, with every combination of the maps' corners."""
         parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
         chosen = np.array(list(product(*(range(len(corners)) for corners in parts)))).T
         combined = stack_parts([corners[which] for corners, which in zip(parts, chosen, strict=True)])
@@ -80,7 +80,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         return flat
 
     def corner_count(self) -> int:
-        """Extreme weights times the product of the maps' counts."""
+        """Return the extreme weights times the product of the maps' counts."""
         return len(self.choice.corners()) * super().corner_count()
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
@@ -88,17 +88,17 @@ class Mixture(AbstractUniform, AbstractCombination):
         return isinstance(own, Mixture) and self.choice.covers(own.choice) and self.covers_maps(own, same_noise)
 
     def list_atoms(self) -> list[Component]:
-        """The atoms of each map, times its probability."""
+        """Return the atoms of each map, times its probability."""
         parts = zip(self.choice.probabilities, self.maps, strict=True)
         return [c._replace(weight=p * c.weight) for p, affine in parts for c in affine.list_atoms()]
 
     def disturb_gain(self) -> DisturbedGain:
-        """Those of one of the maps, drawn."""
+        """Return those of one of the maps, drawn."""
         parts = [affine.disturb_gain() for affine in self.maps]
         return mix_gains(parts, np.asarray(self.choice.probabilities), self.inputs)
 
     def in_words(self) -> str:
-        """The maps in words, with their shares; of a map and silence, a loss that nobody notices."""
+        """Return the maps in words, with their shares; of a map and silence, a loss that nobody notices."""
         parts, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
         if len(parts) == 2 and parts[1] == NOTHING_SENT:
             return f"{parts[0]}, {percent_in_words(shares[1])} lost unnoticed"
@@ -113,7 +113,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
+        """Return the deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
         moments = self.moments(2)
         mean = moments.mean
         second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1

@@ -71,7 +71,7 @@ class Modes(AbstractUniform, AbstractModal):
         return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
 
     def in_words(self) -> str:
-        """The maps in words, and the name of the memory."""
+        """Return the maps in words, and the name of the memory."""
         return f"{self.memory_in_words}modes ({' or '.join(affine.in_words() or DIRECT for affine in self.maps)})"
 
 
@@ -134,7 +134,7 @@ class OneStepLate(AbstractWrapper):
         return True
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the map, and nothing drawn yet."""
+        """Return the state of the map, and nothing drawn yet."""
         return self.base.init(key), jnp.full((self.outputs, self.inputs + 1), jnp.nan)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
@@ -144,7 +144,7 @@ class OneStepLate(AbstractWrapper):
         return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Those of the map."""
+        """Return those of the map."""
         return self.base.carry_angles(sent)
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
@@ -189,11 +189,11 @@ class Faded(AbstractHop, AbstractModal):
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
     def in_words(self) -> str:
-        """What it is, and the name of the memory."""
+        """Return what it is, and the name of the memory."""
         return f"{self.memory_in_words}drifting hop"
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
-        """The map with the gain mean + deviation c."""
+        """Return the map with the gain mean + deviation c."""
         return GainAndNoise(Constant(self.mean + self.deviation * state), self.matrix, self.noise)
 
 
@@ -294,7 +294,7 @@ def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, 
 
 
 def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
-    """Probabilities of the modes at each step."""
+    """Return the probabilities of the modes at each step."""
     over_steps = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
         over_steps.append(over_steps[-1] @ np.asarray(step.transition))
@@ -302,7 +302,7 @@ def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
 
 
 def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant: bool) -> bool:
-    """True if the best linear filter may ignore memory: Cov(Hbar_k, Hbar_l) = 0 for k < l.
+    """Return whether the best linear filter may ignore memory: Cov(Hbar_k, Hbar_l) = 0 for k < l.
 
     Hbar_k = E[H_k | mode]. Where nothing varies (`constant`, one step given), the law of the modes must be that of all
     steps, and lags up to the number of modes decide, since Pi^t is a combination of lower powers (Cayley-Hamilton).

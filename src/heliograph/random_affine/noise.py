@@ -68,12 +68,12 @@ class AbstractNoise(Module):
         return False
 
     def branches(self) -> Branches:
-        """Each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
+        """Return each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
         variances = library(self.covariance).diagonal(self.covariance)[:, None]
         return Branches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Mean, relative to that of the whole, and covariance of the noise without its outliers."""
+        """Return the mean, relative to that of the whole, and covariance of the noise without its outliers."""
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.covariance)
 
     def list_atoms(self) -> list[NoiseAtom]:
@@ -134,7 +134,7 @@ class Gaussian(AbstractNoise):
         return [NoiseAtom(1.0, self.mean, self.covariance)]
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """Blocks of the covariance, where nothing stands between them."""
+        """Return the blocks of the covariance, where nothing stands between them."""
         label = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         if np.any(np.asarray(self.covariance)[label[:, None] != label]):
             return None
@@ -205,7 +205,7 @@ class FiniteSupport(AbstractNoise):
         self.covariance = centred.T @ (self.probabilities[:, None] * centred)
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """The values, each without a spread about it."""
+        """Return the values, each without a spread about it."""
         none = np.zeros((self.dimension, self.dimension))
         return [NoiseAtom(plain(p), v, none) for p, v in zip(self.probabilities, self.atoms, strict=True)]
 
@@ -255,21 +255,21 @@ class Independent(AbstractNoise):
         return all(component.is_symmetric for component in self.parts)
 
     def branches(self) -> Branches:
-        """Those of the parts, one above the other."""
+        """Return those of the parts, one above the other."""
         return stack_branches([component.branches() for component in self.parts])
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """The parts without theirs, one above the other."""
+        """Return the parts without theirs, one above the other."""
         parts = [component.without_outliers() for component in self.parts]
         mean = library(parts).concatenate([part.mean for part in parts])
         return NoiseWithoutOutliers(mean, block_diagonal([part.covariance for part in parts]))
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """Every atom of each part with every one of the others."""
+        """Return every atom of each part with every one of the others."""
         return combine([component.list_atoms() for component in self.parts], NoiseAtom.above)
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """The parts of each group, where no part is of two."""
+        """Return the parts of each group, where no part is of two."""
         owners = np.repeat(np.arange(len(self.parts)), [component.dimension for component in self.parts])
         owned = [[self.parts[i] for i in dict.fromkeys(owners[list(group)].tolist())] for group in groups]
         whole = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
@@ -317,7 +317,7 @@ class Shaped(AbstractNoise):
         return self.source.columns.through(self.matrix)
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """Every atom of u mapped, B c and B R B'."""
+        """Return every atom of u mapped, B c and B R B'."""
         b = self.matrix
         return [NoiseAtom(p, b @ c, b @ r @ b.T) for p, c, r in self.source.list_atoms()]
 
@@ -336,7 +336,7 @@ class Shaped(AbstractNoise):
 
 
 def _times_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
-    """Coefficients of p(u) sum_j row_j u_j."""
+    """Return the coefficients of p(u) sum_j row_j u_j."""
     raised_polynomial: dict[Exponents, Number] = {}
     for a, c in polynomial.items():
         for j in (j for j, entry in enumerate(row) if not is_zero(entry)):
@@ -373,6 +373,6 @@ def count_components(value: NoiseLike) -> int | None:
 
 @singledispatch
 def noise_vector(noise: AbstractNoise, order: int) -> Vector:
-    """E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
+    """Return E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
     moment = noise.moment  # of a module, whose methods are slow to look up
     return stack_parts([moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])

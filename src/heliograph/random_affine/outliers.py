@@ -79,7 +79,7 @@ class StudentT(AbstractNoise):
         return Branches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Gaussian noise of the scale."""
+        """Return the Gaussian noise of the scale."""
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -150,7 +150,7 @@ class Contaminated(AbstractNoise):
 
     @classmethod
     def one_sided(cls, covariance: ArrayLike, share: ArrayLike, mean: ArrayLike, slices: int = 6) -> "Contaminated":
-        """Gaussian noise to which, with probability `share`, an exponential delay of this mean is added.
+        """Return the Gaussian noise to which, with probability `share`, an exponential delay of this mean is added.
 
         The exponential law as `slices` of equal probability, each with its mean and variance: the mean and the variance
         of the whole are those of the law. `mean` is a number or one for each component, of either sign.
@@ -198,14 +198,14 @@ class Contaminated(AbstractNoise):
         return not np.any(np.asarray(self.means) != 0)
 
     def branches(self) -> Branches:
-        """Those of the law."""
+        """Return those of the law."""
         xp, n = library(self.shares), self.dimension
         shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
         return Branches(shares, (self.means - self.mean).T, variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """The first branch."""
+        """Return the first branch."""
         return NoiseWithoutOutliers(self.means[0] - self.mean, self.covariances[0])
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -234,7 +234,7 @@ def precision_shares(degrees: ArrayLike) -> Vector:
 
 
 def has_bounded_noise(*parts: PyTree) -> bool:
-    """True if some noise in these parts of a network is known by a bound of its covariance alone."""
+    """Return whether some noise in these parts of a network is known by a bound of its covariance alone."""
 
     def is_law(leaf: object) -> bool:
         return isinstance(leaf, Contaminated)
@@ -271,7 +271,7 @@ def _check_matrices(name: str, value: ArrayLike, count: int, several: bool) -> l
 
 
 def _exponential_slices(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of the exponential law of mean 1 between its quantiles k / count.
+    """Return the mean and variance of the exponential law of mean 1 between its quantiles k / count.
 
     With the survival S from 1 down to 0 and t = -log S: int t dS and int t^2 dS by parts.
     """
@@ -283,7 +283,7 @@ def _exponential_slices(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _log_or_minus_infinity(value: Vector) -> Vector:
-    """Logarithms, -inf of zero without a warning."""
+    """Return the logarithms, -inf of zero without a warning."""
     if is_traced(value):
         return jnp.log(value)
     with np.errstate(divide="ignore"):

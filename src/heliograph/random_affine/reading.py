@@ -76,7 +76,7 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
 
 
 def _posterior_moments(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and variance of the posterior of a positive gain, by quadrature over all within NATS of its mode.
+    """Return the mean and variance of the posterior of a positive gain, by quadrature over all within NATS of its mode.
 
     In t = g^(1/4), or log g of a law that is wide on a logarithmic scale, the density is smooth to its ends.
     """
@@ -89,7 +89,7 @@ def _posterior_moments(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> t
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
     def nats(t: jax.Array) -> jax.Array:
-        """log p(t | a) but for a constant: the law's density in t, and the reading's."""
+        """Return log p(t | a) but for a constant: the law's density in t, and the reading's."""
         g = gain_at(t)
         stretch = t if law.logarithmic else 3 * jnp.log(t)
         return law.log_density(g) + stretch - jnp.square((a - g) / deviation) / 2

@@ -124,14 +124,14 @@ class Superposed(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> Moments:
-        """E[z^a | y] by halves."""
+        """Return E[z^a | y] by halves."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix[None] for m in self.maps]
         return Moments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """The same with every combination of the maps' corners."""
+        """Return the same with every combination of the maps' corners."""
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
 
     def _interval_of_parts(self, order: int) -> Interval:
@@ -145,21 +145,21 @@ class Superposed(AbstractCombination):
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Those that are known in every map."""
+        """Return those that are known in every map."""
         parts = zip(self.maps, self.places, strict=True)
         rows: KnownGains = np.all([affine.carry_known_gains(known[list(at)]) for affine, at in parts], axis=0)
         return rows
 
     def list_atoms(self) -> list[Component]:
-        """Those of the sum of a stack."""
+        """Return those of the sum of a stack."""
         return self.as_stack.list_atoms()
 
     def disturb_gain(self) -> DisturbedGain:
-        """Those of the sum of a stack."""
+        """Return those of the sum of a stack."""
         return self.as_stack.disturb_gain()
 
     def in_words(self) -> str:
-        """The sum of the maps in words."""
+        """Return the sum of the maps in words."""
         return f"sum of {list_in_words(self.maps)}"
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
@@ -176,7 +176,7 @@ class Superposed(AbstractCombination):
         return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
-        """E[Sym^order] of the sum from those of the parts, each (corners, rows, columns)."""
+        """Return E[Sym^order] of the sum from those of the parts, each (corners, rows, columns)."""
         columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(count_monomials(self.outputs + 1, order), columns, f"moments of order {order}")
         terms = [
@@ -201,7 +201,7 @@ class _Powers(NamedTuple):
 
 
 def _polynomials_of_map(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers:
-    """Polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner."""
+    """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner."""
     ordered = tuple(sorted(places))
     ones = library(matrix).ones((len(matrix), 1, 1))
     where = [ordered.index(i) for i in places] + [len(places)]  # of each variable of the map, and of 1
@@ -215,7 +215,7 @@ def _polynomials_of_map(matrix: Corners, outputs: int, places: Places, order: in
 
 @cache_arrays
 def _find_degree(outputs: int, degree: int, order: int) -> np.ndarray:
-    """Positions at `order` of the monomials of z alone of this degree, times powers of 1."""
+    """Return the positions at `order` of the monomials of z alone of this degree, times powers of 1."""
     alone = factor_variables(outputs, degree)
     return place(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
 
@@ -249,7 +249,7 @@ def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
 
 @cache_arrays
 def _binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
+    """Return terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
     names = exponents(outputs + 1, degree)
     ways: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
     for c, b, rest, weight in zip(*sum_plan(outputs, degree), strict=True):
@@ -261,7 +261,7 @@ def _binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], 
 
 @cache_arrays
 def _products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
-    """Positions of the products of monomials of two sets of variables among those of all `size`."""
+    """Return the positions of the products of monomials of two sets of variables among those of all `size`."""
     left, right = np.array(a)[factor_variables(len(a), first)], np.array(b)[factor_variables(len(b), second)]
     shape = len(left), len(right)
     both = [np.broadcast_to(left[:, None], (*shape, first)), np.broadcast_to(right, (*shape, second))]

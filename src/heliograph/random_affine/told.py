@@ -209,7 +209,7 @@ class Told(AbstractTold):
         return jnp.all(jnp.stack([*finite, *noises]))
 
     def in_words(self) -> str:
-        """The map of typical numbers in words, and what is told."""
+        """Return the map of typical numbers in words, and what is told."""
         return f"{self.believed(self.typical).in_words()} (told {', '.join(self.names)})"
 
 
@@ -267,7 +267,7 @@ class PilotedHop(AbstractHop, AbstractTold):
         return GainAndNoise(law, self.matrix, self.noise)
 
     def in_words(self) -> str:
-        """The hop in words, and what is told."""
+        """Return the hop in words, and what is told."""
         plain = GainAndNoise(self.memory.law, self.matrix, self.noise)
         return f"{plain.in_words()} (told a reading of its gain)"
 

@@ -54,7 +54,7 @@ class _Dense:
         self.first = True
 
     def times(self, vector: np.ndarray) -> np.ndarray:
-        """H v; steepest descent where -H v is no direction of descent."""
+        """Return H v; steepest descent where -H v is no direction of descent."""
         if (self.matrix @ vector) @ vector <= 0:
             self.matrix = np.eye(len(vector)) * 1e-2 / np.linalg.norm(vector)
         return np.asarray(self.matrix @ vector)

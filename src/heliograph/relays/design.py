@@ -50,11 +50,11 @@ class RelayDesign(Module):
     moments: Float[np.ndarray, "steps+1 d d"]
 
     def trace(self, name: str) -> Float[np.ndarray, "time"]:
-        """Trace of one filter's error covariance at k = 0 .. steps."""
+        """Return the trace of one filter's error covariance at k = 0 .. steps."""
         return np.asarray(np.trace(self.covariance[name], axis1=1, axis2=2))
 
     def total_power(self) -> Float[np.ndarray, "steps"]:
-        """Power that the relays send together at each step."""
+        """Return the power that the relays send together at each step."""
         return np.asarray(np.sum([np.zeros(len(self.moments) - 1), *self.power.values()], axis=0))
 
 
@@ -79,12 +79,12 @@ _propagate = compile_in_float64(propagate_slots)
 
 
 def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
-    """Covariance of (x_0, e_1 .. e_F)."""
+    """Return the covariance of (x_0, e_1 .. e_F)."""
     return initial_error_moments(network.initial()[1], len(network.filters))
 
 
 def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Gains by filter as one block matrix for each step."""
+    """Return the gains by filter as one block matrix for each step."""
     if set(table("gains", gains, "arrays")) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     n, first = len(network.states), network.filters[0]
@@ -100,7 +100,7 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
 def split_gains(
     network: RelayNetwork, joined: Float[np.ndarray, "steps Fn R"]
 ) -> dict[str, Float[np.ndarray, "steps n _"]]:
-    """Gains by filter from block matrices."""
+    """Return the gains by filter from block matrices."""
     n, ends = len(network.states), np.cumsum(network.received)
     return {
         name: np.asarray(joined)[:, f * n : (f + 1) * n, end - size : end]
@@ -177,12 +177,12 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
 
 @compile_in_float64
 def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
-    """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
+    """Return the covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
     return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
 
 
 def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
-    """Matrices C_k with <C_k, moments_k> = weights_k tr P_k."""
+    """Return the matrices C_k with <C_k, moments_k> = weights_k tr P_k."""
     d = (1 + filters) * n
     matrices = np.zeros((len(weights), d, d))
     matrices[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)

@@ -99,7 +99,7 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
 
 
 def _converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
-    """Steps of one period, checked for gains under which the second moments converge."""
+    """Return the steps of one period, checked for gains under which the second moments converge."""
     check_slots(network, gains)
     steps = periodic_steps(network)
     radius = spectral_radius(np.asarray(_period_operator(steps, gains)))
@@ -115,13 +115,13 @@ def check_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -
 
 
 def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:
-    """M = step(M) for an affine map of symmetric (d, d) matrices."""
+    """Return M = step(M) for an affine map of symmetric (d, d) matrices."""
     constant, linear = jax.linearize(step, jnp.zeros((d, d)))
     return jnp.asarray(solve_fixed_point(jax.vmap(linear), constant))
 
 
 def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Propagated:
-    """Moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`."""
+    """Return moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`."""
     d = gains.shape[1] + steps.transition.shape[-1]
     return propagate_slots(steps, affine_fixed_point(lambda m: propagate_slots(steps, m, gains).moments[-1], d), gains)
 
@@ -134,7 +134,7 @@ def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
 
 
 def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
-    """Steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
+    """Return the steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
 
     The receiver's gains are held while differentiating: they minimise the error, so their change has no first-order
     effect, and the fixed point with given gains is affine.
@@ -183,7 +183,7 @@ _steady_behind = compile_in_float64(steady_receiver_covariance)
 
 @compile_in_float64
 def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
-    """Linear part of the map of second moments over one period."""
+    """Return the linear part of the map of second moments over one period."""
     d = gains.shape[1] + steps.transition.shape[-1]
     _, linear = jax.linearize(lambda m: propagate_slots(steps, m, gains).moments[-1], jnp.zeros((d, d)))
     return jnp.asarray(make_entry_matrix(jax.vmap(linear), (d, d)))
@@ -317,7 +317,7 @@ def _within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.nda
 
 
 def _largest_entries(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Float[np.ndarray, "slots Fn R"]:
-    """The largest entry of each filter's gain in each slot, at every entry of that gain."""
+    """Return the largest entry of each filter's gain in each slot, at every entry of that gain."""
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
     return join_gains(

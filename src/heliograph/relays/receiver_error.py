@@ -60,7 +60,7 @@ class Limited(NamedTuple):
 
 
 def power_limit_of(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
-    """The limit on the moments after each step, from one on the power that all relays send at each step."""
+    """Return the limit on the moments after each step, from one on the power that all relays send at each step."""
     horizon = len(steps.receives_in_slot)
     limit = repeat_per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
     mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
@@ -77,7 +77,7 @@ def power_limit_of(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
 
 
 def power_forms(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
-    """Matrices with <form_k, moments before step k> = sum over talking relays of tr Cov(C s_r)."""
+    """Return the matrices with <form_k, moments before step k> = sum over talking relays of tr Cov(C s_r)."""
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
     for r in range(len(steps.received) - 1):
@@ -91,7 +91,7 @@ def power_forms(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
 def minimise_within_limit(
     problem: Limited, local_gains: Float[np.ndarray, "time Fn R"], iterations: int
 ) -> Float[np.ndarray, "time Fn R"]:
-    """Gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
+    """Return the gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
 
     Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local_gains`, over the gains of all
     steps at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that
@@ -147,7 +147,7 @@ def _cost_and_slack(
 def _change_gains(
     gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: RelaySteps
 ) -> Float[Array, "time Fn R"]:
-    """Gains changed by x in given units."""
+    """Return the gains changed by x in given units."""
     rows, columns = np.nonzero(gain_mask(steps))
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
 
@@ -156,7 +156,7 @@ def _change_gains(
 def _cost_with_barrier(
     problem: Limited, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
-    """Cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
+    """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
 
     def value(x: jax.Array) -> jax.Array:
         cost, slack = _cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
@@ -252,7 +252,7 @@ def receiver_error_design(
 def _backward_sweep(
     steps: RelaySteps, start: Array, cost: Float[Array, "time d d"], gains: jax.Array
 ) -> Float[jax.Array, "time d d"]:
-    """Gradient of the cost with respect to the moments after each step, gains improved."""
+    """Return the gradient of the cost with respect to the moments after each step, gains improved."""
 
     def ahead_of(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain = row
@@ -270,7 +270,7 @@ def _backward_sweep(
 
 
 def _forward_sweep(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Best gains step by step and the moments after each step."""
+    """Return the best gains step by step and the moments after each step."""
 
     def single(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]

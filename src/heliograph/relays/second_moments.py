@@ -34,7 +34,7 @@ class LinearMaps(NamedTuple):
 
 
 def initial_error_moments(covariance: Float[np.ndarray, "n n"], filters: int) -> Float[np.ndarray, "d d"]:
-    """Covariance of (x, e_1 .. e_F) where every filter starts at the mean: each e_f is x - E x."""
+    """Return the covariance of (x, e_1 .. e_F) where every filter starts at the mean: each e_f is x - E x."""
     return np.asarray(np.kron(np.ones((1 + filters, 1 + filters)), covariance))
 
 
@@ -61,14 +61,14 @@ def linear_maps(step: RelaySteps) -> LinearMaps:
 
 
 def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
-    """E (sent, 1): every estimate is unbiased, so it does not depend on the gains."""
+    """Return E (sent, 1): every estimate is unbiased, so it does not depend on the gains."""
     y = step.sensing @ (step.transition @ step.state_mean + step.drift) + step.sensor_offset
     relayed = step.sensing @ step.state_mean
     return jnp.concatenate([y, *[relayed] * (len(step.received) - 1), jnp.ones(1)])
 
 
 def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], Sent]:
-    """Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
+    """Return Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
 
     d = (1 + F) n, z = d + R.
     """
@@ -84,7 +84,7 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
 
 
 def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
-    """Covariance of eta+ = eta+ before corrections - (0; K) innovations."""
+    """Return the covariance of eta+ = eta+ before corrections - (0; K) innovations."""
     rows, received = gain.shape
     d = z.shape[0] - received
     full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, received)), -gain])], axis=1)
@@ -101,7 +101,7 @@ ROUNDING = 64 * float(np.finfo(float).eps)  # of what is sent: an innovation of 
 
 
 def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "R"]:
-    """1 for each innovation whose variance is above the rounding of what is sent, 0 for the others.
+    """Return 1 for each innovation whose variance is above the rounding of what is sent, 0 for the others.
 
     Of a relay that receives nothing but itself through a known gain the innovation is zero, computed from large ones.
     """
@@ -116,7 +116,7 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
 
 
 def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "Fn R"]:
-    """K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
+    """Return K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
 
     Source: for two alternating relays, filter-and-forward successive relays, Theorems 1 and 2.
     """
@@ -171,7 +171,7 @@ DAMPING = 1e-9  # relative, on the change of a gain: decides only what the recei
 def gain_hessian(
     predicted: Float[Array, "z z"], ahead: Float[Array, "d d"], step: RelaySteps, damping: float
 ) -> tuple[Float[jax.Array, "r r"], Float[jax.Array, ""]]:
-    """Half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the free gains, damped, and the damping.
+    """Return half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the free gains, damped, and the damping.
 
     Its entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that receives nothing. `damping` is
     relative to the mean of the diagonal.
@@ -202,6 +202,6 @@ def best_gain(
 
 
 def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:
-    """Gradient of <Lam, moments after the step> by the moments before it, the adjoint of the propagation."""
+    """Return the gradient of <Lam, moments after the step> by the moments before it, the adjoint of the propagation."""
     _, pull = jax.vjp(lambda m: correct_moments(step_moments(step, m)[0], gain), jnp.zeros_like(ahead))
     return symmetrize(pull(ahead)[0])

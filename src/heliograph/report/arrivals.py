@@ -177,7 +177,7 @@ def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
 
 
 def _clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
-    """Times as numbers: dates in seconds after the first."""
+    """Return the times as numbers: dates in seconds after the first."""
     if time.dtype.kind == "M":
         return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)
     return np.asarray(time, dtype=float)

@@ -58,7 +58,7 @@ def forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
 
 
 def _forecast_table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
-    """Mean and interval of each state and output at some of the horizons, a row each."""
+    """Return the mean and interval of each state and output at some of the horizons, a row each."""
     count = len(forecast.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
     predictions = [("", forecast.states)] + ([] if forecast.outputs is None else [("measured ", forecast.outputs)])
@@ -81,12 +81,12 @@ def _forecast_table(record: Record, name: str, forecast: "heliograph.forecasting
 
 
 def _format_mean_and_interval(mean: float, low: float, high: float, deviation: float) -> str:
-    """Mean and interval in words, to two digits of the deviation."""
+    """Return the mean and interval in words, to two digits of the deviation."""
     if np.isnan(deviation):
         return f"{mean:.4g}"
     return f"{round_to(mean, deviation)} ({round_to(low, deviation)} to {round_to(high, deviation)})"
 
 
 def _format_time(time: np.generic) -> str:
-    """A time in words."""
+    """Return a time in words."""
     return str(time)[:19] if isinstance(time, np.datetime64) else f"{time:g}"

@@ -156,7 +156,7 @@ def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, 
 
 
 def _say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """The sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
+    """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
     of, times = _name_outputs(outputs, sizes)
     return (
         f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "

@@ -177,7 +177,7 @@ def outputs_of(network: Network, listener: Listener, record: Record, inputs: np.
 
 
 def _median_over_time(variance: np.ndarray) -> np.ndarray:
-    """Median over time by output; 0 where none arrived."""
+    """Return the median over time by output; 0 where none arrived."""
     came = ~np.isnan(variance)
     return np.array([np.median(column[there]) if there.any() else 0.0
                      for column, there in zip(variance.T, came.T, strict=True)])  # fmt: skip

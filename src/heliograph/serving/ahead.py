@@ -76,7 +76,7 @@ class ForecastPublisher:
 
 
 def _write_forecast(forecast: "heliograph.forecasting.Forecast", i: int) -> dict[str, object]:
-    """What one filter says of one horizon, as it is published."""
+    """Return what one filter says of one horizon, as it is published."""
     states, outputs = forecast.states, forecast.outputs
     body: dict[str, object] = {
         "mean": states.mean[i].tolist(),

@@ -73,7 +73,7 @@ class EstimateWriter:
         return lines
 
     def _write_estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
-        """All filters' estimates after a row, by node and filter."""
+        """Return all filters' estimates after a row, by node and filter."""
         return {
             node: {columns.filter: self._write_filter(columns, outputs) for columns in places}
             for node, places in self._nodes.items()

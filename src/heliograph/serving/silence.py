@@ -85,7 +85,7 @@ class Silence:
         return bool((moved | (np.abs(now - before) > MOVED * before)).any())
 
     def _dead_senders(self, plant: PlantState) -> tuple[str, ...]:
-        """The dead senders of a plant."""
+        """Return the dead senders of a plant."""
         return tuple(name for name, status in self.fleet.senders(plant).items() if status.dead)
 
 

@@ -139,7 +139,7 @@ def _constant(channel: Channel) -> AbstractRandomAffine:
 
 
 def _unstable(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
-    """Orthonormal basis of the plant's modes that do not decay."""
+    """Return the orthonormal basis of the plant's modes that do not decay."""
     _, basis, count = scipy.linalg.schur(matrix / BELOW_ONE, sort="ouc")
     return np.asarray(basis[:, :count])
 
@@ -162,7 +162,7 @@ class KnownLosses(NamedTuple):
         return any(outcome.random for outcome in self.parts)
 
     def gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
-        """Gains on what arrives, from those on its sums of known gain."""
+        """Return the gains on what arrives, from those on its sums of known gain."""
         return {kind: k @ outcome.combine for kind, k, outcome in zip(self.kinds, gains, self.parts, strict=True)}
 
 
@@ -199,7 +199,7 @@ class Certain(NamedTuple):
     random: bool
 
     def noise(self, outcome: Outcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
-        """Covariance of these sums at x = 0, about the mean of their kind."""
+        """Return the covariance of these sums at x = 0, about the mean of their kind."""
         mean, second = second_moments(outcome.map)
         v = np.append(links.sensor_mean, 1.0)
         signal = np.outer(v, v)

@@ -41,7 +41,7 @@ class Belief(NamedTuple):
 
 
 def lower_claim(claim: Claim) -> Claim:
-    """Nominal, whatever is claimed more."""
+    """Return the nominal, whatever is claimed more."""
     return "none" if claim == "none" else "nominal"
 
 

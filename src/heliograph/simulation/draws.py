@@ -20,5 +20,5 @@ def draw_key(run_key: jax.Array, k: Number, source: Number, purpose: int) -> jax
 
 
 def checksum(name: str) -> int:
-    """Checksum of the name of a node, or of a hop "SENDER to LISTENER", as its place among all keys."""
+    """Return the checksum of the name of a node, or of a hop "SENDER to LISTENER", as its place among all keys."""
     return crc32(name.encode())

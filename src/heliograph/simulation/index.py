@@ -22,7 +22,7 @@ class Place(NamedTuple):
 
 
 def places_of(groups: Sequence[Sequence[str]], kinds: Sequence[Kind]) -> dict[tuple[str, str], Place]:
-    """Place of each estimate, by node and filter."""
+    """Return the place of each estimate, by node and filter."""
     return {
         (node, name): Place(k, f, i)
         for k, kind in enumerate(kinds)

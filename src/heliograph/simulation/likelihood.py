@@ -18,7 +18,7 @@ def log_likelihood(
     measurements: Float[ArrayLike, "steps received"],
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> Scalar:
-    """log p(z_1, z_2, ...) under the filter's model: the sum of its innovations' log-likelihoods, in nats.
+    """Return log p(z_1, z_2, ...) under the filter's model: the sum of its innovations' log-likelihoods, in nats.
 
     Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere.
     `jax.grad` passes through it, with respect to any array of the filter, in the precision of the trace

@@ -186,7 +186,7 @@ class Network(Module):
     def of_relays(
         relays: RelayNetwork, schedules: Mapping[str, Schedule], receivers: Mapping[str, AbstractFilter]
     ) -> "Network":
-        """Network of relays that run their schedules in the world, and a receiver with its filters.
+        """Return the network of relays that run their schedules in the world, and a receiver with its filters.
 
         At each step the relays send C s_r, with s_r their estimates at the step before, through hops with independent
         draws; every filter then receives the sum of its hops, NaN where nobody transmits to it by plan. The nodes are
@@ -231,7 +231,7 @@ class Network(Module):
         filters: Mapping[str, Mapping[str, AbstractFilter]],
         fused: Mapping[str, Fusion | AbstractFilter] | None = None,
     ) -> "Network":
-        """Network of nodes that receive parts of one channel: they share its sensor noise, hops and fading.
+        """Return the network of nodes that receive parts of one channel: they share its sensor noise, hops and fading.
 
         Args:
             plant: the plant.
@@ -278,7 +278,7 @@ class Network(Module):
         return Network(self.plant, {n: v for n, v in self.nodes.items() if n in known}, relays=self.relays)
 
     def nodes_with(self, name: str) -> list[str]:
-        """Names of the nodes that have the filter `name`, in the order of the network.
+        """Return the names of the nodes that have the filter `name`, in the order of the network.
 
         Raises:
             ValueError: none has it.
@@ -290,7 +290,7 @@ class Network(Module):
         return results
 
     def mesh_nodes(self, name: str) -> tuple[str, ...]:
-        """Names of the nodes of a fusion between neighbours, in the order of the network."""
+        """Return the names of the nodes of a fusion between neighbours, in the order of the network."""
         neighbours = self.meshes[name].neighbours or {}
         return tuple(node for node in self.names if node in neighbours)
 
@@ -321,7 +321,7 @@ class Network(Module):
         return text_of(self)
 
     def claims(self) -> Claims:
-        """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
+        """Return the claim of every estimate, by node and filter; fused ones last, under "fused"."""
         claims: Claims = {name: {} for name in (*self.names, *([FUSED] if self.fused else []))}
         for (node, name), claim in self.claimed.items():
             claims[node][name] = claim
@@ -339,7 +339,7 @@ class Network(Module):
         return claims
 
     def beliefs(self) -> tuple[Belief, ...]:
-        """Filters that believe another world than that in which they stand, node after node, fused ones last."""
+        """Return filters that believe another world than that in which they stand, node after node, fused ones last."""
         return tuple(beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
@@ -391,7 +391,7 @@ Network._repr_html_ = table_of  # type: ignore[attr-defined]
 
 
 def _world(node: Node | ReceivingNode) -> object:
-    """Parts of a node that determine its measurements."""
+    """Return the parts of a node that determine its measurements."""
     if isinstance(node, Node):
         return node.sensor, drop_names(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete

@@ -56,7 +56,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
 
 
 def _readers(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
-    """Filters that use flags, after the measurement in the received vector; also inside of others."""
+    """Return the filters that use flags, after the measurement in the received vector; also inside of others."""
     kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
     return [
@@ -234,13 +234,13 @@ class HasNodes(Protocol):
         """Places of the angles among what each node receives."""
 
     def claims(self) -> dict[str, dict[str, Claim]]:
-        """Claims by node and filter."""
+        """Return the claims by node and filter."""
 
     def nodes_with(self, name: str) -> list[str]:
-        """Nodes that have a filter of this name."""
+        """Return the nodes that have a filter of this name."""
 
     def mesh_nodes(self, name: str) -> tuple[str, ...]:
-        """Nodes of a fusion between neighbours."""
+        """Return the nodes of a fusion between neighbours."""
 
 
 def _predicts(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:
@@ -277,7 +277,7 @@ def check_trigger(
 
 
 def name_values(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
-    """Names of the received components: the sensor's outputs where these are as many, else z0, z1, ..."""
+    """Return the names of the received components: the sensor's outputs where these are as many, else z0, z1, ..."""
     return outputs if len(outputs) == received else tuple(f"z{i}" for i in range(received))
 
 

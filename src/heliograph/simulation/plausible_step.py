@@ -35,7 +35,7 @@ def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
 
 
 def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
-    """Reason of each filter not to use its measurement, by kind and by name."""
+    """Return the reason of each filter not to use its measurement, by kind and by name."""
     return [judgement.reason for judgement in outputs["judged"]], {
         n: judgement.reason for n, judgement in outputs["judged_centrally"].items()
     }
@@ -86,11 +86,11 @@ class Judges:
                 self._places[node].append(position)
 
     def of_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
-        """Judgements of the filters that receive from a node; where it has none, of the central ones."""
+        """Return the judgements of the filters that receive from a node; where it has none, of the central ones."""
         return self._stack_judgements(outputs, self._places[node], not self._places[node])
 
     def of_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
-        """Judgements of all filters."""
+        """Return the judgements of all filters."""
         places = [(k, f, i) for k, j in enumerate(outputs["judged"]) for f, i in np.ndindex(*j[0].shape[-2:])]
         return self._stack_judgements(outputs, places, True)
 
@@ -113,7 +113,7 @@ class Judges:
 def find_refused_rows(
     network: Network, outcome: Mapping[str, PyTree]
 ) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
-    """Rows of a recording that are implausible, each with its reason: by node, and to all central filters."""
+    """Return rows of a recording that are implausible, each with its reason: by node, and to all central filters."""
     judges, refused = Judges(network), dict[str, dict[int, str]]()
     shared = judges.without_own
     for name in network.names:
@@ -198,7 +198,7 @@ def _rows(rows: Sequence[int]) -> str:
 
 
 def forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
-    """Rows at which a value came though it was within delta of the value before, and no heartbeat was due.
+    """Return the rows at which a value came though it was within delta of the value before, and no heartbeat was due.
 
     Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter
     uses such a value and gives it a floor of 1e-6 as its probability.

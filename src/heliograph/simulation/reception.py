@@ -160,7 +160,7 @@ def _first_mean(filter: AbstractFilter) -> jax.Array:
 
 
 def measure(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
-    """y = h(x) + v, angles between -pi and pi."""
+    """Return y = h(x) + v, angles between -pi and pi."""
     return wrap_angles(sensor.measure(x) + sensor.noise.sample(key), sensor.angles)
 
 
@@ -271,7 +271,7 @@ class Slots(AbstractMedium):
 
 
 def _remembering(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
-    """Slot, listener, sender and hop of the hops with memory, by name."""
+    """Return the slot, listener, sender and hop of the hops with memory, by name."""
     return {
         f"{number} {listener} {sender}": (number, listener, sender, hop)
         for number, slot in enumerate(relays.slots)

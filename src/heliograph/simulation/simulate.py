@@ -180,7 +180,7 @@ def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Prog
 
 @quickly_compiled
 def _initial(job: _Job) -> PyTree:
-    """Sums of zero before the first block; compiled, so that shapes are worked out once a network."""
+    """Return the sums of zero before the first block; compiled, so that shapes are worked out once a network."""
     shapes = eqx.filter_eval_shape(_block, job, np.arange(BLOCK))[0]
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
 
@@ -234,7 +234,7 @@ def _outputs(job: _Job, runs: jax.Array) -> PyTree:
 
 
 def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
-    """Memory of a simulation by XLA on a processor, from its shapes.
+    """Return the memory of a simulation by XLA on a processor, from its shapes.
 
     Sums stand once in each lane; a lane in flight also has those after its block, and rows of batches from which they
     are made. Of trajectories the program has those that its reducer reads.
@@ -256,7 +256,7 @@ def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
 
 
 def by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
-    """Values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none."""
+    """Return values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none."""
     runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
     row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)
     row = jax.lax.dynamic_update_slice(row, values, (*zero, start))

@@ -75,7 +75,7 @@ class Smoother(Module):
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
     def _near(self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
-        """Estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
+        """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
 
         def near(estimate: Estimate, which: Angles) -> Estimate:
             mean = jnp.asarray(estimate.mean)
@@ -183,7 +183,7 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
 
 
 def record_of(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, time: np.ndarray) -> Record:
-    """Record of a recording, with its smoothed part."""
+    """Return the record of a recording, with its smoothed part."""
     if smoothing is None:
         return trajectories_record(network, {"truth": None, **outputs}, time)
     _warn_of_inconsistency(smoothing.network, outputs["nis"])

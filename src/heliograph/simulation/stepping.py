@@ -127,11 +127,11 @@ class AllFilters(Module):
         return tuple(centre for centre in self.centres if isinstance(centre, Centre))
 
     def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
-        """Matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
+        """Return the matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
         return [self.alike[i].matrices(centre.read, states[i], f, self._quiet(i), u, k) for i, f in centre.sources]
 
     def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """States of the nodes' filters after step k, for measurements of zero."""
+        """Return the states of the nodes' filters after step k, for measurements of zero."""
         pairs = zip(self.alike, states, strict=True)
         return tuple(stacked.step(state, self._quiet(i), u, k)[0] for i, (stacked, state) in enumerate(pairs))
 
@@ -305,7 +305,7 @@ def plans(filters: AllFilters) -> bool:
 
 
 def _reporting(network: Network) -> dict[str, Reporting]:
-    """Fusions by reports, each with its uplinks and its centre."""
+    """Return the fusions by reports, each with its uplinks and its centre."""
     results = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and fusion.by_report:

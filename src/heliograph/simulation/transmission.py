@@ -102,7 +102,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
 
 
 def _separate_delays(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (steps, m), and the delay of each (steps,)."""
+    """Return the values (steps, m), and the delay of each (steps,)."""
     channel = node.channel if isinstance(node, Node) else None
     link = first(channel)
     if link is None or not link.past:

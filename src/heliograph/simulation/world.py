@@ -46,7 +46,7 @@ class World(Module):
 
 
 def _near(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
-    """Estimates with angles within half a turn of the truth, so that x - xhat is the error."""
+    """Return the estimates with angles within half a turn of the truth, so that x - xhat is the error."""
     if not plant.circular:
         return outputs
 

@@ -62,7 +62,7 @@ class AbstractSmoothing(Module):
     """Choice of the states to be estimated, and of the later data that they are estimated from."""
 
     def estimates(self, steps: SmootherStep) -> Estimate:
-        """Estimates along time from smoother steps stacked along time, with the claim that remains.
+        """Return the estimates along time from smoother steps stacked along time, with the claim that remains.
 
         Warns where the NIS of the filter says that it is not consistent: later data then make estimates worse.
         """
@@ -74,7 +74,7 @@ class AbstractSmoothing(Module):
         raise unwritten(self, "sweep")
 
     def means(self, steps: SmootherStep) -> jax.Array:
-        """Means alone, where covariances are known from elsewhere."""
+        """Return the means alone, where covariances are known from elsewhere."""
         return jnp.asarray(self.sweep(steps).mean)
 
     def select_reference(self, values: A) -> A:
@@ -95,11 +95,11 @@ class FixedInterval(AbstractSmoothing):
     """Smoothing of every state given all data of the run."""
 
     def sweep(self, steps: SmootherStep) -> Estimate:
-        """Estimates (time, ...)."""
+        """Return the estimates (time, ...)."""
         return sweep_back(steps)
 
     def means(self, steps: SmootherStep) -> jax.Array:
-        """Means (time, ...)."""
+        """Return the means (time, ...)."""
         return sweep_means(steps)
 
 
@@ -119,7 +119,7 @@ class FixedLag(AbstractSmoothing):
         self.lag = check_count("lag", lag, 0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
-        """Estimates (time, ...)."""
+        """Return the estimates (time, ...)."""
         return sweep_over_lag(steps, self.lag)
 
 
@@ -139,7 +139,7 @@ class FixedPoint(AbstractSmoothing):
         self.step = check_count("step of a fixed point", step, 0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
-        """Estimates (time from that step on, ...)."""
+        """Return the estimates (time from that step on, ...)."""
         return carry_ahead(steps, self.step)
 
     def select_reference(self, values: A) -> A:

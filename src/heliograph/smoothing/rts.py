@@ -114,7 +114,7 @@ def planned_smoother(
 
 @compile_on_call
 def _smoothed_means(planned: PlannedSmoother, z: Array) -> jax.Array:
-    """Smoothed means of one run's measurements (horizon, received)."""
+    """Return the smoothed means of one run's measurements (horizon, received)."""
     _, steps = step_rows(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
     return planned.smoothing.means(jax.tree.map(jnp.asarray, steps))
 
@@ -128,5 +128,5 @@ def _plan_or_none(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
 
 @compile_on_call
 def _smoothed_covariances(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    """Smoothed estimates for z = 0, of which the covariances are those of all data."""
+    """Return the smoothed estimates for z = 0, of which the covariances are those of all data."""
     return smoothing.sweep(data_free_smoother_steps(filter, u))

@@ -113,7 +113,7 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
 
 
 def _monomials(z: np.ndarray, order: int) -> np.ndarray:
-    """Monomials of each row of z."""
+    """Return the monomials of each row of z."""
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
     powers = exponents(len(columns), order)

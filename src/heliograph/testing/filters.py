@@ -78,13 +78,13 @@ def _parts(
 
 
 def _side_by_side(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> PyTree:
-    """Means of two such steps in one vmap."""
+    """Return the means of two such steps in one vmap."""
     twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, z))
     return jax.vmap(lambda s, z: filter.step(s, z, u, k)[1].mean)(*twice)
 
 
 def _each_way(*arguments: PyTree) -> tuple[PyTree, ...]:
-    """Step in each of three ways; native code computes once what they have in common."""
+    """Return the step in each of three ways; native code computes once what they have in common."""
     return _step(*arguments), _parts(*arguments), _side_by_side(*arguments)
 
 

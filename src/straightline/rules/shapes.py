@@ -73,7 +73,7 @@ def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
-    """Memory that a loop fills, as the transpose of a scan begins with: zeros."""
+    """Return the memory that a loop fills, as the transpose of a scan begins with: zeros."""
     return [lowering.known(np.zeros(result_shape(equation), equation.params["dtype"]))]
 
 

@@ -125,7 +125,7 @@ def nearest(x: Vector) -> tuple[Vector, Vector]:
 
 
 def _reduced(x: Vector, n: Vector) -> tuple[Vector, Vector]:
-    """x - n ln 2 as the sum of two numbers."""
+    """Return x - n ln 2 as the sum of two numbers."""
     high, low = format_of(x).ln2
     first = fma(n, -high, x)
     rest = n * low
@@ -134,23 +134,23 @@ def _reduced(x: Vector, n: Vector) -> tuple[Vector, Vector]:
 
 
 def _power(form: Format, n: Vector) -> Vector:
-    """2^n of integers -1022 ... 1023, of floats -126 ... 127."""
+    """Return 2^n of integers -1022 ... 1023, of floats -126 ... 127."""
     return ((n << form.fraction) + form.one_bits).as_type("double" if form.word == "i64" else "float")
 
 
 def _scaled(x: Vector, n: Vector) -> Vector:
-    """x 2^n in two factors, each of which is a normal number."""
+    """Return x 2^n in two factors, each of which is a normal number."""
     form, half = format_of(x), n >> 1
     return x * _power(form, half) * _power(form, n - half)
 
 
 def _limited(x: Vector, value: Vector, largest: float, smallest: float) -> Vector:
-    """The result; infinity for x beyond the largest, 0 below the smallest, NaN of NaN."""
+    """Return the result; infinity for x beyond the largest, 0 below the smallest, NaN of NaN."""
     return select(x > largest, math.inf, select(x < smallest, 0.0, value))
 
 
 def _exponent(x: Vector) -> tuple[Vector, Vector]:
-    """k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number."""
+    """Return k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number."""
     form = format_of(x)
     bits = x.as_type(form.word)
     k = (bits - form.root_half_bits) >> form.fraction
@@ -159,7 +159,7 @@ def _exponent(x: Vector) -> tuple[Vector, Vector]:
 
 
 def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
-    """K ln 2 + log(1 + f) + more, where `more` is small against the rest or the rest is zero."""
+    """Return K ln 2 + log(1 + f) + more, where `more` is small against the rest or the rest is zero."""
     form = format_of(f)
     s = f / (2 + f)
     z = s * s
@@ -169,6 +169,6 @@ def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
 
 
 def _with_domain(x: Vector, value: Vector) -> Vector:
-    """A logarithm's result; -infinity of 0, NaN below, infinity of infinity."""
+    """Return a logarithm's result; -infinity of 0, NaN below, infinity of infinity."""
     special = select(x.equals(0.0), -math.inf, select(x > 0.0, x, math.nan))
     return select((x > 0.0) & (x < math.inf), value, special)

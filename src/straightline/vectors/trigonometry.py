@@ -82,7 +82,7 @@ def _turned(x: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def _sin(x: Vector, low: Vector) -> Vector:
-    """sin(x + low), |x| <= pi / 4."""
+    """Return sin(x + low), |x| <= pi / 4."""
     z = x * x
     v = z * x
     r = polynomial(z, _terms(x, SIN)[1:])
@@ -90,7 +90,7 @@ def _sin(x: Vector, low: Vector) -> Vector:
 
 
 def _cos(x: Vector, low: Vector) -> Vector:
-    """cos(x + low), |x| <= pi / 4."""
+    """Return cos(x + low), |x| <= pi / 4."""
     z = x * x
     half = 0.5 * z
     w = 1 - half
@@ -132,7 +132,7 @@ def _atan_of_positive(x: Vector) -> Vector:
 
 
 def atan2(y: Vector, x: Vector) -> Vector:
-    """The angle of (x, y) in (-pi, pi]."""
+    """Return the angle of (x, y) in (-pi, pi]."""
     ratio = abs(y / x)
     both = abs(x).equals(abs(y))
     # 0/0 and infinity/infinity: along an axis, or a diagonal.

@@ -27,7 +27,7 @@ class BallMoments(NamedTuple):
 
 
 def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
-    """Moments of independent e_i ~ N(centre_i, variance_i) where |e| <= radius, or where not.
+    """Return the moments of independent e_i ~ N(centre_i, variance_i) where |e| <= radius, or where not.
 
     Slices: given e_1 = radius sin(t) the others lie in a ball of radius cos(t) times as large, whose moments are those
     of fewer components; the last is a truncated normal. 32 Gauss-Legendre nodes in t where e_1 has its probability. As

@@ -41,5 +41,5 @@ class EventBelief(NamedTuple):
 
     @staticmethod
     def of(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
-        """The state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
+        """Return the state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
         return EventBelief(jnp.exp(parts.log_weight), *parts.gaussian, parts.label, begun, moved)

@@ -95,7 +95,7 @@ class EventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> EventBelief:
-        """The prior, and no reference yet."""
+        """Return the prior, and no reference yet."""
         start, m = at(self.plant, 0), self.outputs
         x = from_covariance(start.initial_mean, start.initial_covariance)
         both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), Columns(np.eye(m), jnp.zeros(m)))
@@ -292,7 +292,7 @@ class EventFilter(AbstractSizedFilter):
         return label - due, due
 
     def _loss_probability(self, channel: SideInformation, s: int) -> jax.Array:
-        """Probability that what a sender transmits is lost, for each mode of the link (M,)."""
+        """Return the probability that what a sender transmits is lost, for each mode of the link (M,)."""
         mine = self.senders[s] if len(self.senders) > 1 else slice(None)
         lost = ~jnp.any(jnp.asarray(channel.present)[:, mine], axis=1)
         return jnp.asarray(channel.chance) @ lost.astype(float)
@@ -315,12 +315,12 @@ class EventFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
-        """Mean and covariance of the whole sum."""
+        """Return the mean and covariance of the whole sum."""
         whole = self._merge_state(state)
         return Estimate(whole.mean, whole.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """The one of the joined sums' moments around the update."""
+        """Return the one of the joined sums' moments around the update."""
         return smoother_step_by_transform(self, step, first(self.plant), self._merge_state)
 
     def _merge_state(self, state: EventBelief) -> Gaussian:

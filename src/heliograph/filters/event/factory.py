@@ -35,7 +35,7 @@ def event_filter(
     lost: int = 2,
     transform: AbstractTransform | None = None,
 ) -> AbstractFilter:
-    """Filter that knows when its sender sends, and so what it means that nothing came.
+    """Return the filter that knows when its sender sends, and so what it means that nothing came.
 
     Silence says that y lies within delta of the sender's reference, or that what was sent was lost. The filter carries
     a sum of Gaussians of (x, r), r the sender's reference: `known` of them where r is the value that came last, one for
@@ -128,17 +128,17 @@ def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger:
 
 
 def _may_lose(channel: SideInformation) -> bool:
-    """True if with positive probability not all components arrive."""
+    """Return whether with positive probability not all components arrive."""
     return bool(np.any(np.asarray(channel.chance)[:, ~np.all(channel.present, axis=1)] > 0))
 
 
 def _has_known_gain(channel: SideInformation) -> bool:
-    """True if no gain is random, and what arrives is all that was sent, in every mode."""
+    """Return whether no gain is random, and what arrives is all that was sent, in every mode."""
     return _has_same_law_in_every_mode(channel) and not np.any(_gain_and_noise_spread(channel)[..., :-1, :-1])
 
 
 def _gain_and_noise_spread(channel: SideInformation) -> np.ndarray:
-    """Spread of gain and noise by mode and pattern, with what rounding leaves of a known gain set to zero."""
+    """Return spread of gain and noise by mode and pattern, with what rounding leaves of a known gain set to zero."""
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
     size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
     size = np.pad(size, [(0, 0)] * (size.ndim - 2) + [(0, 1)] * 2)
@@ -152,7 +152,7 @@ def _has_gaussian_noise(*models: PyTree) -> bool:
 
 
 def _arrival_determines_y(channel: SideInformation) -> bool:
-    """True if y follows from whatever arrives, without noise: then that it was sent says nothing more."""
+    """Return whether y follows from whatever arrives, without noise: then that it was sent says nothing more."""
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
         gain, rows = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
@@ -164,7 +164,7 @@ def _arrival_determines_y(channel: SideInformation) -> bool:
 
 
 def _has_same_law_in_every_mode(channel: SideInformation) -> bool:
-    """True if what arrives has the same mean and spread in every mode in which it can arrive."""
+    """Return whether what arrives has the same mean and spread in every mode in which it can arrive."""
     possible = np.asarray(channel.chance) > 0
     return all(
         np.array_equal(moment[rows, a], np.broadcast_to(moment[rows, a][:1], moment[rows, a].shape))
@@ -175,7 +175,7 @@ def _has_same_law_in_every_mode(channel: SideInformation) -> bool:
 
 
 def _delivers_y_unchanged(channel: SideInformation) -> bool:
-    """True if what arrives is y itself, all of it."""
+    """Return whether what arrives is y itself, all of it."""
     m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
     if m != p:
         return False
@@ -210,7 +210,7 @@ def _check_threshold_rule(
 
 
 def _has_independent_losses(channel: SideInformation) -> bool:
-    """True if components arrive unchanged, and are lost independently of each other, without modes."""
+    """Return whether components arrive unchanged, and are lost independently of each other, without modes."""
     m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
     if len(chance) > 1:
         return False

@@ -64,12 +64,12 @@ class GaussianSum(NamedTuple):
 
 
 def safe_log(x: jax.Array) -> jax.Array:
-    """log x, -inf at 0 without a derivative that is no number."""
+    """Return log x, -inf at 0 without a derivative that is no number."""
     return jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), -jnp.inf)
 
 
 def log_total(log_weight: jax.Array) -> jax.Array:
-    """log of the sum of weights; -inf where all are 0."""
+    """Return log of the sum of weights; -inf where all are 0."""
     top = jnp.max(log_weight)
     top = jnp.where(jnp.isfinite(top), top, 0.0)
     return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))

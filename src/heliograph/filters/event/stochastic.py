@@ -77,7 +77,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> StochasticBelief:
-        """The prior."""
+        """Return the prior."""
         start = at(self.plant, 0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
         return StochasticBelief(*x, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False))
@@ -191,7 +191,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _log_probability_sent(
         self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
     ) -> jax.Array:
-        """log P(sent | z) = log(1 - P(silent | z)), by the law of y given z with this innovation."""
+        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z with this innovation."""
         total, inverse = signal.covariance, self._inverse_weight()
         back = psd_solve(covariance, gain @ total)
         left = symmetrize(total - total @ gain.T @ back) + inverse
@@ -200,12 +200,12 @@ class StochasticEventFilter(AbstractSizedFilter):
         return jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_silent, 0.0)), FLOOR))
 
     def _inverse_weight(self) -> jax.Array:
-        """W^-1, the noise with which silence is a measurement."""
+        """Return W^-1, the noise with which silence is a measurement."""
         assert isinstance(self.trigger, StochasticTrigger)
         return psd_solve(self.trigger.matrix(self.outputs), jnp.eye(self.outputs))
 
     def _log_silence_normaliser(self) -> jax.Array:
-        """log of exp(-e' W e / 2) / N(e; 0, W^-1), the same for all e."""
+        """Return log of exp(-e' W e / 2) / N(e; 0, W^-1), the same for all e."""
         assert isinstance(self.trigger, StochasticTrigger)
         log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
         return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
@@ -225,11 +225,11 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
-        """The Gaussian."""
+        """Return the Gaussian."""
         return Estimate(state.mean, state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """The Gaussian's, around the update."""
+        """Return the Gaussian's, around the update."""
         return smoother_step_by_transform(self, step, first(self.plant))
 
 

@@ -99,14 +99,14 @@ class AdaptiveFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> AdaptiveBelief:
-        """The filter's prior, and the variances' with as much weight as forgetting leaves them."""
+        """Return the filter's prior, and the variances' with as much weight as forgetting leaves them."""
         shape = jnp.full(self.received, PRIOR_SHAPE)
         variance = jnp.diagonal(jnp.asarray(at(self.noise, 0).covariance))
         return AdaptiveBelief(*self.base.init(), shape, shape * variance)
 
     @predicts
     def predict(self, state: AdaptiveBelief, u: ArrayLike = (), k: Step = 0) -> AdaptiveBelief:
-        """The state as the filter does; what is known of the variances stays until something arrives."""
+        """Return the state as the filter does; what is known of the variances stays until something arrives."""
         return AdaptiveBelief(*self.base.predict(state.gaussian, u, k), state.shape, state.scale)
 
     @corrects
@@ -140,12 +140,12 @@ class AdaptiveFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: AdaptiveBelief) -> Estimate:
-        """The filter's own."""
+        """Return the filter's own."""
         posterior = self.base.estimate(state.gaussian)
         return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
-        """Noise variances of what arrives, b / a, of one state or of several stacked."""
+        """Return the noise variances of what arrives, b / a, of one state or of several stacked."""
         variances: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
         return variances
 
@@ -214,7 +214,7 @@ def _variational_update(
 
 
 def _make_independent_noise(variance: jax.Array) -> Columns:
-    """Noise of independent components with these variances (m,)."""
+    """Return the noise of independent components with these variances (m,)."""
     return Columns(np.eye(len(variance)), variance)
 
 
@@ -225,7 +225,7 @@ def _scale_law(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
 
 
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
-    """Filter with the noise variances of its sensor learned on line, each forgetting with `memory` a step.
+    """Return the filter with the noise variances of its sensor learned on line, each forgetting with `memory` a step.
 
     Forgetting goes towards the filter's own variance, which also remains after
     losses, and never towards none. The process noise is taken as true: a Q that is too small is absorbed by R (learn Q

@@ -54,14 +54,14 @@ class AbstractBeliefFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
-        """Mean and covariance of f(x, u) + w."""
+        """Return the mean and covariance of f(x, u) + w."""
         return predict_gaussian(
             at(self.plant, k), self.transform, state, jnp.asarray(u), second_moments_at_start(self.plant, self)
         )
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
-        """Mean and covariance of the belief, angles between -pi and pi."""
+        """Return the mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrap_angles(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -77,7 +77,7 @@ class HasStart(Protocol):
 
 
 def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array, " n"]:
-    """E[x_i^2] at the start plus Var w_i of a step, (n,): how large the numbers are that rounding acts on.
+    """Return E[x_i^2] at the start plus Var w_i of a step, (n,): how large the numbers are that rounding acts on.
 
     Of the plant's first step, and of its law at the start or of another one; a noise that depends on inputs counts
     where it is added.
@@ -92,13 +92,13 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
 
 
 def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> Columns:
-    """Factors of Cov w, and of the rounding of a state that had the second moments `start`, (n,)."""
+    """Return the factors of Cov w, and of the rounding of a state that had the second moments `start`, (n,)."""
     own = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
     return triangularise(join_columns(own, rounding_of(start + jnp.diagonal(plant.noise_covariance(u)))))
 
 
 def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
-    """f(x, u), exactly where it is linear."""
+    """Return f(x, u), exactly where it is linear."""
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
     return transform.image(plant.moves(u, x.mean), x)
@@ -107,7 +107,7 @@ def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u:
 def predict_gaussian(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
-    """f(x, u) + w."""
+    """Return f(x, u) + w."""
     noise = process_noise(plant, u, start)
     if isinstance(plant, LinearPlant):
         return predict_affine(x, plant.transition_matrix(u), plant.shift(u), noise)
@@ -129,7 +129,7 @@ def smoother_step_by_transform(
     start: HasStart,
     whole: Callable[[PyTree], Gaussian] | None = None,
 ) -> SmootherStep:
-    """Smoother step of x+ = f(x, u) + w; `whole` reads Gaussians off states of another form.
+    """Return the smoother step of x+ = f(x, u) + w; `whole` reads Gaussians off states of another form.
 
     `start`: whose law of the first state says how large numbers are.
     """
@@ -167,7 +167,7 @@ def open_loop_filter(
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> OpenLoop:
-    """Prediction by cubature points without any measurement.
+    """Return the prediction by cubature points without any measurement.
 
     Args:
         plant: the plant, n states.

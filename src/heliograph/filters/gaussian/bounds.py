@@ -47,14 +47,14 @@ class Scalars(Module):
 
 
 def scalars_as_array(scalars: Scalars | None) -> np.ndarray:
-    """Scalars as two numbers, NaN where the trace is to be minimised over them."""
+    """Return the scalars as two numbers, NaN where the trace is to be minimised over them."""
     if scalars is None:
         return np.full(2, np.nan)
     return instance("scalars", scalars, Scalars, "Scalars").values
 
 
 def as_scalars(values: np.ndarray) -> Scalars | None:
-    """Scalars from two numbers, None for NaN: the inverse of `scalars_as_array`."""
+    """Return the scalars from two numbers, None for NaN: the inverse of `scalars_as_array`."""
     return None if np.isnan(values).any() else Scalars(*values)
 
 

@@ -61,7 +61,7 @@ class GaussianFilter(AbstractBeliefFilter):
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
-        """Moments of the sensor's signal y at step k, from the state before its measurement."""
+        """Return the moments of the sensor's signal y at step k, from the state before its measurement."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
@@ -232,7 +232,7 @@ def cubature_filter(
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> "GaussianFilter":
-    """Cubature Kalman filter on its channel's second moments.
+    """Return the cubature Kalman filter on its channel's second moments.
 
     Args:
         plant: the plant, n states.
@@ -263,7 +263,7 @@ def extended_filter(
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> "GaussianFilter":
-    """Extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
+    """Return the extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
 
     Args:
         plant: the plant, n states.
@@ -290,7 +290,7 @@ def mean_gain_filter(
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """Cubature filter that takes the mean gain for the gain: the naive filter, as a baseline.
+    """Return the cubature filter that takes the mean gain for the gain: the naive filter, as a baseline.
 
     Args:
         plant: the plant, n states.
@@ -338,7 +338,7 @@ def kalman_filter(
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """Kalman filter of a linear plant whose linear sensor is received directly.
+    """Return the Kalman filter of a linear plant whose linear sensor is received directly.
 
     P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - v), P = P- - K C P-.
 

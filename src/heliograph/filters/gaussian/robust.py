@@ -73,7 +73,7 @@ class InverseMultiquadric(AbstractWeights):
         self.c = scalar("constant of the inverse multiquadric rule", c, TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """1 / (1 + d^2 / c^2)."""
+        """Return 1 / (1 + d^2 / c^2)."""
         return 1 / (1 + squared / self.c**2)
 
 
@@ -89,7 +89,7 @@ class WoLF(AbstractWeights):
         self.c = scalar("constant of the weighted likelihood filter", c, TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """1 / (1 + e^2 / (c^2 r))."""
+        """Return 1 / (1 + e^2 / (c^2 r))."""
         return 1 / (1 + e**2 / (self.c**2 * scale))
 
 
@@ -105,7 +105,7 @@ class Gate(AbstractWeights):
         self.c = scalar("limit of the gate", c, TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """1 or 0."""
+        """Return 1 or 0."""
         return jnp.where(squared <= self.c, 1.0, 0.0)
 
 
@@ -126,7 +126,7 @@ class StudentVB(AbstractWeights):
         self.degrees = np.zeros(0)
 
     def of_law(self, degrees: Degrees) -> "StudentVB":
-        """The same rule with the degrees of each received component."""
+        """Return the same rule with the degrees of each received component."""
         rule = StudentVB(self.iterations)
         object.__setattr__(rule, "degrees", degrees)
         return rule
@@ -134,7 +134,7 @@ class StudentVB(AbstractWeights):
     def iterate(
         self, before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The weights of the last update, and those that it would give the next one."""
+        """Return the weights of the last update, and those that it would give the next one."""
         scale = noise.diagonal
         used = w = jnp.broadcast_to(jnp.ones_like(scale), e.shape)
         for _ in range(self.iterations):
@@ -194,7 +194,7 @@ class RobustFilter(AbstractBeliefFilter):
 def signal_without_noise(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Gaussian, start: jax.Array
 ) -> Signal:
-    """Moments of h(x) and the mean of its noise, without the noise's spread."""
+    """Return the moments of h(x) and the mean of its noise, without the noise's spread."""
     return signal_of(plant, sensor, transform, state, start, zero_covariance(len(sensor.outputs)))
 
 
@@ -223,7 +223,7 @@ def _innovation_about_mean(
 
 
 def _student_degrees_of(noise: ReceivedNoise) -> Vector:
-    """Student's degrees of each component.
+    """Return Student's degrees of each component.
 
     Raises:
         ValueError: noise of another law.

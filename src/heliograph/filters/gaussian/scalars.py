@@ -27,7 +27,7 @@ Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(b
 
 
 def trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
-    """Scalars of Young's inequality of least tr P: Newton's method on log beta; those that are given stay.
+    """Return the scalars of Young's inequality of least tr P: Newton's method on log beta; those that are given stay.
 
     Alternating minimisation converges slowly, so this is Newton's method, after one sweep from START. Where a Newton
     step is too long the sweep itself is taken. The last step is taken outside the loop: its derivative is that of the
@@ -55,7 +55,7 @@ def trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Ar
 
 
 def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
-    """t + (I - J)^-1 (f(t) - t) for one or two components."""
+    """Return t + (I - J)^-1 (f(t) - t) for one or two components."""
     rest = refined - t
     if len(rest) == 1:
         step = rest / (1 - slopes[0][0])
@@ -109,7 +109,7 @@ def _trace_weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array
 def _root_ratio(
     top: jax.Array, by_top: list[jax.Array], bottom: jax.Array, by_bottom: Sequence[jax.Array | None]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """Half of log(top / bottom), at least log SMALLEST_SCALAR, also where both are zero.
+    """Return half of log(top / bottom), at least log SMALLEST_SCALAR, also where both are zero.
 
     Returned with its slopes, from those of both. No quotient or root of zero is taken, so that derivatives exist.
     """

@@ -87,7 +87,7 @@ class _Score(NamedTuple):
 
 
 def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.Array, noise: jax.Array) -> _Score:
-    """Score of an innovation e about a t of variance v, with branches (branches,) of the noise."""
+    """Return the score of an innovation e about a t of variance v, with branches (branches,) of the noise."""
     total = v + noise
     reach = LARGEST * jnp.sqrt(jnp.max(total))
     apart = jnp.clip(e, -reach, reach) - mean
@@ -113,7 +113,7 @@ class AbstractWeights(Module):
     def iterate(
         self, before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The weights of the update, and those to report, for noise of m components."""
+        """Return the weights of the update, and those to report, for noise of m components."""
         scale = noise.diagonal
         w = self.weights(e, e**2 / (before.columns.diagonal + scale), scale)
         return w, w
@@ -131,19 +131,19 @@ def update_weighted(
 
 
 def reweight(noise: Columns, w: jax.Array) -> Columns:
-    """r_ij / sqrt(w_i w_j): each row over the root of its weight."""
+    """Return r_ij / sqrt(w_i w_j): each row over the root of its weight."""
     return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
 
 def joint_update(before: PredictedMeasurement, e: jax.Array, present: jax.Array, noise: Columns) -> Gaussian:
-    """State after the components that are present, with noise of this covariance besides that of t."""
+    """Return the state after the components that are present, with noise of this covariance besides that of t."""
     return condition_on_observation(before.prior, before.slopes, e, join_columns(before.noise, noise), present)[0]
 
 
 def expected_squared_residuals(
     before: PredictedMeasurement, noise: Columns, e: jax.Array, present: jax.Array
 ) -> jax.Array:
-    """E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,)."""
+    """Return E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,)."""
     t = from_columns(jnp.zeros_like(e), before.columns)
     after, _ = condition_on_observation(t, t.root, e, noise, present)
     return (e - after.mean) ** 2 + after.columns.diagonal

@@ -83,7 +83,7 @@ class SequentialFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
-        """Mean and covariance of the belief, by the first node's filter."""
+        """Return the mean and covariance of the belief, by the first node's filter."""
         posterior = self.filters[0].estimate(state)
         return Estimate(posterior.mean, posterior.covariance, self.claim)
 
@@ -99,7 +99,7 @@ def _join_innovations(parts: Sequence[Innovation]) -> Innovation:
 
 
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
-    """Central filter made of single nodes' `filters`, in the order of the network's nodes.
+    """Return the central filter made of single nodes' `filters`, in the order of the network's nodes.
 
     Claim: "exact" if every part is, else "nominal".
 

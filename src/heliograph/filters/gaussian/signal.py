@@ -97,7 +97,7 @@ def signal_of(
 
 
 def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
-    """(|H| root E[x x'] + |E v|)^2 + Cov v of the state at the start, (p,): size of the terms summed in y.
+    """Return (|H| root E[x x'] + |E v|)^2 + Cov v of the state at the start, (p,): size of the terms summed in y.
 
     Not of the prior: on data no covariance of a linear filter depends, and before them moments grow without end where
     only inputs hold a plant.

@@ -37,7 +37,7 @@ class AbstractTransform(Module):
     """
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
-        """Moments of function(x) for x with mean (n,) and covariance (n, n)."""
+        """Return the moments of function(x) for x with mean (n,) and covariance (n, n)."""
         if type(self).image is AbstractTransform.image:
             raise unwritten(self, "apply")
         x = from_covariance(mean, covariance)
@@ -51,7 +51,7 @@ class AbstractTransform(Module):
 
 
 def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
-    """Slopes (D^-1 L^-1 Cov(x, f))' and as curvature what Cov f has more than slopes D slopes'."""
+    """Return the slopes (D^-1 L^-1 Cov(x, f))' and as curvature what Cov f has more than slopes D slopes'."""
     slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
     rest = moments.covariance - (slopes * x.variances) @ slopes.T
     return image_by_slopes(moments.mean, slopes, x, eliminate(rest))
@@ -80,7 +80,7 @@ class Cubature(AbstractTransform):
 
 
 def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each."""
+    """Return f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each."""
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)
     values = jax.vmap(function, in_axes=1, out_axes=1)(points)
@@ -157,7 +157,7 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count^dimension, dimension) and weights of the tensor rule for a standard normal vector."""
+    """Return the points (count^dimension, dimension) and weights of the tensor rule for a standard normal vector."""
     if count**dimension > POINT_LIMIT:
         raise fail("points of the exact-moment rule", f"at most {POINT_LIMIT:,}", f"{count}^{dimension}")
     nodes, weights = np.polynomial.hermite_e.hermegauss(count)

@@ -56,7 +56,7 @@ class AbstractUpdate(Module):
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero.
+        """Return the gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero.
 
         A rule of your own gives this; those of the library give `condition`, from which it follows.
 
@@ -92,7 +92,7 @@ class AbstractUpdate(Module):
         return keep_where_unchanged(jnp.any(z.present), after, prior)
 
     def claim(self, uncertain: bool) -> Claim:
-        """Claim of the bound behind a channel of this kind, of a filter for which all else is exact.
+        """Return the claim of the bound behind a channel of this kind, of a filter for which all else is exact.
 
         Args:
             uncertain: whether probabilities of the channel are known up to a radius only.
@@ -183,7 +183,7 @@ class Interval(AbstractUpdate):
         self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Worst cases from intervals.
+        """Return the worst cases from intervals.
 
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
@@ -191,7 +191,7 @@ class Interval(AbstractUpdate):
         return interval_description(channel, lambda hop: hop.second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2)
 
     def described(self) -> AbstractUpdate:
-        """Young's bound, as for a polytope."""
+        """Return Young's bound, as for a polytope."""
         return Polytope(as_scalars(self.scalars))
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
@@ -226,7 +226,7 @@ def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
 
 
 def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
-    """True if the matrix is a number times the identity."""
+    """Return whether the matrix is a number times the identity."""
     return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
 
 

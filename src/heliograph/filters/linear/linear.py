@@ -83,7 +83,7 @@ class LinearFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: LinearBelief) -> Estimate:
-        """Mean and covariance of the estimate."""
+        """Return the mean and covariance of the estimate."""
         return Estimate(state.mean, state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -107,7 +107,7 @@ class LinearFilter(AbstractSizedFilter):
 
 
 def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Array) -> Signal:
-    """y = C x + v with its mean before any data and E[y y'], and slopes of the estimate.
+    """Return y = C x + v with its mean before any data and E[y y'], and slopes of the estimate.
 
     They depend only on the error covariance and on the state's moments before data, not on the estimate: derivatives
     with respect to the estimate do not involve them.
@@ -134,7 +134,7 @@ def correct_linear(
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> AbstractFilter:
-    """Best linear filter for a linear plant and sensor behind any channel.
+    """Return the best linear filter for a linear plant and sensor behind any channel.
 
     Behind links with memory the modes are estimated jointly; if such a channel also loses data, what arrives is used as
     information on the modes (`side_information_filter`). Behind a late link the past signals are estimated jointly,
@@ -201,7 +201,7 @@ def linear_filter(
 def memoryless_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> AbstractFilter:
-    """Best linear filter for links with independent draws, behind links that may have memory.
+    """Return the best linear filter for links with independent draws, behind links that may have memory.
 
     Args:
         plant: a linear plant, n states.
@@ -232,7 +232,7 @@ def memoryless_filter(
 def as_current_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> LinearFilter:
-    """Filter that takes delayed signals as current: the best linear filter if all delays were zero.
+    """Return the filter that takes delayed signals as current: the best linear filter if all delays were zero.
 
     Args:
         plant: a linear plant, n states.

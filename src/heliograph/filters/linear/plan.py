@@ -42,11 +42,11 @@ class LinearStep(NamedTuple):
         return jnp.asarray(self.output @ mean + self.offset)
 
     def correct(self, mean: Float[Array, " N"], innovation: Float[jax.Array, " m"]) -> Float[jax.Array, " N"]:
-        """m = m- + K e."""
+        """Return m = m- + K e."""
         return jnp.asarray(mean + self.gain @ innovation)
 
     def keep(self) -> Float[jax.Array, "*node N N"]:
-        """I - K C, which maps the predicted mean, and its error, to the corrected one."""
+        """Return I - K C, which maps the predicted mean, and its error, to the corrected one."""
         return jnp.asarray(jnp.eye(self.gain.shape[-2]) - self.gain @ self.output)
 
 
@@ -87,13 +87,13 @@ class PlannedFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
-        """F m + f; the input is in f."""
+        """Return F m + f; the input is in f."""
         step: LinearStep = at(self.steps, k)
         return PlannedMean(step.predict(state.mean), _stage(state, 2 * k + 1))
 
     @corrects
     def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
-        """m + K (z - C m - c)."""
+        """Return m + K (z - C m - c)."""
         step: LinearStep = at(self.steps, k)
         z, expected = jnp.asarray(z), step.expect(state.mean)
         mean = step.correct(state.mean, z - expected)
@@ -101,11 +101,11 @@ class PlannedFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PlannedMean) -> Estimate:
-        """Mean of the state, with the planned covariance."""
+        """Return the mean of the state, with the planned covariance."""
         return self._estimate(state.mean, state.stage)
 
     def after_step(self, state: PlannedMean, k: Step) -> Estimate:
-        """Mean of the state, with the planned covariance of step k, common to all runs."""
+        """Return the mean of the state, with the planned covariance of step k, common to all runs."""
         return self._estimate(state.mean, 2 * k + 2)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -174,7 +174,7 @@ _plan_by_xla = quickly_compiled(_record_matrices)
 def plan_step(
     filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step
 ) -> tuple[LinearStep, PyTree, PyTree]:
-    """Matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
+    """Return matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
     # F and f: the prior mean is affine in the mean.
     none = jnp.zeros_like(state.mean)
 

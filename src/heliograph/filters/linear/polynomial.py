@@ -158,11 +158,11 @@ class PolynomialFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: CentredState) -> Estimate:
-        """Estimate of the inner filter, plus the mean."""
+        """Return the estimate of the inner filter, plus the mean."""
         return _add_mean(self.inner.estimate(state.inner), state.mean)
 
     def after_step(self, state: CentredState, k: Step) -> Estimate:
-        """Estimate of the inner filter after step k, plus the mean."""
+        """Return the estimate of the inner filter after step k, plus the mean."""
         return _add_mean(self.inner.after_step(state.inner, k), state.mean)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -182,12 +182,12 @@ class PolynomialFilter(AbstractSizedFilter):
 
 
 def _initial_mean(centre: MeanBeforeData | None, n: int) -> jax.Array:
-    """Mean of the state at the start (n,), zeros where nothing is subtracted."""
+    """Return the mean of the state at the start (n,), zeros where nothing is subtracted."""
     return jnp.zeros(n) if centre is None else jnp.asarray(centre.start)
 
 
 def _predict_mean(centre: MeanBeforeData | None, mean: Array, k: Step) -> Array:
-    """E[x+] = A E[x] + b over step k."""
+    """Return E[x+] = A E[x] + b over step k."""
     if centre is None:
         return mean
     c = at(centre, k)
@@ -196,7 +196,7 @@ def _predict_mean(centre: MeanBeforeData | None, mean: Array, k: Step) -> Array:
 
 
 def _subtract_mean(centre: MeanBeforeData | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
-    """z - G C E[x]."""
+    """Return z - G C E[x]."""
     return jnp.asarray(z) if centre is None else jnp.asarray(z) - at(centre, k).received @ mean
 
 
@@ -206,7 +206,7 @@ def _add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
 
 
 def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
-    """Innovation of z itself, out of that of its monomials."""
+    """Return the innovation of z itself, out of that of its monomials."""
     m, places = len(z), position(len(z) + 1, degree)
     values = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
     value, covariance = innovation.value[values], innovation.covariance[values][:, values]
@@ -216,7 +216,7 @@ def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: in
 def polynomial_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int, degree: int = 2
 ) -> PolynomialFilter:
-    """Best filter that is a polynomial of `degree` in each received z_k: 1 linear, 2 quadratic, 3 cubic.
+    """Return the best filter that is a polynomial of `degree` in each received z_k: 1 linear, 2 quadratic, 3 cubic.
 
     For linear plants and sensors behind any channel, with noises of any law whose moments up to 2 degree exist. It
     estimates the whole state, a dynamical bias included, and its covariance is recomputed where z has gaps. For many
@@ -336,16 +336,16 @@ class MemoryFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: MemoryState) -> Estimate:
-        """Estimate of the filter of products, plus the mean."""
+        """Return the estimate of the filter of products, plus the mean."""
         return _add_mean(self.products.estimate(state.products), state.mean)
 
     def after_step(self, state: MemoryState, k: Step) -> Estimate:
-        """Estimate of the filter of products after step k, plus the mean."""
+        """Return the estimate of the filter of products after step k, plus the mean."""
         return _add_mean(self.products.after_step(state.products, k), state.mean)
 
 
 def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
-    """Quadratic filter whose products reach into the past through the linear filter's estimate.
+    """Return the quadratic filter whose products reach into the past through the linear filter's estimate.
 
     Args:
         plant: a linear plant without inputs, n states.

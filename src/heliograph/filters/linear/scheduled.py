@@ -106,7 +106,7 @@ class ScheduledFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: ScheduleState) -> Estimate:
-        """Mean of the estimate, with the schedule's covariance while all has arrived."""
+        """Return the mean of the estimate, with the schedule's covariance while all has arrived."""
         return self._estimate(state, state.stage)
 
     def after_step(self, state: ScheduleState, k: Step) -> Estimate:
@@ -161,7 +161,7 @@ class LinearSystemFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
-        """A y + a and A P A' + Cov(w)."""
+        """Return A y + a and A P A' + Cov(w)."""
         s: Steps = at(self.steps, k)
         return predict_affine(state, s.transition, s.drift, at(self.noises, k).process)
 
@@ -175,7 +175,7 @@ class LinearSystemFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
-        """Mean and covariance of the plant's states, by the projection."""
+        """Return the mean and covariance of the plant's states, by the projection."""
         projection = jnp.asarray(self.projection)
         return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
@@ -198,7 +198,7 @@ class SystemNoises(NamedTuple):
 
 @in_float64
 def _factor_noises(system: LinearSystem) -> SystemNoises:
-    """Factors of both noises at each step, with the rounding of numbers as large as the system makes them.
+    """Return the factors of both noises at each step, with the rounding of numbers as large as the system makes them.
 
     A combination of measurements that is free of noise is so to the rounding of Cov(v) itself, which is joined too:
     else one that repeats another would measure, without noise, the state times what rounding left of their difference.

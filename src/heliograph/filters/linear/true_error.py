@@ -50,7 +50,7 @@ def true_error(
     horizon: int,
     inputs: Float[ArrayLike, "horizon inputs"] | None = None,
 ) -> TrueError:
-    """E[(x - xhat)(x - xhat)'] of a linear filter in a world that may differ from its model, exactly.
+    """Return E[(x - xhat)(x - xhat)'] of a linear filter in a world that may differ from its model, exactly.
 
     With r = (x, 1, s), s the filter's state, N_j = E[r r' 1{mode j}] is propagated through plant, channel and gains.
     Nothing is assumed about the origin of the gains.

@@ -140,7 +140,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
-        """Matrix (n, N) that maps zeta to x."""
+        """Return the matrix (n, N) that maps zeta to x."""
         return np.eye(len(self.states), (len(self.states) + 1) * self._function_count)
 
     @property
@@ -153,11 +153,11 @@ class AdditiveModalFilter(AbstractModalFilter):
         return jnp.pad(first, (0, (self._function_count - 1) * len(first)))
 
     def _mean_from_centre(self, centre: jax.Array) -> jax.Array:
-        """Part of E zeta that the centre c makes: (c, 0) in the first block."""
+        """Return the part of E zeta that the centre c makes: (c, 0) in the first block."""
         return self._embed_first_block(jnp.append(centre, 0.0))
 
     def _transition_matrices(self, state: AdditiveBelief, k: Step) -> Laws:
-        """Transition matrix of each term's chain; the identity before the first prediction."""
+        """Return the transition matrix of each term's chain; the identity before the first prediction."""
         chains = [jnp.asarray(term.transition) for term in at(self.terms, k)]
         return tuple(jnp.where(state.moved, chain, jnp.eye(len(chain))) for chain in chains)
 
@@ -216,7 +216,7 @@ def _gains_by_function(terms: Sequence[ChannelByMode], laws: Laws) -> jax.Array:
 
 
 def _next_laws(laws: Laws, rows: Laws) -> Laws:
-    """Probabilities of each term's modes one step later."""
+    """Return the probabilities of each term's modes one step later."""
     return tuple(law @ chain for law, chain in zip(laws, rows, strict=True))
 
 
@@ -228,7 +228,7 @@ def _function_transition(rows: Laws) -> jax.Array:
 
 
 def _indicator_covariance(law: jax.Array) -> jax.Array:
-    """Covariance of the indicators of all modes but the first, diag(p) - p p'."""
+    """Return the covariance of the indicators of all modes but the first, diag(p) - p p'."""
     return jnp.diag(law[1:]) - jnp.outer(law[1:], law[1:])
 
 
@@ -238,7 +238,7 @@ def _second_moment_of_functions(laws: Laws) -> Columns:
 
 
 def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -> Columns:
-    """Columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i."""
+    """Return the columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i."""
     factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
     weights = jnp.concatenate([jnp.ones(one.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)

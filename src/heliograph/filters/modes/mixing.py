@@ -25,7 +25,7 @@ class AbstractMerging(Module):
         raise unwritten(self, "mixing")
 
     def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (component, mode) of the measurement update: all that can have a weight."""
+        """Return the pairs (component, mode) of the measurement update: all that can have a weight."""
         places = np.arange(modes)
         return places, places
 

@@ -125,7 +125,7 @@ class MixtureFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
-        """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
+        """Return A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = process_noise(plant, u, second_moments_at_start(self.plant))
         moved = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
@@ -160,7 +160,7 @@ class MixtureFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: MixtureBelief) -> Estimate:
-        """Mean and covariance of the belief, angles between -pi and pi."""
+        """Return the mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrap_angles(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:

@@ -126,13 +126,13 @@ class AbstractModalFilter(AbstractSizedFilter):
         return plan_filter(self, inputs, self._projection_to_state())
 
     def process_noise_by_mode(self, u: ArrayLike, k: Step, of_mode: Columns) -> Columns:
-        """Columns of zeta's process noise and rounding, from `of_mode` = E[phi phi'] of the next functions."""
+        """Return columns of zeta's process noise and rounding, from `of_mode` = E[phi phi'] of the next functions."""
         parts = noise_in_mode(at(self.plant, k), u, second_moments_at_start(self.plant))
         return Columns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
 
     @abstractmethod
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
-        """Matrix (n, N) that maps zeta to x."""
+        """Return the matrix (n, N) that maps zeta to x."""
 
 
 class AbstractJointModalFilter(AbstractModalFilter):
@@ -142,7 +142,7 @@ class AbstractJointModalFilter(AbstractModalFilter):
     initial: Float[Array, " M"]
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
-        """x = sum_j zeta^j."""
+        """Return x = sum_j zeta^j."""
         return sum_of_modes(len(self.states), len(self.initial))
 
 
@@ -194,7 +194,7 @@ class ModalFilter(AbstractJointModalFilter):
         return ModalBelief(*after, *state[3:]), innovation
 
     def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
-        """Transition matrix (M, M) of the chain; the identity before the first prediction."""
+        """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
     def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, Columns]:
@@ -231,7 +231,7 @@ def _propagate_moments(state: ModalBelief, move: jax.Array) -> jax.Array:
 
 
 def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Columns:
-    """Covariance of the process noise of x~, with the rounding of the state and of the mode's indicator."""
+    """Return the covariance of the process noise of x~, with the rounding of the state and of the mode's indicator."""
     own = process_noise(plant, jnp.asarray(u), start)
     one = rounding_of(np.ones(1))
     return Columns(jax.scipy.linalg.block_diag(own.matrix, one.matrix), jnp.append(own.weights, one.weights))
@@ -250,7 +250,7 @@ def mode_transition_covariance(carried: jax.Array, rows: jax.Array) -> Columns:
 
 
 def covariance_of_mode(rows: jax.Array) -> jax.Array:
-    """Cov(1{j}, 1{l} | i) = delta_jl Pi_ij - Pi_ij Pi_il, (M, M, M)."""
+    """Return Cov(1{j}, 1{l} | i) = delta_jl Pi_ij - Pi_ij Pi_il, (M, M, M)."""
     return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
 
 
@@ -265,7 +265,7 @@ def separate_modes(among: jax.Array) -> Columns:
 
 
 def known_noise(channel: ChannelByMode, sent: Columns, law: jax.Array) -> Columns:
-    """Columns (m, M columns) of sum_j P(j) (Hbar_j Cov(v) Hbar_j' + Cov n_j), which no signal scales."""
+    """Return the columns (m, M columns) of sum_j P(j) (Hbar_j Cov(v) Hbar_j' + Cov n_j), which no signal scales."""
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     through = Columns(gains @ sent.matrix, jnp.broadcast_to(sent.weights, (len(law), len(sent.weights))))
     return join_columns(side_by_side(through, law), side_by_side(channel.noise, law))
@@ -284,7 +284,7 @@ def kron(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
-    """Matrix (n, N) that maps zeta to x = sum_j zeta^j."""
+    """Return the matrix (n, N) that maps zeta to x = sum_j zeta^j."""
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
@@ -309,7 +309,7 @@ def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Arra
 
 
 def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
-    """Law of zeta at the start, and E[x~ x~'].
+    """Return the law of zeta at the start, and E[x~ x~'].
 
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
     """
@@ -327,7 +327,7 @@ def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]
 
 
 def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
-    """P(mode) c, mode after mode: the part of E zeta that the centre makes."""
+    """Return P(mode) c, mode after mode: the part of E zeta that the centre makes."""
     return jnp.kron(law, jnp.append(centre, 0.0))
 
 
@@ -366,7 +366,7 @@ M = TypeVar("M", bound=AbstractJointModalFilter)
 
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
-    """Best linear filter behind links with memory; `linear_filter` has checked that the parts fit."""
+    """Return the best linear filter behind links with memory; `linear_filter` has checked that the parts fit."""
     return build_from_modes(ModalFilter, plant, sensor, channel, claim_of_modes(channel))
 
 
@@ -385,7 +385,7 @@ def channels_by_mode(channel: Channel) -> tuple[Float[Array, " M"], ChannelByMod
 
 
 def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
-    """Moments of the channel by mode at one step, and the transition from the step before."""
+    """Return the moments of the channel by mode at one step, and the transition from the step before."""
     mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
     gains, noises = zip(*(divide_spread(nominal_spread(m).center) for m in now.maps), strict=True)
     noise = Columns(*(stack_parts(part) for part in zip(*noises, strict=True)))

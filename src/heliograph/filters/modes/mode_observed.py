@@ -119,7 +119,7 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: ModeObservedBelief) -> Estimate:
-        """Mean and covariance of the estimate."""
+        """Return the mean and covariance of the estimate."""
         return Estimate(state.belief.mean, state.belief.covariance, self.claim)
 
 
@@ -134,7 +134,7 @@ def _condition_channel(channel: AbstractRandomAffine, numbers: jax.Array) -> Sec
 def _predict_channel(
     last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array
 ) -> SecondOrder:
-    """Moments of the channel given the memories' states one step before; without them, of the first step."""
+    """Return the moments of the channel given the memories' states one step before; without them, of the first step."""
     choices = []
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
         choices.append(
@@ -149,7 +149,7 @@ def _predict_channel(
 
 
 def _nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
-    """Mean and spread of the channel under the nominal law, for numbers that may be traced."""
+    """Return the mean and spread of the channel under the nominal law, for numbers that may be traced."""
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
     none = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))

@@ -202,7 +202,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
-        """Mean and covariance of the whole mixture, angles between -pi and pi."""
+        """Return the mean and covariance of the whole mixture, angles between -pi and pi."""
         mean, covariance = moments_of_mixture(state.mean, state.covariance, jnp.sum(state.weight, axis=1))
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
@@ -230,7 +230,7 @@ def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> ja
 def fields_of_mode_filters(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None, nodes: int
 ) -> dict[str, Any]:
-    """Fields that all filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
+    """Return the fields that all filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
     angles, (initial, described) = find_received_angles(plant, sensor, channel), describe_modes(channel, nodes)
@@ -246,7 +246,7 @@ def fields_of_mode_filters(
 def imm_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
-    """Interacting multiple model filter of a plant behind links with memory: one Gaussian per mode.
+    """Return the interacting multiple model filter of a plant behind links with memory: one Gaussian per mode.
 
     Before each step they are mixed by the mode that the next one comes from, mu_(i|j) = Pi_ij mu_i / c_j; after it the
     modes are weighted by the likelihood of z. A gain that is random within a mode enters by its second moments;

@@ -133,7 +133,7 @@ class ParticleFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Particles) -> Estimate:
-        """Mean and covariance of the whole mixture, angles between -pi and pi."""
+        """Return the mean and covariance of the whole mixture, angles between -pi and pi."""
         mean, covariance = moments_of_mixture(state.mean, state.covariance, state.weight)
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
@@ -149,7 +149,7 @@ def _resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
 
 
 def _fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
-    """Key made of another one and of the bits of a measurement."""
+    """Return the key made of another one and of the bits of a measurement."""
     bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
     for word in bits.ravel():
         key = jax.random.fold_in(key, word)

@@ -55,7 +55,7 @@ def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M
 def _describe_step_by_pattern(
     outcomes: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
 ) -> SideInformation:
-    """Probability and conditional moments of one step, from each mode's list of loss patterns."""
+    """Return the probability and conditional moments of one step, from each mode's list of loss patterns."""
     m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
     shape = (len(outcomes), len(kinds))
     # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].

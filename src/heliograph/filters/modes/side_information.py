@@ -225,7 +225,7 @@ def _make_belief(mean: jax.Array, moments: Columns, centre: jax.Array, moved: ja
 
 
 def _mode_probabilities(x: jax.Array, weights: jax.Array) -> jax.Array:
-    """Probabilities of the modes (M,), E[1^2 1{mode}]."""
+    """Return the probabilities of the modes (M,), E[1^2 1{mode}]."""
     return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
 
 
@@ -317,7 +317,7 @@ def gram_schmidt_first(
 def side_information_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Float[ArrayLike, "modes flags"] | None = None
 ) -> SideInformationFilter:
-    """Linear filter with side information on the modes: which packets arrived, and a flag with each.
+    """Return the linear filter with side information on the modes: which packets arrived, and a flag with each.
 
     Args:
         plant: a linear plant, n states.

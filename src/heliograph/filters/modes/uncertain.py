@@ -149,7 +149,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
 
 def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
-    """Quotient, 0 where the denominator is 0."""
+    """Return the quotient, 0 where the denominator is 0."""
     return jnp.where(denominator > 0, numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0)
 
 

@@ -167,7 +167,7 @@ class ClockFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: ClockBelief) -> Estimate:
-        """Mean and covariance of the belief, angles between -pi and pi."""
+        """Return the mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrap_angles(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
 
 
@@ -201,7 +201,7 @@ def clock_filter(
     clocks: Sequence[str],
     transform: AbstractTransform | None = None,
 ) -> ClockFilter:
-    """Filter of plant and clocks, as `with_clocks` makes them, that detects when a clock cannot be observed.
+    """Return the filter of plant and clocks, as `with_clocks` makes them, that detects when a clock cannot be observed.
 
     Args:
         plant: the plant with its clocks' offsets and drifts among the states.

@@ -65,7 +65,7 @@ class AbstractPartFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
-        """Mean and covariance of the first states."""
+        """Return the mean and covariance of the first states."""
         return self._select_first_states(self.base.estimate(state))
 
     def _select_first_states(self, whole: Estimate) -> Estimate:
@@ -89,7 +89,7 @@ class PartFilter(AbstractPartFilter):
         return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Mean and covariance of the first states after step k."""
+        """Return the mean and covariance of the first states after step k."""
         return self._select_first_states(self.base.after_step(state, k))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -266,7 +266,7 @@ class LateFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: LateState) -> Estimate:
-        """Prediction over the last `delay` steps."""
+        """Return the prediction over the last `delay` steps."""
 
         def move(j: jax.Array, base: PyTree) -> PyTree:
             return self._predict_if_begun(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)

@@ -75,12 +75,12 @@ class PredictionFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: BeliefAndPrior) -> Estimate:
-        """Mean and covariance of the prediction."""
+        """Return the mean and covariance of the prediction."""
         return self.base.estimate(state.prior)
 
 
 def prediction_of(filter: AbstractFilter) -> PredictionFilter:
-    """One-step prediction of a filter as its estimate: at step k it does not use z_k.
+    """Return the one-step prediction of a filter as its estimate: at step k it does not use z_k.
 
     Claim: that of `filter`, a `GaussianFilter`.
 
@@ -146,7 +146,7 @@ class FedBackFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: FedBackBelief, u: ArrayLike = (), k: Step = 0) -> FedBackBelief:
-        """Mean and covariance of f(x, u) + w, and the reference that the sensor will subtract."""
+        """Return the mean and covariance of f(x, u) + w, and the reference that the sensor will subtract."""
         moved = self.base.predict(state.gaussian, u, k)
         return FedBackBelief(*moved, self.reference(state.mean, jnp.asarray(u), k))
 
@@ -168,7 +168,7 @@ class FedBackFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: FedBackBelief) -> Estimate:
-        """Mean and covariance of the belief."""
+        """Return the mean and covariance of the belief."""
         return Estimate(state.mean, state.covariance, self.claim)
 
 

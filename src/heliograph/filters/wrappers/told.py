@@ -103,11 +103,11 @@ class ToldFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
-        """Mean and covariance of the estimate."""
+        """Return the mean and covariance of the estimate."""
         return self._claim(self.base.estimate(state))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Mean and covariance after step k."""
+        """Return the mean and covariance after step k."""
         return self._claim(self.base.after_step(state, k))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:

@@ -72,7 +72,7 @@ class NodeGains(NamedTuple):
 
 
 def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
-    """Gains of the step with these weights of the estimates: fuse what was believed, predict once, correct."""
+    """Return gains of the step with these weights of the estimates: fuse what was believed, predict once, correct."""
     a = jnp.asarray(step.matrix)
     predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
     corrected, innovation = correct(predicted, jnp.asarray(step.arrived))
@@ -82,7 +82,7 @@ def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
 def correct(
     predicted: Float[jax.Array, "n n"], information: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, "n n"], Float[jax.Array, "n n"]]:
-    """P = (Pb^-1 + S)^-1 and F = I - P S of a predicted Pb, which may be singular, and of information S.
+    """Return P = (Pb^-1 + S)^-1 and F = I - P S of a predicted Pb, which may be singular, and of information S.
 
     With S = L diag(d) L' the measurements that were made say as much as L' x + v, Cov v = diag(d)^-1.
     """
@@ -96,7 +96,7 @@ def correct(
 def information_of(
     gain: jax.Array, noise: jax.Array, used: jax.Array
 ) -> tuple[Float[jax.Array, "n m"], Float[jax.Array, "n n"]]:
-    """H' R^-1 and H' R^-1 H of the components that are used."""
+    """Return H' R^-1 and H' R^-1 H of the components that are used."""
     there = used.astype(gain.dtype)
     h = there[:, None] * gain
     r = there[:, None] * noise * there[None] + jnp.diag(1 - there)

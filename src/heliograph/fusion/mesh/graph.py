@@ -14,10 +14,10 @@ class GraphLike(Protocol):
     """A graph as networkx has it: `edges()` yields pairs of names, sender first where it `is_directed()`."""
 
     def edges(self) -> Iterable[Any]:
-        """Pairs of names."""
+        """Return the pairs of names."""
 
     def nodes(self) -> Iterable[Any]:
-        """Names of the nodes."""
+        """Return the names of the nodes."""
 
     def is_directed(self) -> bool:
         """Test whether a pair is one way."""
@@ -99,7 +99,7 @@ def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
 def neighbours_within(
     positions: Mapping[str, Float[ArrayLike, " axes"]], radius: Float[ArrayLike, ""]
 ) -> dict[str, tuple[str, ...]]:
-    """Neighbours of nodes at these positions: every other node at most `radius` away.
+    """Return the neighbours of nodes at these positions: every other node at most `radius` away.
 
     Args:
         positions: by node (axes,), in the unit of the radius.

@@ -37,7 +37,7 @@ def measurement_weights(
 def scatter_blocks(
     blocks: Float[Array, "node degree n n"], senders: Int[Array, "node degree"], present: Bool[Array, "node degree"]
 ) -> Any:
-    """Matrix (N, N) with these blocks at (node, sender) where present, sparse unless it is traced."""
+    """Return the matrix (N, N) with these blocks at (node, sender) where present, sparse unless it is traced."""
     nodes, _, n, _ = blocks.shape
     if is_traced(blocks):
         there = jnp.where(present[:, :, None, None], blocks, 0.0)
@@ -52,7 +52,7 @@ def scatter_blocks(
 def joint_after(
     joint: Float[Array, "N N"], m: Any, f: Float[Array, "node n n"], noise: Float[Array, "n n"], ws: Any, w: Any
 ) -> Float[Array, "N N"]:
-    """J+ from M, F, Q, and the matrices of W_i S_j and of W_i over the measurements that node i has."""
+    """Return J+ from M, F, Q, and the matrices of W_i S_j and of W_i over the measurements that node i has."""
     measured = ws @ w.T
     added = propagate_by_mode(f.reshape(len(joint), -1), noise, measured if is_traced(measured) else measured.toarray())
     after = propagate_by_mode(m, joint, added)
@@ -61,6 +61,6 @@ def joint_after(
 
 
 def blocks_of(joint: Float[Array, "node n node n"], senders: Int[Array, "node degree"]) -> Float[Array, "..."]:
-    """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
+    """Return the joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
     blocks: Float[Array, "..."] = joint[senders[:, :, None], :, senders[:, None], :].swapaxes(2, 3)
     return blocks

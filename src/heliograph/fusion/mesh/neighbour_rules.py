@@ -45,7 +45,7 @@ class TraceIntersection(AbstractIntersection):
         self.improvements = check_count("improvements", improvements, 0)
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Shares of all of several estimates."""
+        """Return the shares of all of several estimates."""
         traces, all_there = jnp.trace(covariances, axis1=1, axis2=2), jnp.ones(len(covariances), dtype=bool)
         believed = NeighbourEstimates(covariances[0], traces, information, None, all_there)
         return trace_shares(believed, self.power, self.improvements)[0]
@@ -121,7 +121,7 @@ class DiffusionWeights(_NeighbourRule):
         return placed
 
     def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
-        """Gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
+        """Return the gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
         a = jnp.asarray(step.matrix)
         predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
         corrected, innovation = correct(predicted, jnp.asarray(step.complete))
@@ -157,7 +157,7 @@ class FrozenWeights(_NeighbourRule):
         return FrozenWeights(self.rule, np.ascontiguousarray(np.moveaxis(blocks, 0, -1)))
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Weights of what arrived, and the covariance that the blocks give them."""
+        """Return the weights of what arrived, and the covariance that the blocks give them."""
         return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
 
     def weights_ahead(self, arrived: Bool[np.ndarray, "step row degree"]) -> Ahead | None:
@@ -174,7 +174,7 @@ class FrozenWeights(_NeighbourRule):
 def _weights_of_row(
     rule: AbstractFusion, joint: Float[jax.Array, "degree n degree n"], arrived: Bool[jax.Array, "step degree"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Parts and covariances (step, ...) of one node's weights."""
+    """Return the parts and covariances (step, ...) of one node's weights."""
     degree, n = joint.shape[:2]
     nothing = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
 
@@ -186,7 +186,7 @@ def _weights_of_row(
 
 
 def _check_shares(name: str, row: object) -> dict[str, float]:
-    """Shares of one node: not negative, at most one in sum, and one where its own is among them."""
+    """Return the shares of one node: not negative, at most one in sum, and one where its own is among them."""
     what = f"diffusion shares of {name!r}"
     mine = {n: float(scalar(what, share, 0.0)) for n, share in table(what, row, "shares by neighbour").items()}
     total = sum(mine.values())

@@ -61,7 +61,7 @@ def gather_data(network: Network, recording: object, inputs: Any, free: int, tru
 
 
 def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> object:
-    """Inputs of one recording of several: those in its place in a list, or the common ones."""
+    """Return the inputs of one recording of several: those in its place in a list, or the common ones."""
     if not isinstance(inputs, list | tuple):
         return inputs
     if len(inputs) != len(several):
@@ -92,7 +92,7 @@ def _split_truth(network: Network, several: Sequence[object], truth: Any, steps:
 
 
 def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
+    """Return the measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
     held = getattr(recording, "measurements", recording)
     known = getattr(recording, "inputs", None) if inputs is None else inputs
     # measurements by node
@@ -128,14 +128,14 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
 
 
 def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """Runs of a simulation one by one; a recording is one."""
+    """Return the runs of a simulation one by one; a recording is one."""
     if all(value.ndim == 3 for value in values):
         return [list(run) for run in zip(*values, strict=True)]
     return [values]
 
 
 def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
-    """Array with rows added up to a length: of a filler, or copies of the last one."""
+    """Return the array with rows added up to a length: of a filler, or copies of the last one."""
     more = length - len(values)
     end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
     return np.concatenate([values, np.repeat(end, more, axis=0)]) if more else values

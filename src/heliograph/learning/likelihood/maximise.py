@@ -164,7 +164,7 @@ def _mark_arrived(state: _State, moving: np.ndarray, domains: Domains, close: fl
 
 
 def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Bool[np.ndarray, "lanes p"]:
-    """Coordinates on whose way to the end of their domain the likelihood rises, but hardly.
+    """Return the coordinates on whose way to the end of their domain the likelihood rises, but hardly.
 
     Where v = exp(x) is small l(0) - l(v) = -v l'(v) = -dl/dx to first order.
     """
@@ -257,7 +257,7 @@ def trust_region_step(
     moving: np.ndarray,
     free: np.ndarray,
 ) -> tuple[Float[np.ndarray, "lanes p"], Float[np.ndarray, " lanes"], Float[np.ndarray, " lanes"]]:
-    """Maximiser p of g' p - p' B p / 2 over |D p| <= radius, |D p|, and the gain that B foretells.
+    """Return the maximiser p of g' p - p' B p / 2 over |D p| <= radius, |D p|, and the gain that B foretells.
 
     It is (B + s D^2)^-1 g with the least s >= 0 for which B + s D^2 is not indefinite and |D p| <= radius: Newton's
     method for 1 / |D p| = 1 / radius, from below. All in units u of standard errors, in which B is of order 1 and
@@ -291,7 +291,7 @@ def trust_region_step(
 
 
 def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(B + s D^2)^-1 g of each lane; nothing along directions in which the matrix is singular."""
+    """Return (B + s D^2)^-1 g of each lane; nothing along directions in which the matrix is singular."""
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
@@ -302,7 +302,7 @@ def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.nd
 def expected_gain(
     gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
 ) -> Float[np.ndarray, " lanes"]:
-    """g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
+    """Return g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
     unit, _ = _units_and_flat(information, counting)
     scaled = _scale_both_sides(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
@@ -321,11 +321,11 @@ def _units_and_flat(information: np.ndarray, moving: np.ndarray) -> tuple[np.nda
 
 
 def _scale_both_sides(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
+    """Return U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
     stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
     return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])
 
 
 def _multiply_lanes(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """A x of each lane."""
+    """Return A x of each lane."""
     return np.asarray(np.einsum("lij,lj->li", matrix, vector))

@@ -35,7 +35,7 @@ from heliograph.simulation.node import Node
 
 
 def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
-    """Plant, sensor and channel of all nodes together, in their order, as if no observed loss ever happened.
+    """Return the plant, sensor and channel of all nodes together, in their order, as if no observed loss ever happened.
 
     Raises:
         ValueError: relays that filter and forward.
@@ -53,7 +53,7 @@ def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
 
 
 def _joint_channel(channel: Channel) -> Channel:
-    """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
+    """Return the channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
     complete: Channel = at_each_step(lambda step: step.condition_on_arrival(), channel)
@@ -116,7 +116,7 @@ class Objective:
         return hash((_identity_of(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
-        """All by which one objective may differ from another."""
+        """Return all by which one objective may differ from another."""
         description = self.description
         return self.form, _identity_of(description.build), description.parameters, description.named, description.start
 
@@ -125,7 +125,7 @@ class Objective:
         return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
-        """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
+        """Return the innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
 
         Where the estimate is no number the covariance is none, so that no likelihood is taken for that of silence.
         """
@@ -160,7 +160,7 @@ def _identity_of(build: Build) -> tuple[object, ...]:
 
 
 def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
-    """Objectives that the network allows, the linear one first; `by_truth` the density of the true states alone.
+    """Return objectives that the network allows, the linear one first; `by_truth` the density of the true states alone.
 
     Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
     whatever the laws. Conditional: by the state's moments given data, for channels without memory or delay. Without a
@@ -182,7 +182,7 @@ def _reuse_equal(objective: Objective) -> Objective:
 
 
 def forms_of(network: Network) -> list[Form]:
-    """The forms that a network allows."""
+    """Return the forms that a network allows."""
     plant, sensor, channel = joint_world(network)
     link = first(channel)
     plain = not link.remembers and not link.past
@@ -223,7 +223,7 @@ def sole_filter(network: Network) -> AbstractFilter:
 
 
 def evaluate_at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
-    """Likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
+    """Return likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
     count, copies = len(data.measurements), (len(x), 1, 1)
     runs = np.repeat(x, count, axis=0), *(np.tile(data_row, copies) for data_row in data_rows)

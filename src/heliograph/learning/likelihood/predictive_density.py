@@ -45,7 +45,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
 
 
 def discretise_laws(channel: Map, count: int) -> Map:
-    """Channel with each gain's law as finitely many values."""
+    """Return the channel with each gain's law as finitely many values."""
 
     def is_law(leaf: object) -> bool:
         return isinstance(leaf, AbstractLaw)
@@ -59,7 +59,7 @@ def discretise_laws(channel: Map, count: int) -> Map:
 
 @cache
 def _normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Values of Phi(t) at the nodes, and their weights."""
+    """Return the values of Phi(t) at the nodes, and their weights."""
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
     return np.asarray(ndtr(t)), weights / weights.sum()
@@ -103,7 +103,7 @@ def predictive(
     inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
     nodes: int = NODES,
 ) -> Predictive:
-    """Density of each measurement with the laws of the channel's gains as `nodes` values each.
+    """Return the density of each measurement with the laws of the channel's gains as `nodes` values each.
 
     p(z_k | past) = sum_j w_j N(z; G_j y + c_j, G_j P_y G_j' + N_j), where y and P_y are what the cubature filter that
     knows the channel's moments expects of the sensor, and j runs over the combinations of gains. Parts of a stack are
@@ -154,7 +154,7 @@ class StackDensities(tuple[StackDensity, ...]):
 
     @staticmethod
     def of(channel: AbstractRandomAffine, nodes: int) -> "StackDensities":
-        """Combinations of each part of a stack, of everything else as a whole."""
+        """Return the combinations of each part of a stack, of everything else as a whole."""
         parts = channel.in_parallel
         return StackDensities(_part(discretise_laws(affine, nodes).list_atoms()) for affine in parts)
 
@@ -178,7 +178,7 @@ def score_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: St
 def _score_block(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: StackDensities
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it."""
+    """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it."""
     total, pits, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]

@@ -45,13 +45,13 @@ class Surface:
         return Domains(low, high, single & (low | high))
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """Evaluation at points."""
+        """Return the evaluation at points."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
             self._last[:] = [(np.array(x), evaluate_at_points(self.objective, np.asarray(x), self.data))]
         return self._last[0][1]
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
-        """Likelihood, gradient and information at points."""
+        """Return the likelihood, gradient and information at points."""
         evaluation = self.evaluations(x)
         return evaluation.total, evaluation.gradient, evaluation.information
 
@@ -73,7 +73,7 @@ class Surface:
         return hessian
 
     def information_by_row(self, x: Float[np.ndarray, " p"], places: np.ndarray) -> list[Float[np.ndarray, "steps k"]]:
-        """What each row of each recording tells of some coordinates: -ds_k/dx_k by central differences."""
+        """Return what each row of each recording tells of some coordinates: -ds_k/dx_k by central differences."""
         deviation = self.standard_errors(x)[places]
         width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
         shifts = np.zeros((len(places), len(x)))
@@ -93,7 +93,7 @@ class Surface:
     def possible(
         self, points: Float[np.ndarray, "points p"], near: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "points p"]:
-        """Points, moved halfway to a possible one, again and again, where the likelihood is not finite."""
+        """Return the points, moved halfway to a possible one, again and again, where the likelihood is not finite."""
         points = points.copy()
         for _ in range(HALVINGS):
             wrong = ~np.isfinite(self.evaluations(points).total)
@@ -103,7 +103,7 @@ class Surface:
         return points
 
     def curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Curvature:
-        """Curvature of -l along the directions that are identified, in standard errors, at a point (p,)."""
+        """Return the curvature of -l along the directions that are identified, in standard errors, at a point (p,)."""
         evaluation, places = self.evaluations(x[None]), np.flatnonzero(active)
         information = evaluation.information[0][np.ix_(places, places)]
         gradient = evaluation.gradient[0][places]
@@ -173,7 +173,7 @@ class Surface:
 
 
 def _ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
-    """Coordinates of a number that are at an end of its domain at minus infinity, and at infinity."""
+    """Return the coordinates of a number that are at an end of its domain at minus infinity, and at infinity."""
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":
         return ~none, ~none

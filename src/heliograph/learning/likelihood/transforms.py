@@ -78,7 +78,7 @@ def unlink(domain: Domain, value: PyTree) -> PyTree:
 
 
 def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
-    """Derivative d unlink / d value."""
+    """Return the derivative d unlink / d value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
     if np.isfinite(domain.low):
@@ -87,7 +87,7 @@ def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
 
 
 def slope(domain: Domain, value: PyTree) -> PyTree:
-    """Derivative d link / d value."""
+    """Return the derivative d link / d value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
     if np.isfinite(domain.low):
@@ -96,7 +96,7 @@ def slope(domain: Domain, value: PyTree) -> PyTree:
 
 
 def size(domain: Domain, shape: tuple[int, ...]) -> int:
-    """Count of numbers on the line."""
+    """Return the count of numbers on the line."""
     count = int(np.prod(shape))
     if domain.kind == "simplex":
         return count - count // shape[-1]

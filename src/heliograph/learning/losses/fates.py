@@ -43,24 +43,24 @@ class BetweenArrivals(np.ndarray):
 
 
 def is_trial(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
-    """Packets whose fate is known and was not what made them an end."""
+    """Return the packets whose fate is known and was not what made them an end."""
     return np.asarray((fate == 0) | (fate == 1))
 
 
 def fill_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """Fates as far as they are known to those after them: ends have arrived."""
+    """Return the fates as far as they are known to those after them: ends have arrived."""
     return np.where(fate == CHOSEN, 0.0, fate)
 
 
 def ends_alone(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """A stretch of which nothing is known but that its chosen ends arrived."""
+    """Return a stretch of which nothing is known but that its chosen ends arrived."""
     return np.where(fate == CHOSEN, 0.0, np.nan)
 
 
 def fates_of_sequence(
     sequence: "Float[ArrayLike, ' packets']", sent: "Float[ArrayLike, ' packets'] | None" = None, jump: int = JUMP
 ) -> Fates:
-    """Fates of the packets of one sender from the sequence numbers that were received: what is missing was lost.
+    """Return fates of the packets of one sender from the sequence numbers that were received: what is missing was lost.
 
     A number that leaps ahead by `jump` or falls back starts a new stretch (the sender restarted). Copies are dropped:
     one or two numbers again within 50, or all again from a number on. Packets that overtake each other look like
@@ -122,7 +122,7 @@ def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
 
 
 def _mark_gaps(received: np.ndarray) -> BetweenArrivals:
-    """Fates of the packets from the first number to the last: those that are missing were lost."""
+    """Return the fates of the packets from the first number to the last: those that are missing were lost."""
     lost = np.ones(received[-1] - received[0] + 1)
     lost[received - received[0]] = 0.0
     return BetweenArrivals.of(lost)
@@ -133,7 +133,7 @@ def fates_by_node(
     sequence: "Float[ArrayLike, ' packets']",
     sent: "Float[ArrayLike, ' packets'] | None" = None,
 ) -> dict[str, Fates]:
-    """Fates of the packets of each sender of a log, by the sender's name.
+    """Return the fates of the packets of each sender of a log, by the sender's name.
 
     Args:
         node: sender of each packet (packets,).
@@ -154,7 +154,7 @@ def fates_by_node(
 
 
 def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[str, Fates]:
-    """Fates at each hop of a route, from which packets arrived behind each, in the order of the route.
+    """Return the fates at each hop of a route, from which packets arrived behind each, in the order of the route.
 
     A packet that was lost says nothing of the hops that it did not reach.
 
@@ -185,7 +185,7 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
 
 
 def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *received']]") -> dict[str, Fates]:
-    """Fates of what each node of a recording should have received at each step, where NaN is a loss.
+    """Return the fates of what each node of a recording should have received at each step, where NaN is a loss.
 
     Components of a node that come and go together are one packet, under the node's name; else each has a name of its
     own, NODE.0, NODE.1, ... A component that never arrived was not sent.

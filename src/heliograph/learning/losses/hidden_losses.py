@@ -61,11 +61,11 @@ class HiddenModeLosses(AbstractLossLaw):
         return HiddenModeLosses(good, bad, fails, recovers)
 
     def shares(self) -> dict[str, Share]:
-        """Losses of each mode and the chain's probabilities, with likelihood intervals."""
+        """Return the losses of each mode and the chain's probabilities, with likelihood intervals."""
         return {name: getattr(self, name) for name in ("good_loss", "bad_loss", "fail", "recover")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Probability of each loss by the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
+        """Return the probability of each loss by the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
         good, bad, fails, recovers = (share.estimate for share in self.shares().values())
         away = fails + recovers
         is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
@@ -81,7 +81,7 @@ class HiddenModeLosses(AbstractLossLaw):
         return probabilities
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Link in two modes (`gilbert_elliott`) with the losses of each."""
+        """Return the link in two modes (`gilbert_elliott`) with the losses of each."""
         good, bad = (erasure(link, 1 - share.estimate) for share in (self.good_loss, self.bad_loss))
         return gilbert_elliott(good, bad, self.fail.estimate, self.recover.estimate)
 
@@ -114,7 +114,7 @@ class Runs:
         return float(total[4].real), np.asarray(total[:4].imag / STEP)
 
     def _log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
-        """Log-likelihoods for several sets of shares (sets, 4)."""
+        """Return the log-likelihoods for several sets of shares (sets, 4)."""
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)
         # T' and A of each fate, and the stationary law p

@@ -30,15 +30,15 @@ class AbstractLossLaw(Module):
     """
 
     def shares(self) -> dict[str, Share]:
-        """Estimates with their intervals, by name."""
+        """Return the estimates with their intervals, by name."""
         raise unwritten(self, "shares")
 
     def predicted(self, fate: Packets) -> Packets:
-        """Probability that each packet of a stretch is lost, given those before it."""
+        """Return the probability that each packet of a stretch is lost, given those before it."""
         raise unwritten(self, "predicted")
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Link with such losses, which the receiver knows of.
+        """Return the link with such losses, which the receiver knows of.
 
         Raises:
             ValueError: a law that no channel has.
@@ -57,7 +57,7 @@ class AbstractLossLaw(Module):
         return np.concatenate([self._score_stretch(stretch) for stretch in parts])
 
     def _score_stretch(self, fate: Packets) -> Packets:
-        """Log-likelihood of each packet of one stretch; of chosen ends, given that the last one arrived."""
+        """Return the log-likelihood of each packet of one stretch; of chosen ends, given that the last one arrived."""
         p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):
             logs: Packets = np.where(is_trial(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
@@ -66,7 +66,7 @@ class AbstractLossLaw(Module):
         return logs
 
     def _arrives_again(self, steps: int) -> float:
-        """Probability that a packet arrives so many after one that did, whatever became of those between."""
+        """Return the probability that a packet arrives so many after one that did, whatever became of those between."""
         fate = np.full(steps + 1, np.nan)
         fate[0] = 0.0
         return 1.0 - float(self.predicted(fate)[-1])
@@ -94,15 +94,15 @@ class IndependentLosses(AbstractLossLaw):
         return IndependentLosses(int(np.sum(known == 1)), int(np.sum(is_trial(known))))
 
     def shares(self) -> dict[str, Share]:
-        """Share of losses, lost / packets, with Wilson's interval."""
+        """Return the share of losses, lost / packets, with Wilson's interval."""
         return {"loss": wilson(self.lost, self.packets)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Probability (k + 1/2) / (n + 1) of each loss, so that none is impossible."""
+        """Return the probability (k + 1/2) / (n + 1) of each loss, so that none is impossible."""
         return np.full(len(fate), (self.lost + 0.5) / (self.packets + 1))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Link behind an erasure."""
+        """Return the link behind an erasure."""
         return erasure(link, 1 - self.lost / self.packets)
 
 
@@ -161,7 +161,7 @@ class MarkovLosses(AbstractLossLaw):
         return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Probability (k + 1/2) / (n + 1) of each loss after the past, as far as it is known."""
+        """Return the probability (k + 1/2) / (n + 1) of each loss after the past, as far as it is known."""
         past, length = _last_fates(fate, self.order)
         probabilities = np.zeros(len(fate))
         for known in range(self.order + 1):
@@ -178,7 +178,7 @@ class MarkovLosses(AbstractLossLaw):
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Link in modes that are the last fates; a past that was never seen is taken for even odds."""
+        """Return the link in modes that are the last fates; a past that was never seen is taken for even odds."""
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
             shares = self.shares()
@@ -193,7 +193,7 @@ class MarkovLosses(AbstractLossLaw):
 
 
 def _spans(parts: Fates) -> np.ndarray:
-    """Steps from the first to the last packet of stretches between arrivals."""
+    """Return the steps from the first to the last packet of stretches between arrivals."""
     return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
 
 
@@ -231,7 +231,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
 
 
 def _last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Last fates as a number, the latest lowest, and how many are known without a gap, `order` at most."""
+    """Return the last fates as a number, the latest lowest, and how many are known without a gap, `order` at most."""
     past, length = np.zeros(len(fate), dtype=int), np.zeros(len(fate), dtype=int)
     for back in range(1, order + 1):
         before = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]

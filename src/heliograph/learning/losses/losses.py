@@ -79,7 +79,7 @@ class Losses:
     best: str
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Link with the losses of the law that predicts best among those that a channel can have."""
+        """Return the link with the losses of the law that predicts best among those that a channel can have."""
         able = [name for name in self.laws if name != RUNNING]
         name = max(able, key=lambda law: self.held_out[law].log_likelihood) if self.held_out else self.best
         return self.laws[name].channel(link)
@@ -161,13 +161,13 @@ def loss_memory(fates: object) -> LossMemory:
 
 
 def _likelihood(counts: np.ndarray) -> float:
-    """Log-likelihood sum n_ab log(n_ab / n_a)."""
+    """Return the log-likelihood sum n_ab log(n_ab / n_a)."""
     rows = counts.sum(axis=1, keepdims=True)
     return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
 
 
 def _split_at_unknown(fate: np.ndarray) -> list[np.ndarray]:
-    """Parts of a stretch without an unknown fate."""
+    """Return the parts of a stretch without an unknown fate."""
     edges = np.flatnonzero(np.isnan(fate))
     return [stretch[~np.isnan(stretch)] for stretch in np.split(fate, edges) if np.any(~np.isnan(stretch))]
 
@@ -219,7 +219,7 @@ class RunningRateLosses(AbstractLossLaw):
         return {name: getattr(self, name) for name in ("base", "weight", "step")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Probability of each loss by the running rate; an unknown fate leaves it where it is."""
+        """Return the probability of each loss by the running rate; an unknown fate leaves it where it is."""
         known = ~np.isnan(fate)
         at_known = _predict_losses(np.append(fate[known], 0.0), *(share.estimate for share in self.shares().values()))[
             0
@@ -228,7 +228,7 @@ class RunningRateLosses(AbstractLossLaw):
 
 
 def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
-    """P(lost) of each packet, and its derivatives (3, packets)."""
+    """Return P(lost) of each packet, and its derivatives (3, packets)."""
     before = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
     keep = [1.0, step - 1.0]
     rate = scipy.signal.lfilter([step], keep, before)  # r - base, which starts at 0
@@ -240,7 +240,7 @@ def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> t
 def _sum_log_probabilities(
     lost: Packets, ahead: tuple[Packets, Packets], trials: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Log-likelihood of the trials under these predictions, and its gradient."""
+    """Return the log-likelihood of the trials under these predictions, and its gradient."""
     p, slope = ahead
     p = np.clip(p, 1e-300, 1 - 1e-16)
     logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))

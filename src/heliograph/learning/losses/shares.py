@@ -57,7 +57,7 @@ def _profile_interval(function: Slope, top: np.ndarray, value: float, i: int) ->
 
 
 def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> float:
-    """Crossing of the level by the profile of logit i on one side; 0 or 1 where it does not cross."""
+    """Return the crossing of the level by the profile of logit i on one side; 0 or 1 where it does not cross."""
     others, near = np.delete(np.arange(len(top)), i), top.copy()
 
     @cache  # an end of a bracket keeps its value: from another start a search may end elsewhere
@@ -85,5 +85,5 @@ def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side:
 
 
 def logits(*shares: float) -> np.ndarray:
-    """Logits of shares inside (0, 1)."""
+    """Return the logits of shares inside (0, 1)."""
     return np.asarray(logit(np.array(shares)))

@@ -120,7 +120,7 @@ def _flatten_path(path: str) -> str:
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
-    """Paths, without their last names, of covariances in `old` that are factors in `new` alone."""
+    """Return the paths, without their last names, of covariances in `old` that are factors in `new` alone."""
     before, now = set(old), set(new)
     stems = [path.removesuffix(COVARIANCE) for path in old if path.endswith(COVARIANCE) and path not in now]
     return [stem for stem in stems if {stem + LOWER, stem + VARIANCES} <= now - before]

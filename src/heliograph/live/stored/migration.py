@@ -185,11 +185,11 @@ class Carrier:
         ).to_bytes()
 
     def _node_sizes(self) -> Iterator[tuple[str, int]]:
-        """How many numbers each node's events have here."""
+        """Return how many numbers each node's events have here."""
         return ((name, node.received) for name, node in self.fleet.network.nodes.items())
 
     def _node_size(self, names: Sequence[str], node: int) -> int:
-        """How many numbers an event of this node has, -1 standing for inputs."""
+        """Return how many numbers an event of this node has, -1 standing for inputs."""
         return int(self._old["given"] if node < 0 else self._old["nodes"][names[node]])
 
     def _translate_rows(self, table: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:

@@ -156,7 +156,7 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
 
 
 def _states_of(*sensors: AbstractSensor) -> list[int]:
-    """Numbers of states that both sensors take, among the first few."""
+    """Return the numbers of states that both sensors take, among the first few."""
     return [n for n in range(1, 33) if all(_takes(sensor, n) for sensor in sensors)][:1]
 
 

@@ -39,7 +39,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
 
 
 def how_to_install(extra: str) -> str:
-    """A command that brings an extra to this Python, also from a clone, whose name no index knows."""
+    """Return a command that brings an extra to this Python, also from a clone, whose name no index knows."""
     clone = Path(heliograph.__file__).parents[2]
     package = clone if (clone / "pyproject.toml").is_file() else "heliograph"
     return f'{sys.executable} -m pip install "{package}[{extra}]"'

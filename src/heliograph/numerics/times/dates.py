@@ -64,7 +64,7 @@ def moment_of(text: str, name: str) -> tuple[int, bool]:
 
 
 def _instant(match: re.Match[str]) -> int:
-    """Nanoseconds since 1970 in UTC."""
+    """Return the nanoseconds since 1970 in UTC."""
     if int(match["day"][:4]) not in YEARS:
         raise ValueError
     nanoseconds = int(np.datetime64(f"{match['day']}T{match['clock'] or '00:00'}", "ns").astype(np.int64))
@@ -84,7 +84,7 @@ def _offset(zone: str | None) -> str:
 
 
 def instant(text: str) -> datetime:
-    """A date of ISO 8601 with its zone, to the microsecond."""
+    """Return a date of ISO 8601 with its zone, to the microsecond."""
     match = DATE.fullmatch(text)
     if match is None or match["zone"] is None or int(match["day"][:4]) not in YEARS:
         raise ValueError
@@ -93,7 +93,7 @@ def instant(text: str) -> datetime:
 
 
 def seconds_between(time: np.ndarray) -> np.ndarray:
-    """Seconds since the row before, 0 in the first; of dates from whole nanoseconds."""
+    """Return the seconds since the row before, 0 in the first; of dates from whole nanoseconds."""
     if time.dtype.kind != "M":
         return np.diff(time, prepend=time[:1])
     whole = time.astype("datetime64[ns]").astype(np.int64)
@@ -118,7 +118,7 @@ def unequal_steps(time: np.ndarray) -> str:
 
 
 def format_dates(time: np.ndarray) -> np.ndarray:
-    """Dates as texts in UTC, all with as many digits of a second as one of them needs; NaT is empty."""
+    """Return the dates as texts in UTC, all with as many digits of a second as one of them needs; NaT is empty."""
     there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
     unit = next(unit for unit, size in UNITS.items() if not np.any(there % size))
     return np.asarray(np.where(np.isnat(time), "", np.datetime_as_string(time, unit=unit, timezone="UTC")))

@@ -27,7 +27,7 @@ class Conditions(NamedTuple):
 
 
 def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
-    """Design of a network that is a function of free numbers: the best of several descents.
+    """Return the design of a network that is a function of free numbers: the best of several descents.
 
     Raises:
         ValueError: no start from which a budget or a target error is met, a network that does not fit the error.
@@ -77,7 +77,7 @@ def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
 
 
 def _limits(allowed: PowerLimits, target: float | None) -> Limits:
-    """Finite limits of a budget as rows of all powers; peaks too, since powers are no free numbers here."""
+    """Return the finite limits of a budget as rows of all powers; peaks too, since powers are no free numbers here."""
     rows, most = allowed.rows()
     peak = allowed.peak.ravel()
     finite = np.isfinite(peak)
@@ -103,7 +103,7 @@ def _unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> ValueError:
 
 
 def lagrange_conditions(problem: Problem, limits: Limits, x: Vector) -> Conditions:
-    """Multipliers of the limits that leave least of the gradient, what they leave, and a watt's worth."""
+    """Return the multipliers of the limits that leave least of the gradient, what they leave, and a watt's worth."""
     programme, z = Programme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
     value, gradient = programme.value(z)
     reached = programme.room(z) < ACTIVE

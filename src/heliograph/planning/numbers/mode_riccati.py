@@ -56,7 +56,7 @@ class ModeSolution(NamedTuple):
 
 
 def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
-    """Covariances with the best gains, and their adjoint under the criterion.
+    """Return the covariances with the best gains, and their adjoint under the criterion.
 
     Raises:
         ValueError: an error that grows without limit, measurements without any noise.
@@ -74,7 +74,7 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
 
 
 def _periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
-    """X and best gains for steps that repeat for ever."""
+    """Return X and best gains for steps that repeat for ever."""
     # The recursion, until its gains stabilise.
     last = m.law[-1, :, None, None] * m.process[-1]
     for _ in range(PLAIN):
@@ -102,7 +102,7 @@ def _step_through(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Par
 
 
 def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Best gains of a step, and X after it."""
+    """Return the best gains of a step, and X after it."""
     law = m.law[k][:, None, None]
     prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)
     cross = m.output[k] @ prior
@@ -114,14 +114,14 @@ def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[n
 
 
 def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
-    """Recursion of X under given gains: F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K']."""
+    """Return the recursion of X under given gains: F = (I - K H) A, S = pi [(I - K H) Q (I - K H)' + K N K']."""
     close = np.eye(gains.shape[2]) - gains @ m.output
     added = close @ m.process[:, None] @ close.swapaxes(-1, -2) + gains @ m.noise @ gains.swapaxes(-1, -2)
     return JumpSystem(m.chain, close @ m.transition[:, None], m.law[:, :, None, None] * added)
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """sum_k,j <L, right side>, which has the error's gradient where X, K and L are fixed."""
+    """Return sum_k,j <L, right side>, which has the error's gradient where X, K and L are fixed."""
     parts, gains, ahead = (jnp.asarray(values) for values in solution)
     earlier = jnp.roll(parts, 1, axis=0)
     if m.start is not None:  # the first step's chain forgets the mode before: any will do

@@ -42,7 +42,7 @@ class Number(NamedTuple):
 
 
 def young_scalars(steps: int) -> Number:
-    """Scalar of Young's inequality for each step, or a single one of the steady bound."""
+    """Return the scalar of Young's inequality for each step, or a single one of the steady bound."""
     shape = () if steps == 1 else (steps,)
     return Number(*(np.full(shape, value) for value in (0.1, 1e-6, 1e3)))
 
@@ -68,7 +68,7 @@ class Numbers(NamedTuple):
         return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
     def named(self, x: Array) -> dict[str, Any]:
-        """Numbers by name, each in its shape."""
+        """Return the numbers by name, each in its shape."""
         by_name, begin = {}, 0
         for name, number in self.by_name.items():
             by_name[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
@@ -76,7 +76,7 @@ class Numbers(NamedTuple):
         return by_name
 
     def drawn(self, draws: np.random.Generator) -> Vector:
-        """Another start: anywhere between the ends, or where there are none by a factor about the first."""
+        """Return another start: anywhere between the ends, or where there are none by a factor about the first."""
         between = np.isfinite(self.low) & np.isfinite(self.high)
         within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
         factor = np.exp(draws.normal(size=len(self.low)))
@@ -107,7 +107,7 @@ def check_numbers(free: object) -> Numbers:
 
 
 def _end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
-    """A least or largest value, which may be infinite, of the start's shape."""
+    """Return a least or largest value, which may be infinite, of the start's shape."""
     try:
         value = np.broadcast_to(np.asarray(end, dtype=float), shape)
     except (TypeError, ValueError):
@@ -183,7 +183,7 @@ class TracedNetwork:
         return shapes, self.error.steps, self.error.horizon is None, self.young
 
     def system(self, x: Array) -> ModeSystem:
-        """System of the best linear filter at these numbers."""
+        """Return the system of the best linear filter at these numbers."""
         values = self.numbers.named(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
         try:
@@ -194,7 +194,7 @@ class TracedNetwork:
         return mode_system(network, self.error, young)
 
     def slopes(self, x: Array, solution: ModeSolution) -> Slopes:
-        """Derivatives there, at fixed gains."""
+        """Return the derivatives there, at fixed gains."""
         m, pull = jax.vjp(self.system, jnp.asarray(x))
         # Cotangents: of the error through everything, and of each power alone.
         of_error, size = jax.grad(lagrangian)(m, solution), m.powers.size
@@ -250,7 +250,7 @@ class NumberProblem:
         self._last: dict[tuple[bytes, int | None], Point] = {}
 
     def network(self, x: Vector) -> Network:
-        """Network at these numbers."""
+        """Return the network at these numbers."""
         named = self.numbers.named(x).items()
         values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
@@ -274,7 +274,7 @@ class NumberProblem:
                     raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
 
     def at(self, x: Vector, criterion: Criterion | None = None) -> Point:
-        """Everything at a point, of an eigenvalue as sharp as the criterion has it.
+        """Return everything at a point, of an eigenvalue as sharp as the criterion has it.
 
         Raises:
             ValueError: an error that grows without limit, powers that do.
@@ -292,7 +292,7 @@ class NumberProblem:
         return self._last[key]
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
-        """Error, powers and derivatives; None where the error or the powers grow without limit."""
+        """Return the error, powers and derivatives; None where the error or the powers grow without limit."""
         try:
             now = self.at(x, self.criterion._replace(sharpness=sharpness))
         except ValueError:
@@ -300,7 +300,7 @@ class NumberProblem:
         return Evaluation(now.error, now.slopes.error, now.powers.ravel(), now.slopes.powers.reshape(-1, len(x)))
 
     def descent_problem(self) -> Problem:
-        """Problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
+        """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
         low, high = self.numbers.low, self.numbers.high
         unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), 1e-12)
         sharpnesses = [criterion.sharpness for criterion in self.criterion.sharper()]

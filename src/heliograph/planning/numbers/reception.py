@@ -66,7 +66,7 @@ class _Modes(NamedTuple):
 
 
 def sources_of(network: Network) -> dict[str, Source]:
-    """Sensors with their channels by node.
+    """Return the sensors with their channels by node.
 
     Raises:
         ValueError: relays that filter, sensors that are not linear, delays.
@@ -89,7 +89,7 @@ def sources_of(network: Network) -> dict[str, Source]:
 
 
 def transmitters_of(network: Network) -> tuple[str, ...]:
-    """Names of all transmitters, in the order of `ModeSystem.powers`."""
+    """Return the names of all transmitters, in the order of `ModeSystem.powers`."""
     sources = sources_of(network).items()
     return tuple(f"{name}.{hop}" for name, source in sources for hop in transmitter_names(first(source.channel)))
 
@@ -107,7 +107,7 @@ def check_time(network: Network, error: Error) -> None:
 
 
 def mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
-    """System of the network's best linear filter. Exact noises; where probabilities are uncertain, upper bounds.
+    """Return system of the network's best linear filter. Exact noises; where probabilities are uncertain, upper bounds.
 
     `young` is the scalar b of each step, None where the mean gains are known.
 
@@ -142,7 +142,7 @@ def mode_system(network: Network, error: Error, young: Array | None = None) -> M
 
 
 def _stack_nodes(nodes: list[Received]) -> tuple[Array, Array]:
-    """H and N of all nodes in each choice of a mode for each."""
+    """Return H and N of all nodes in each choice of a mode for each."""
     outputs, noises = [], []
     for modes in product(*(range(node.law.shape[1]) for node in nodes)):
         pairs = list(zip(nodes, modes, strict=True))
@@ -200,7 +200,7 @@ def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
 
 
 def _flag_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
-    """Modes of a channel all of whose modes are observed, with the map in each."""
+    """Return the modes of a channel all of whose modes are observed, with the map in each."""
     parts = channel.in_parallel
     rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
     chains = memories(channel)
@@ -212,7 +212,7 @@ def _flag_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
 def _laws(
     onward: Float[Array, "time M M"], initial: Float[Array, "M"], forever: bool
 ) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
-    """The law at each step, and the chain into it: around for ever, or from the initial law on."""
+    """Return the law at each step, and the chain into it: around for ever, or from the initial law on."""
     around = reduce(jnp.matmul, onward)
     law = [stationary(around) if forever and len(around) > 1 else jnp.asarray(initial)]
     for step in onward[:-1]:
@@ -224,7 +224,7 @@ def _laws(
 def _span(
     sensor: LinearSensor, channel: AbstractRandomAffine, modes: _Modes, states: Array, young: Array | None, law: Array
 ) -> tuple[Array, Array, Array]:
-    """H, N and powers over steps with one sensor and one channel."""
+    """Return H, N and powers over steps with one sensor and one channel."""
     y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
     described = [_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
@@ -241,7 +241,7 @@ def _span(
 def _mode(
     channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, sensor: LinearSensor, young: Array | None
 ) -> tuple[Float[Array, "m n"], Float[Array, "time m m"]]:
-    """H, and N: what random gains make of E (y, 1)(y, 1)', and the sensor's noise; of what is lost, noise."""
+    """Return H, and N: what random gains make of E (y, 1)(y, 1)', and the sensor's noise; of what is lost, noise."""
     described, present = second_order(channel), jnp.asarray(arrived)
     gain = jnp.where(present[:, None], jnp.asarray(described.mean_gain), 0.0)
     sensed = gain @ jnp.asarray(sensor.noise.covariance) @ gain.T + jnp.zeros((len(y), 1, 1))

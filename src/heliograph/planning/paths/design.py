@@ -38,15 +38,15 @@ class PathProblem(NamedTuple):
     scale: float
 
     def covariances(self, powers: Powers) -> Float[np.ndarray, "time n n"]:
-        """P after each step."""
+        """Return P after each step."""
         return error_covariances(self.paths, self.information(powers).information)
 
     def exact(self, powers: Powers) -> float:
-        """Error itself."""
+        """Return the error itself."""
         return self.criterion.exact(self.covariances(powers))
 
     def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
-        """Error, -d error / d j of the path of each free hop, and d error / d p; by one adjoint recursion."""
+        """Return error, -d error / d j of the path of each free hop, and d error / d p; by one adjoint recursion."""
         information, slope = self.information(powers)
         p = error_covariances(self.paths, information)
         value, weights = self.criterion.smooth(p)
@@ -54,14 +54,14 @@ class PathProblem(NamedTuple):
         return value, by_information, -by_information * slope
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
-        """Error, powers and their derivatives."""
+        """Return the error, powers and their derivatives."""
         powers = np.maximum(x, 0.0).reshape(self.limits.peak.shape)
         sharp = self._replace(criterion=self.criterion._replace(sharpness=sharpness))
         value, _, gradient = sharp.sensitivity(powers)
         return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
 
     def linear(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
-        """Problem with the linear error that touches this one from below, its value here and its gradient."""
+        """Return problem with the linear error that touches this one from below, its value here and its gradient."""
         problem = self._replace(criterion=self.criterion.supporting(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
         return problem, value, gradient
@@ -72,7 +72,7 @@ class PathProblem(NamedTuple):
         return float(value + np.sum(gradient * (self.limits.best(-gradient) - powers)))
 
     def least_total(self, powers: Powers, target: float) -> float:
-        """Least total power at which the linear model at p, below a convex f everywhere, reaches the target."""
+        """Return least total power at which the linear model at p, below a convex f everywhere, reaches the target."""
         _, value, gradient = self.linear(powers)
         low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
         for _ in range(100):
@@ -83,7 +83,7 @@ class PathProblem(NamedTuple):
         return low
 
     def solve(self, starts: list[Powers], target: float | None = None) -> Powers | None:
-        """Best powers from these starts, for the least error or for the least total that reaches a target."""
+        """Return best powers from these starts, for the least error or for the least total that reaches a target."""
         rows, most = self.limits.rows()
         peak = self.limits.peak
         problem = Problem(
@@ -112,7 +112,7 @@ class PowerTask(NamedTuple):
         return is_convex(self.problem.path)
 
     def whole(self) -> SplitPaths:
-        """Paths by the power that their free hops send together."""
+        """Return the paths by the power that their free hops send together."""
         return split_paths(self.problem.paths, self.free, self.fixed)
 
     def relax(self) -> PathProblem:
@@ -134,7 +134,7 @@ class PowerTask(NamedTuple):
         )
 
     def of_paths(self, powers: Powers) -> Float[np.ndarray, "time path"]:
-        """Power that the free hops of each path send together."""
+        """Return the power that the free hops of each path send together."""
         total = np.zeros(self.problem.paths.second.shape)
         np.add.at(total.T, self.problem.path, powers.T)
         return total
@@ -154,7 +154,7 @@ def power_task(
     starts: int,
     seed: int,
 ) -> PowerTask:
-    """Problem in the free powers, with starts that are even over some choices of the paths that send."""
+    """Return the problem in the free powers, with starts that are even over some choices of the paths that send."""
 
     def information(powers: Powers) -> PathInformation:
         every = fixed.copy()
@@ -193,7 +193,7 @@ def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) 
 
 
 def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
-    """Powers of the least error within the limits of a `task`, and the certificate."""
+    """Return the powers of the least error within the limits of a `task`, and the certificate."""
     problem, starts = task.problem, task.starts
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         whole = SplitPaths(*(values[:, problem.path] for values in task.whole()))
@@ -211,7 +211,7 @@ def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
 
 
 def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
-    """Powers of the least total that reaches the target error, and the certificate."""
+    """Return the powers of the least total that reaches the target error, and the certificate."""
     _check_reachable(task, target)
     limits = task.problem.limits
     free_total = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))
@@ -237,7 +237,7 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
 
 
 def _reach(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
-    """Least powers that reach a target, from starts each raised until it does; None where none can."""
+    """Return the least powers that reach a target, from starts each raised until it does; None where none can."""
     nothing = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(nothing))[0] <= target:
         return nothing
@@ -276,7 +276,7 @@ def _check_reachable(task: PowerTask, target: float) -> None:
 
 
 def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, present: float) -> PowerDesign:
-    """Design of a task: the least error, or the least power for a target."""
+    """Return the design of a task: the least error, or the least power for a target."""
     powers, certificate = least_error_powers(task) if target is None else least_power(task, target)
     paths = task.problem.paths
     every = task.fixed.copy()

@@ -49,7 +49,7 @@ class RiccatiMap(NamedTuple):
 
 
 def compose(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
-    """Composition of two such maps, the first applied first: again such a map."""
+    """Return the composition of two such maps, the first applied first: again such a map."""
     inner = np.linalg.inv(np.eye(len(first.h)) + first.h @ second.g)
     through = inner @ first.a
     g = first.g + first.a.T @ second.g @ through
@@ -58,7 +58,7 @@ def compose(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 
 
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
-    """Limit of X = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k of them.
+    """Return the limit of X = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k of them.
 
     Raises:
         ValueError: covariances that grow without limit.
@@ -75,7 +75,7 @@ def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
 
 
 def covariances(plants: Plants, information: Matrices) -> Matrices:
-    """Posterior covariance P_k of each step under the information received at each step.
+    """Return the posterior covariance P_k of each step under the information received at each step.
 
     Raises:
         ValueError: steps that repeat for ever, under which the error grows without limit.
@@ -97,7 +97,7 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
 
 
 def adjoint(plants: Plants, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
-    """Adjoint L_k, the gradient of the cost with respect to P_k through all later steps."""
+    """Return the adjoint L_k, the gradient of the cost with respect to P_k through all later steps."""
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
     always = JumpSystem(np.ones((len(p), 1, 1)), phi[:, None], np.zeros_like(phi[:, None]))
     return always.adjoint(weights, plants.start is None)[:, 0]
@@ -147,7 +147,7 @@ def independent_paths(
     initial_covariance: Matrix | None = None,
     transmitters: tuple[str, ...] | None = None,
 ) -> "Paths":
-    """Paths of a plant x+ = A x + w and sensors y_i = c_i x + v_i, each measured over hops of its own.
+    """Return the paths of a plant x+ = A x + w and sensors y_i = c_i x + v_i, each measured over hops of its own.
 
     A hop delivers g sent + m; relays amplify what they receive, noise included. Hops are listed path by path.
 
@@ -205,14 +205,14 @@ def independent_paths(
 
 
 def check_at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Numbers, none below `least`; ValueError if some are."""
+    """Return the numbers, none below `least`; ValueError if some are."""
     if value.size and np.min(value) < least:
         raise fail(name, f"numbers of at least {least:g}", f"{np.min(value):g}")
     return value
 
 
 def _broadcast_to_hops(value: ArrayLike, sensors: int, hops: int) -> Float[np.ndarray, "..."]:
-    """Numbers (M, H), from (M,) for one hop, or from one number for all."""
+    """Return the numbers (M, H), from (M,) for one hop, or from one number for all."""
     numbers = np.asarray(value)
     if numbers.ndim == 0:
         return np.broadcast_to(numbers, (sensors, hops))
@@ -220,12 +220,12 @@ def _broadcast_to_hops(value: ArrayLike, sensors: int, hops: int) -> Float[np.nd
 
 
 def fading(paths: Paths) -> PathValues:
-    """K, the product of kappa along each path."""
+    """Return K, the product of kappa along each path."""
     return np.asarray(_along(paths, paths.kappa)[0].prod(axis=-1))
 
 
 def _along(paths: Paths, values: Powers) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
-    """Values of hops by path and place on it, 1 where a path has no more; and the place of each hop."""
+    """Return the values of hops by path and place on it, 1 where a path has no more; and the place of each hop."""
     order = np.argsort(paths.path, kind="stable")
     counts = np.bincount(paths.path, minlength=paths.second.shape[1])
     position = np.empty_like(paths.path)
@@ -236,14 +236,14 @@ def _along(paths: Paths, values: Powers) -> tuple[Float[np.ndarray, "time path p
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
-    """p / (p + alpha) of each hop; zero where neither power nor noise is."""
+    """Return p / (p + alpha) of each hop; zero where neither power nor noise is."""
     total = powers + alpha
     # A hop without noise: any power does.
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))
 
 
 def path_information(paths: Paths, powers: Powers) -> PathInformation:
-    """Information j of each path at each step, and dj/dp of each hop, at these powers (time, hop)."""
+    """Return the information j of each path at each step, and dj/dp of each hop, at these powers (time, hop)."""
     along, position = _along(paths, share_of_signal(powers, paths.alpha))
     # F, and the product of the other hops' factors for its derivative.
     others = np.stack([np.delete(along, h, axis=-1).prod(axis=-1) for h in range(along.shape[-1])], axis=-1)
@@ -256,12 +256,12 @@ def path_information(paths: Paths, powers: Powers) -> PathInformation:
 
 
 def information_matrix(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
-    """J = sum_i j_i c_i' c_i."""
+    """Return J = sum_i j_i c_i' c_i."""
     return np.asarray(np.swapaxes(paths.rows, 1, 2) @ (information[:, :, None] * paths.rows))
 
 
 def error_covariances(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
-    """Error covariance of the best linear filter after each step."""
+    """Return the error covariance of the best linear filter after each step."""
     return covariances(paths.plants, information_matrix(paths, information))
 
 
@@ -271,7 +271,7 @@ def sensitivities(
     p: Float[np.ndarray, "time n n"],
     weights: Float[np.ndarray, "time n n"],
 ) -> PathValues:
-    """Sensitivity -d cost / d j of each path: w_i = c_i P L P c_i'."""
+    """Return the sensitivity -d cost / d j of each path: w_i = c_i P L P c_i'."""
     ahead = adjoint(paths.plants, information_matrix(paths, information), p, weights)
     projected = paths.rows @ p
     return np.asarray(np.sum((projected @ ahead) * projected, axis=-1))

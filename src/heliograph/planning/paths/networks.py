@@ -74,7 +74,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 
 
 def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[Chain]:
-    """Chains of a channel that carries rows @ (y, 1).
+    """Return the chains of a channel that carries rows @ (y, 1).
 
     Raises:
         ValueError: a channel that is not made of independent chains, each for one number.
@@ -131,7 +131,7 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
 
 
 def _hop(hop: GainAndNoise) -> tuple[float, float]:
-    """kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2."""
+    """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2."""
     if len(hop.law.extremes()) > 1:
         raise _unfit("a gain with uncertain probabilities")
     mean, square = float(hop.law.moment(1)), float(hop.law.moment(2))
@@ -143,7 +143,7 @@ def _hop(hop: GainAndNoise) -> tuple[float, float]:
 
 
 def _loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
-    """Channel behind an unobserved loss, and 1 / (arrival probability)."""
+    """Return the channel behind an unobserved loss, and 1 / (arrival probability)."""
     p = np.asarray(mixture.choice.probabilities)
     silent = [isinstance(m, GainAndNoise) and not np.any(np.append(m.matrix, m.noise.covariance)) for m in mixture.maps]
     if silent.count(False) != 1 or mixture.corner_count() > 1 or not (arrival := float(p[silent.index(False)])) > 0:

@@ -45,7 +45,7 @@ class SplitPaths(NamedTuple):
 
 
 def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
-    """Paths by the power that their free hops send together, the others sending the powers `fixed`."""
+    """Return the paths by the power that their free hops send together, the others sending the powers `fixed`."""
     full = paths.second * fading(paths)
     hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
     alpha = np.zeros((*full.shape, max(1, max(len(places) for places in hops))))
@@ -84,7 +84,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
 
 
 def hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
-    """Noises of a chain's hops, checked."""
+    """Return the noises of a chain's hops, checked."""
     noise = check_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
     if not len(noise):
         raise fail("alpha of hops", "at least one", "none")
@@ -94,7 +94,7 @@ def hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
 
 
 def split(whole: SplitPaths, total: PathValues) -> Split:
-    """Best split of each path's power: one multiplier l for its hops, by Newton's method for log l."""
+    """Return the best split of each path's power: one multiplier l for its hops, by Newton's method for log l."""
     alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]
     hops = (alpha > 0).sum(axis=-1)
     log = 2 * np.log(np.where(hops[..., None] > 0, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
@@ -124,7 +124,7 @@ def split(whole: SplitPaths, total: PathValues) -> Split:
 
 
 def _shares(alpha: np.ndarray, log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """p_h(l) without cancellation, and -d sum P / d log l."""
+    """Return p_h(l) without cancellation, and -d sum P / d log l."""
     over = np.exp(-log)
     root = np.sqrt(alpha**2 + 4 * alpha * over)
     whole = root + alpha

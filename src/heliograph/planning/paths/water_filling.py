@@ -28,7 +28,7 @@ Point = tuple[float, Powers, Powers]  # error, -d error / d j of each free hop's
 def water_filling(
     limits: PowerLimits, sensitivity: Callable[[Powers], Point], whole: SplitPaths, start: Powers
 ) -> Powers:
-    """Best powers within limits by the fixed point, from a start, until the gap closes or shrinks no more.
+    """Return the best powers within limits by the fixed point, from a start, until the gap closes or shrinks no more.
 
     `sensitivity` gives error and derivatives at powers (time, free), `whole` the path of each free hop.
     """
@@ -50,7 +50,7 @@ def water_filling(
 
 
 def _along(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead: Powers) -> tuple[Powers, Point]:
-    """A point lower on the way: its end, or where the slopes at both ends say that the lowest lies.
+    """Return a point lower on the way: its end, or where the slopes at both ends say that the lowest lies.
 
     Where rounding hides the way down, half of it, by which the gap still shrinks.
     """
@@ -66,7 +66,7 @@ def _along(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead
 
 
 def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
-    """Powers at the level that the limits set, under fixed weights."""
+    """Return the powers at the level that the limits set, under fixed weights."""
     rise, dry = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
     steps = len(dry)
     # The level at which each transmitter's mean is reached, then that of the total under these.
@@ -84,7 +84,7 @@ def _fill_to_level(
     dry: Float[np.ndarray, "*k"],
     peak: Float[np.ndarray, "*k"],
 ) -> Float[np.ndarray, "*k"]:
-    """Powers min([level rise - dry]^+, peak); a sensor of no use stays dry at any level."""
+    """Return the powers min([level rise - dry]^+, peak); a sensor of no use stays dry at any level."""
     with np.errstate(invalid="ignore"):
         wet = np.where(rise > 0, level * rise - dry, 0.0)
     return np.clip(wet, 0.0, peak)
@@ -97,7 +97,7 @@ def _level(
     highest: Float[np.ndarray, "k"],
     total: float,
 ) -> float:
-    """Level at which the powers sum to the total; infinite where they never do."""
+    """Return the level at which the powers sum to the total; infinite where they never do."""
     live = rise > 0
     rise, dry, peak, highest = rise[live], dry[live], peak[live], highest[live]
     if not rise.size or not np.isfinite(total):

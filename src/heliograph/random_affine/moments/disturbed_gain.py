@@ -33,7 +33,7 @@ class DisturbedGain(NamedTuple):
         return covariance
 
     def spreads(self) -> np.ndarray:
-        """Matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
+        """Return the matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
 
         They are the eigenvectors of the covariance of H's entries, in units of each entry, times the roots of their
         eigenvalues; as many as its rank, so none where nothing is random.
@@ -75,7 +75,7 @@ def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m
 
 
 def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray) -> DisturbedGain:
-    """Joint moments of [g A, N] of a hop, from E[g] and E[g^2] of its gain g."""
+    """Return the joint moments of [g A, N] of a hop, from E[g] and E[g^2] of its gain g."""
     scaled = np.concatenate([gain, np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(gain), root], axis=1)
     first, second = moments
@@ -94,7 +94,7 @@ def mix_gains(parts: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts
 
 
 def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGain], index: int) -> DisturbedGain:
-    """The same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
+    """Return the same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
     private_widths = [p.mean.shape[1] - shared for p in parts]
     start = shared + sum(private_widths[:index])
     columns = [*range(shared), *range(start, start + private_widths[index])]

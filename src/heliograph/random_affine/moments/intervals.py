@@ -14,7 +14,7 @@ Interval = tuple[Entries, Entries]
 
 
 def multiply_matrices(second: Interval, first: Interval) -> Interval:
-    """Interval matrix product by centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1)."""
+    """Return the interval matrix product by centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1)."""
     c2, r2 = (second[1] + second[0]) / 2, (second[1] - second[0]) / 2
     c1, r1 = (first[1] + first[0]) / 2, (first[1] - first[0]) / 2
     size = library(c1, c2).abs
@@ -23,7 +23,7 @@ def multiply_matrices(second: Interval, first: Interval) -> Interval:
 
 
 def multiply_rows(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
-    """Interval product of two polynomials: ends of the products of ends, summed over equal monomials.
+    """Return the interval product of two polynomials: ends of the products of ends, summed over equal monomials.
 
     Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.
     """

@@ -57,7 +57,7 @@ class Lift(AbstractWrapper):
         return state, jnp.asarray(symmetric_power(h, self.degree))
 
     def moments(self, order: int) -> Moments:
-        """Rows and columns of E[Sym^(degree order)(H)], spread over the repeated products."""
+        """Return the rows and columns of E[Sym^(degree order)(H)], spread over the repeated products."""
         check_forgets("moments of a map", self)
         inner = self.base.moments(order * self.degree).matrix
         rows = _products(self.base.outputs + 1, self.degree, order)
@@ -71,13 +71,13 @@ class Lift(AbstractWrapper):
         return self.degree * self.base.degree_in(identity)
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
-        """A lifted point: the monomials of an input of the base map."""
+        """Return a lifted point: the monomials of an input of the base map."""
         lifted: np.ndarray = monomials(self.base.example_input(generator), self.degree)[:-1]
         return lifted
 
 
 def _products(variables: int, degree: int, order: int) -> np.ndarray:
-    """Position of each product of `order` monomials of `degree` among the monomials of degree * order."""
+    """Return the position of each product of `order` monomials of `degree` among the monomials of degree * order."""
     parts = exponents(variables, degree)
     target = position(variables, degree * order)
     return np.array([

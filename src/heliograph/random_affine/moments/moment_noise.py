@@ -168,7 +168,7 @@ class AboutMean(AbstractNoise):
 
 @singledispatch
 def about_mean(law: AbstractNoise) -> AbstractNoise:
-    """The law of n - E[n]; of the known kinds one of the same kind, so that nothing is subtracted twice."""
+    """Return the law of n - E[n]; of the known kinds one of the same kind, so that nothing is subtracted twice."""
     return AboutMean(law)
 
 

@@ -39,7 +39,7 @@ def exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
 
 @cache
 def position(variables: int, degree: int) -> dict[Exponents, int]:
-    """Position of each monomial in `exponents`."""
+    """Return the position of each monomial in `exponents`."""
     return {powers: i for i, powers in enumerate(exponents(variables, degree))}
 
 
@@ -81,7 +81,7 @@ def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
 
 
 def monomials(y: Numbers, degree: int) -> Numbers:
-    """All monomials of (y, 1) of total degree `degree`, for y of shape (p,)."""
+    """Return all monomials of (y, 1) of total degree `degree`, for y of shape (p,)."""
     values: list[Numbers] = [*y, 1.0]
     terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)
              for powers in exponents(len(values), degree)]  # fmt: skip
@@ -113,7 +113,7 @@ def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def symmetric_power(h: Numbers, degree: int) -> Numbers:
-    """Sym^k(H): coefficients of the monomials of H Y in the monomials of Y.
+    """Return Sym^k(H): coefficients of the monomials of H Y in the monomials of Y.
 
     Row of z_a z_b...: the product of linear forms, built degree by degree,
     S_k[a, g] = sum_c H[i, c] S_{k-1}[a / z_i, g / y_c]. Works on NumPy and on JAX arrays.
@@ -141,7 +141,7 @@ def _append_zero_column(a: Numbers) -> Numbers:
 
 @cache_arrays
 def product_table(variables: int, first: int, second: int) -> np.ndarray:
-    """Entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
+    """Return the entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
     a, b = factor_variables(variables, first), factor_variables(variables, second)
     shape = len(a), len(b)
     both = [np.broadcast_to(a[:, None], (*shape, first)), np.broadcast_to(b, (*shape, second))]
@@ -162,7 +162,7 @@ def degrees(dimension: int, order: int) -> np.ndarray:
 
 @cache_arrays
 def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
+    """Return (y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
     places, terms = position(dimension + 1, order), []
     for row, powers in enumerate(exponents(dimension + 1, order)):
         a = powers[:-1]
@@ -203,12 +203,12 @@ class Moments(Module):
         return tensor
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
-        """E[Sym^order(H)] of a lower order, whose monomials are among these."""
+        """Return E[Sym^order(H)] of a lower order, whose monomials are among these."""
         matrix: jax.Array | np.ndarray = self.matrix[_among(self.outputs, self.inputs, self.order, order)]
         return matrix
 
     def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
-        """E[mono_k(z)] from E[mono_k(y)], for y independent of the map."""
+        """Return E[mono_k(z)] from E[mono_k(y)], for y independent of the map."""
         return self.matrix @ y_moments
 
 
@@ -220,6 +220,6 @@ def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, 
 
 @cache_arrays
 def times_one(variables: int, low: int, high: int) -> np.ndarray:
-    """Positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
+    """Return the positions at degree `high` of the monomials of degree `low` times powers of the last variable, 1."""
     chosen = factor_variables(variables, low)
     return place(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)

@@ -37,7 +37,7 @@ Array2 = Float[jax.Array | np.ndarray, "n m"]
 
 @singledispatch
 def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
-    """E[mono_order(z)] from E[mono_order(y)], for y independent of the map.
+    """Return E[mono_order(z)] from E[mono_order(y)], for y independent of the map.
 
     The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
 
@@ -48,7 +48,7 @@ def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> 
 
 @push_moments.register
 def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
-    """(A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
+    """Return (A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
     known = push_known(affine_matrix(channel.matrix), order, _check_moments(channel, order, moments))
     scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
     row, column, noise, weight = sum_plan(channel.outputs, order)
@@ -70,7 +70,7 @@ def _(channel: Mixture, order: int, moments: Array1) -> Array1:
 
 
 def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
-    """E[mono(z)] of z = A y + b with H = [[A, b], [0, 1]]: entries of Sym(H) E[Y Y'] Sym(H)' at half the order.
+    """Return E[mono(z)] of z = A y + b with H = [[A, b], [0, 1]]: entries of Sym(H) E[Y Y'] Sym(H)' at half the order.
 
     Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
     """

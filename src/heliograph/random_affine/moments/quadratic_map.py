@@ -54,7 +54,7 @@ def signal_of_map(bound: QuadraticMap) -> QuadraticMap:
 
 
 def size_of_map(shift: QuadraticMap) -> Any:
-    """Root of the power that the map gives of unit signals; it weighs bounds, and has no derivative."""
+    """Return the root of the power that the map gives of unit signals; it weighs bounds, and has no derivative."""
     tensor = stop_gradient(shift.center + shift.radius)
     return library(tensor).sqrt(library(tensor).einsum("iiaa->", tensor))
 
@@ -70,7 +70,7 @@ def scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
 
 
 def place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
-    """The map of outputs start, start + 1, ... among all of them, zero elsewhere."""
+    """Return the map of outputs start, start + 1, ... among all of them, zero elsewhere."""
     margin = (start, outputs - start - block.center.shape[0])
     widths = [margin, margin, (0, 0), (0, 0)]
     return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))

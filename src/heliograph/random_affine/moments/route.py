@@ -58,7 +58,7 @@ class Position(NamedTuple):
 
 
 def carry_by_moments(signal: Signal, moments: Moments) -> Signal:
-    """E h Y h' behind a random map h, by its second moments, and its mean."""
+    """Return E h Y h' behind a random map h, by its second moments, and its mean."""
     second, tensor = signal.second, moments.second
     mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
     behind = xp.block([[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]])
@@ -72,5 +72,5 @@ def refuse_gain_on_angles(got: str) -> ValueError:
 
 
 def apply(h: jax.Array, y: jax.Array) -> jax.Array:
-    """z = G y + n for a drawn H."""
+    """Return z = G y + n for a drawn H."""
     return h[:-1, :-1] @ y + h[:-1, -1]

@@ -67,7 +67,7 @@ class SecondOrder(Module):
 def describe_second_moments(
     mean: Matrix, spread: QuadraticMap, shift: QuadraticMap, power: QuadraticMap, nominal: QuadraticMap, uncertain: bool
 ) -> SecondOrder:
-    """Second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise."""
+    """Return second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise."""
     gain, noise = divide_spread(nominal.center)
     return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
 
@@ -175,7 +175,7 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
-    """Cov(z | y) under the nominal law."""
+    """Return Cov(z | y) under the nominal law."""
     nominal = channel.moments(2)
     return map_of_known_law(_drop_known_gain(channel, tensors_of_law(nominal, nominal.mean[:-1])[0]))
 
@@ -189,7 +189,7 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
 
 
 def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
-    """Diagonal blocks from each part; off the diagonal, independent parts meet through their means only.
+    """Return the diagonal blocks from each part; off the diagonal, independent parts meet through their means only.
 
     E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D| at most the reach of each mean.
     """
@@ -269,5 +269,5 @@ def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, An
 
 
 def _constant_power(size: int) -> np.ndarray:
-    """Matrix of zeros, but 1 as its last entry: W of the constant 1 alone."""
+    """Return the matrix of zeros, but 1 as its last entry: W of the constant 1 alone."""
     return np.outer(np.eye(size)[-1], np.eye(size)[-1])

@@ -11,13 +11,13 @@ Matrix = Float[jax.Array | np.ndarray, "m p"]
 
 
 def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
-    """(A y)(B y)' as a tensor, made symmetric in the two factors y."""
+    """Return (A y)(B y)' as a tensor, made symmetric in the two factors y."""
     forward: Tensor = library(a, b).einsum("ia,jb->ijab", a, b)
     return (forward + forward.swapaxes(2, 3)) / 2
 
 
 def drop_constant(tensor: Tensor) -> Tensor:
-    """The tensor without its last row and column, those of the constant 1."""
+    """Return the tensor without its last row and column, those of the constant 1."""
     signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
     signal_part: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
     return signal_part

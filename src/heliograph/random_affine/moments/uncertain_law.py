@@ -18,7 +18,7 @@ PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from di
 
 
 def tensors_of_law(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
-    """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
+    """Return the spread about the nominal mean H0, shift of the mean, and power, all of one law."""
     raw = moments.second
     law_mean = moments.mean[:-1]
     spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)

@@ -41,7 +41,7 @@ def doubts_of(found: "heliograph.forecasting.Backtest") -> list[str]:
 
 @matplotlib.rc_context(STYLE)
 def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
-    """Share within the intervals of 80 and 95 % over the horizon, with two standard errors on each side."""
+    """Return the share within the intervals of 80 and 95 % over the horizon, with two standard errors on each side."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     axes = figure.subplots()
     named = list(dict.fromkeys((s.node, s.filter, s.part, s.name) for s in found.scores))
@@ -79,7 +79,7 @@ def backtest_page(found: "heliograph.forecasting.Backtest", network: str, drawin
 
 
 def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
-    """All scores, a row for each forecast and horizon, with their standard errors."""
+    """Return all scores, a row for each forecast and horizon, with their standard errors."""
     rows = [
         [visible(f"{s.node}/{s.filter} {s.part} {s.name}"), str(s.horizon), f"{s.compared:,}",
          round_to(s.rmse, s.mse.error / (2 * s.rmse) if s.rmse > 0 else np.nan),

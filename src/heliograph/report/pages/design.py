@@ -157,7 +157,7 @@ def page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
 
 
 def _headline(results: DesignResults) -> str:
-    """The title: what the design saves, of error and of power."""
+    """Return the title: what the design saves, of error and of power."""
     design, before = results.design, sum(results.before.values())
     changed = [f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}"
                for what, now, then in (("error", design.error, design.present), ("power", design.total, before))
@@ -166,7 +166,7 @@ def _headline(results: DesignResults) -> str:
 
 
 def _result_section(results: DesignResults) -> Section:
-    """Error, power and certificate of the design, beside those of the network as it is."""
+    """Return the error, power and certificate of the design, beside those of the network as it is."""
     design = results.design
     keys = [
         KeyFigure("error", f"{design.error:.4g}", f"{design.present:.4g} as the network is", BLUE),
@@ -178,13 +178,13 @@ def _result_section(results: DesignResults) -> Section:
 
 
 def _front_section(drawings: Mapping[str, bytes]) -> Section:
-    """The least error over total power, with the lower bound."""
+    """Return the least error over total power, with the lower bound."""
     caption = "The least error found at each total power. Nothing lies in the grey region, whatever is tried."
     return Section("Error against power", [Picture(drawings["front"], "Error falling with total power.", caption)])
 
 
 def _powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
-    """Powers by transmitter, before and after, and what one more watt would save at each."""
+    """Return the powers by transmitter, before and after, and what one more watt would save at each."""
     after, slope = mean_powers(results.design), results.design.sensitivity
     rows = [
         [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",
@@ -201,13 +201,13 @@ def _powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Se
 
 
 def _map_section(drawings: Mapping[str, bytes]) -> Section:
-    """The map of errors over places for one more."""
+    """Return the map of errors over places for one more."""
     caption = "The least error at the design's total power, with the network standing as the map's function says."
     return Section("Where", [Picture(drawings["map"], "The error over places, with the best one.", caption)])
 
 
 def _changes_section(results: DesignResults) -> Section:
-    """What one more transmitter, relay or place would save."""
+    """Return what one more transmitter, relay or place would save."""
     unit = results.design.certificate.unit
     rows = [[visible(change.name), f"{change.value:.4g}", f"{change.saved:+.3g}"] for change in results.changes]
     caption = (
@@ -218,7 +218,7 @@ def _changes_section(results: DesignResults) -> Section:
 
 
 def _rerun_section() -> Section:
-    """How to run the designed network."""
+    """Return how to run the designed network."""
     commands = f"heliograph run {DESIGNED} --measurements data.csv --out estimates.csv"
     text = (
         f"`{DESIGNED}` is the network with these powers and the best linear filters for them; it reads `{SOURCE}`, "

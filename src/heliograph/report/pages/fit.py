@@ -94,7 +94,7 @@ def _draw_estimates(learned: Learned) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def _draw_correlations(tested: list[Change]) -> Figure:
-    """Correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
+    """Return the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
     figure, grid = stacked_panels(len(tested), 1.6, 0.7)
     # Correlation of innovations by lag, before and after, with 95 % intervals.
     for axes, change in zip(grid, tested, strict=True):
@@ -116,7 +116,7 @@ def _draw_correlations(tested: list[Change]) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def _draw_pits(received: list[Uniformity]) -> Figure:
-    """Histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
+    """Return the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
     figure, grid = stacked_panels(len(received), 1.5, 0.7)
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]
@@ -153,7 +153,7 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
 
 
 def _headline(learned: Learned) -> str:
-    """The title: how many numbers were learned."""
+    """Return the title: how many numbers were learned."""
     rows = learned.fit.rows()
     return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"
 
@@ -175,7 +175,7 @@ def _summarise_gain(learned: Learned) -> str:
 
 
 def _list_key_figures(learned: Learned) -> list[KeyFigures]:
-    """Numbers to remember: how many were learned, from how many rows, and the gain of the first filter."""
+    """Return the numbers to remember: how many were learned, from how many rows, and the gain of the first filter."""
     outputs = [row for row in learned.fit.rows() if row.identified]
     keys = [
         KeyFigure("numbers learned", f"{len(outputs)}", f"of {len(learned.fit.rows())} free ones", BLUE),
@@ -216,7 +216,7 @@ def _estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Pi
 
 
 def _list_sentences(learned: Learned) -> list[Points | Text]:
-    """The fit's sentences, as points."""
+    """Return the fit's sentences, as points."""
     said = learned.fit.sentences
     if said:
         return [Points([visible(line) for line in said])]
@@ -224,7 +224,7 @@ def _list_sentences(learned: Learned) -> list[Points | Text]:
 
 
 def _comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
-    """Sections on the held-out rows: each filter before and after, and whether the laws fit."""
+    """Return the sections on the held-out rows: each filter before and after, and whether the laws fit."""
     if not learned.changes:
         return []
     # One row for each filter: gain of the log-likelihood, size and correlation of its innovations.

@@ -58,7 +58,7 @@ def results_of_plants(examined: Mapping[str, Health], network: str) -> Results:
 
 
 def _make_overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
-    """The page of several plants: how many rows each has and what is doubted there, the most doubted first."""
+    """Return the page of several plants: how many rows each has and what is doubted there, the most doubted first."""
     doubts = {plant: health.warnings() for plant, health in examined.items()}
     worst = sorted(examined, key=lambda plant: len(doubts[plant]), reverse=True)
     rows = []
@@ -256,7 +256,7 @@ def _make_header(state: str, units: Mapping[str, str]) -> str:
 
 
 def _describe_agreement(health: Health, doubts: list[str]) -> str:
-    """How many doubts there are about the network, or that there are none, in words."""
+    """Return how many doubts there are about the network, or that there are none, in words."""
     if doubts:
         return f"There {'is' if len(doubts) == 1 else 'are'} {_count_in_words(len(doubts), 'doubt')} about the network."
     tested = any(tested_filter.test is not None for tested_filter in health.filters)
@@ -269,7 +269,7 @@ def _count_in_words(count: int, what: str) -> str:
 
 
 def _describe_span(time: np.ndarray) -> str:
-    """The time that the recording covers, in words."""
+    """Return the time that the recording covers, in words."""
     if time.dtype.kind == "M":
         return f"{str(time[0])[:19]} to {str(time[-1])[:19]} UTC"
     return f"from {time[0]:g} to {time[-1]:g}"
@@ -297,7 +297,7 @@ def _list_premises(health: Health) -> list[Text | Points]:
 
 
 def _links_section(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
-    """Each link: when it is due, what arrived, its longest gap, and mean and deviation of its values."""
+    """Return each link: when it is due, what arrived, its longest gap, and mean and deviation of its values."""
     rows = []
     for link in health.links:
         mean, deviation = _format_mean_and_deviation(link.values)

@@ -210,7 +210,7 @@ class Nats:
         return self._reader
 
     def _configure_consumer(self) -> ConsumerConfig:
-        """Settings of the consumer: this part's messages in order, from the first that was not acknowledged."""
+        """Return settings of the consumer: this part's messages in order, from the first that was not acknowledged."""
         return ConsumerConfig(
             durable_name=self._name,
             deliver_policy=DeliverPolicy.BY_START_SEQUENCE,

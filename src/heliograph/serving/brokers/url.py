@@ -54,7 +54,7 @@ class Address:
 
 
 def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Address:
-    """A broker's URL, SCHEME://user:password@host:port/topic, as an address; the host must be there.
+    """Return a broker's URL, SCHEME://user:password@host:port/topic, as an address; the host must be there.
 
     User and password are taken from HELIOGRAPH_BROKER_USER and HELIOGRAPH_BROKER_PASSWORD if these are set, since other
     users of the machine would see them in a URL.

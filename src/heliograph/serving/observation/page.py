@@ -83,7 +83,7 @@ def _yield_plant_metrics(watch: Watch) -> Iterable[Metric]:
 
 
 def _collect_links(watch: Watch) -> Iterable[Metric]:
-    """Metrics of the nodes' messages: by verdict, lost, and values beyond limits."""
+    """Return the metrics of the nodes' messages: by verdict, lost, and values beyond limits."""
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
     what = "Values beyond a node's limits, or codes, which count as not arrived."
@@ -98,7 +98,7 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
 
 
 def _collect_dead_senders(watch: Watch) -> Metric:
-    """Metric of the dead senders, by node."""
+    """Return the metric of the dead senders, by node."""
     what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance."
     dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
     for node, count in watch.dead_senders().items():
@@ -115,7 +115,7 @@ def _count_doubted_fused(watch: Watch) -> Metric:
 
 
 def _collect_nis(watch: Watch) -> Iterable[Metric]:
-    """Metrics of each filter's NIS over its expectation, with the band in which it should be."""
+    """Return the metrics of each filter's NIS over its expectation, with the band in which it should be."""
     labels = ["node", "filter"]
     ratio = GaugeMetricFamily(
         "heliograph_nis", "Normalised innovation squared over its expectation, of the last rows; 1.", labels=labels

@@ -291,7 +291,7 @@ def _means_and_deviations(message: Mapping[str, Any]) -> dict[str, object]:
 
 
 def _deviation_of(variance: float | None) -> float | None:
-    """Standard deviation of a variance; None where it has none."""
+    """Return the standard deviation of a variance; None where it has none."""
     return None if variance is None else math.sqrt(max(variance, 0.0))
 
 

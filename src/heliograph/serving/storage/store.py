@@ -168,7 +168,7 @@ class Store:
         return results
 
     def _fail_unreadable(self, what: str) -> InputError:
-        """The error of a store that cannot be read."""
+        """Return the error of a store that cannot be read."""
         return fail(f"store {self.name}", "a database as it was written", f"one that is damaged: {what}")
 
     @property
@@ -197,7 +197,7 @@ class Store:
         return results
 
     def _describe_damage(self, name: str, got: str) -> str:
-        """The damage of a row, and what stands in its place."""
+        """Return the damage of a row, and what stands in its place."""
         anew = f"--anew {quote(name)} begins it anew"
         return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
 

@@ -38,7 +38,7 @@ def is_named(written: object, name: object) -> bool:
 
 
 def _checksum_row(name: str | int, values: Sequence[str | int | bytes]) -> int:
-    """The checksum of a row with this name and these columns."""
+    """Return the checksum of a row with this name and these columns."""
     checksum = crc32(f"{name}".encode())
     for value in values:
         data = value if isinstance(value, bytes) else f"{value}".encode()

@@ -145,7 +145,7 @@ def cross_covariances(
 def fused_covariances(
     network: Network, horizon: int, inputs: Float[ArrayLike, "horizon inputs"] | None = None
 ) -> dict[str, Float[np.ndarray, "time n n"]]:
-    """Covariances (time, n, n) of the network's informed fusions, by name, for complete data.
+    """Return the covariances (time, n, n) of the network's informed fusions, by name, for complete data.
 
     Args:
         network: a network with informed fusions of linear filters.

@@ -94,7 +94,7 @@ class Apart(Module):
     counts: tuple[int, ...] = eqx.field(static=True, default=())
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Moments of the measurements, group after group."""
+        """Return the moments of the measurements, group after group."""
         m, n = self.size, len(mean)
         parts = [Observation(*(jnp.zeros((self.counts[i], *s)) for s in ((m, n), (m,), (m, m)))) if group is None
                  else group.observe(mean, covariance, k, m) for i, group in enumerate(self.groups)]  # fmt: skip
@@ -109,7 +109,7 @@ class Together(Module):
     rows: np.ndarray
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Moments of the rows of each node, and the cross-covariance of their noises."""
+        """Return the moments of the rows of each node, and the cross-covariance of their noises."""
         gain, offset, noise = _linear_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
         noise = jnp.pad(noise, (0, 1))
@@ -226,7 +226,7 @@ def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel])
 
 
 def describe_channel(channel: Channel) -> SecondOrder | OverTime:
-    """Second moments of the channel where all of it arrives, for each step where it varies."""
+    """Return the second moments of the channel where all of it arrives, for each step where it varies."""
     moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(step.condition_on_arrival()), channel)
     return moments
 
@@ -235,7 +235,7 @@ Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
 
 
 def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
-    """Claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
+    """Return the claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
 
     `shared`: whether the nodes receive parts of one channel.
 
@@ -314,13 +314,13 @@ class NodesFilters(Protocol):
         """The centre of their errors' moments, alone."""
 
     def init(self) -> PyTree:
-        """States before the first step."""
+        """Return the states before the first step."""
 
     def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> Sequence[PyTree]:
-        """Matrices of the filters' next step."""
+        """Return the matrices of the filters' next step."""
 
     def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """States after a step."""
+        """Return the states after a step."""
 
 
 class CentreBelief(NamedTuple):
@@ -373,5 +373,5 @@ class CentreFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: CentreBelief) -> Estimate:
-        """Best linear estimate of the plant's state."""
+        """Return the best linear estimate of the plant's state."""
         return Estimate(*estimate_state(state.known, len(self.states)), self.claim)

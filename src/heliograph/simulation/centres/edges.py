@@ -174,7 +174,7 @@ def _open_link(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure)
 
 
 def arrival_chance(channel: Channel | None) -> float | None:
-    """Probability that a message arrives; None where it is not the same at every step whatever was before."""
+    """Return probability that a message arrives; None where it is not the same at every step whatever was before."""
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
     chance, inside = _open_link(channel)

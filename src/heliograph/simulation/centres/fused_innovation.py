@@ -105,7 +105,7 @@ def following_prior(estimate: Estimate) -> Gaussian:
 
 
 def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) -> dict[str, FusedInnovation]:
-    """Tests of the network's fusions of estimates, by name, where there is one.
+    """Return the tests of the network's fusions of estimates, by name, where there is one.
 
     There is none where a filter's state is more than a mean and a covariance of the plant's states, such as a mixture,
     or past signals behind a link that is late by chance, or a fusion claims no covariance, or where nodes share a

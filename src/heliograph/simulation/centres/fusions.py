@@ -114,7 +114,7 @@ class Reporting(Module):
 
 
 def fusions_of(network: Network) -> tuple[StackedFusions, ...]:
-    """Fusions of the network, those of one structure stacked."""
+    """Return the fusions of the network, those of one structure stacked."""
     alike: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
@@ -144,7 +144,7 @@ def _stack_fusions(
 
 
 def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
-    """Centres of the network, one for the informed fusions of each filter."""
+    """Return the centres of the network, one for the informed fusions of each filter."""
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and isinstance(fusion.rule, AbstractInformedFusion) and not fusion.by_report:
@@ -188,7 +188,7 @@ def sources_of(
 def _observe(
     network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
 ) -> Apart | Together:
-    """Measurement model of these nodes for a centre."""
+    """Return the measurement model of these nodes for a centre."""
     if network.common is not None:
         rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]

@@ -176,7 +176,7 @@ class Mesh(Module):
         return after, self._split_by_group(mean, claimed)
 
     def _messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:
-        """Messages that are no estimates of now as they are; None where all are."""
+        """Return the messages that are no estimates of now as they are; None where all are."""
         if state.way is None:
             return None
         ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)
@@ -222,7 +222,7 @@ class Mesh(Module):
         return MeshStep(motion, after, tuple(exchanges), data, information, gains)
 
     def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
-        """Measurements of a group, filled with NaN up to the longest."""
+        """Return the measurements of a group, filled with NaN up to the longest."""
         return jnp.pad(z, ((0, 0), (0, self.observation_model.size - z.shape[1])), constant_values=jnp.nan)
 
     def _pull_to_neighbours(
@@ -235,7 +235,7 @@ class Mesh(Module):
         return jnp.einsum("iab,ib->ia", front, off)
 
     def _data(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
-        """Messages about what was measured, and about what would be if no component were missing."""
+        """Return the messages about what was measured, and about what would be if no component were missing."""
         real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
         gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
         weighted, information = jax.vmap(information_of)(gain, noise, real & there)
@@ -274,13 +274,13 @@ class Mesh(Module):
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
     def _collect_sums(self, values: jax.Array, arrived: Arrived) -> jax.Array:
-        """Sums of the nodes' messages that each node has after all rounds, each counted once."""
+        """Return the sums of the nodes' messages that each node has after all rounds, each counted once."""
         if self.edges.rounds == 1:
             return self.sum_of(values, jnp.asarray(arrived[:, 0]))
         return jnp.tensordot(self.known(arrived).astype(values.dtype), values, 1)
 
     def known(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
-        """Test whose measurements each node has after all rounds."""
+        """Return the test whose measurements each node has after all rounds."""
         known, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
         for number in range(self.edges.rounds):
             known = jnp.any(known[self.senders] & arrived[:, number, :, None], axis=1)
@@ -295,7 +295,7 @@ class Mesh(Module):
         self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array, motion: Motion,
         information: jax.Array, complete: jax.Array, ahead: Ahead = (), senders: Array | None = None,
     ) -> NodeGains:  # fmt: skip
-        """Gains of all nodes."""
+        """Return the gains of all nodes."""
 
         def single(
             rule: AbstractFusion,
@@ -314,7 +314,7 @@ class Mesh(Module):
         return gains
 
     def ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
-        """Weights of many steps, by part of the nodes; none where they depend on more than what arrives."""
+        """Return the weights of many steps, by part of the nodes; none where they depend on more than what arrives."""
         weights = [bucket.rule.weights_ahead(arrived[:, bucket.rows, -1, : bucket.width])
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
@@ -322,7 +322,7 @@ class Mesh(Module):
     def _propagate_joint(
         self, joint: jax.Array, parts: MeshStep, present: jax.Array
     ) -> Float[jax.Array, "node n node n"]:
-        """Joint covariance after a step."""
+        """Return the joint covariance after a step."""
         gains, motion, size = parts.gains, parts.motion, joint.shape[0] * joint.shape[1]
         measured = measurement_weights(gains.gain, present)
         blocks = error_transitions(gains, motion.matrix), measured @ parts.data.information[self.senders], measured
@@ -331,14 +331,14 @@ class Mesh(Module):
         return jnp.asarray(after).reshape(joint.shape)
 
     def _split_by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
-        """Estimates (1, node, ...) of the mesh's nodes in each of the network's groups."""
+        """Return the estimates (1, node, ...) of the mesh's nodes in each of the network's groups."""
         return tuple(
             Estimate(mean[jnp.array(rows)][None], covariance[jnp.array(rows)][None], self.claim) for rows in self.places
         )
 
 
 def _weights(rule: AbstractFusion, belief: NeighbourEstimates, *_: PyTree) -> NeighbourWeights:
-    """Weights of an exchange that only intersects, with the covariance after it."""
+    """Return the weights of an exchange that only intersects, with the covariance after it."""
     return rule.neighbour_weights(belief)
 
 
@@ -386,7 +386,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
 
 
 def meshes_of(network: Network) -> dict[str, Mesh]:
-    """Fusions between neighbours, by name, to be stepped.
+    """Return the fusions between neighbours, by name, to be stepped.
 
     Raises:
         ValueError: too many nodes for a rule that follows the joint covariance of their errors.

@@ -220,13 +220,13 @@ def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
 
 
 def _scale_rows(h: np.ndarray) -> np.ndarray:
-    """Rows of unit length, whatever the unit of a measurement."""
+    """Return the rows of unit length, whatever the unit of a measurement."""
     lengths = np.linalg.norm(h, axis=1, keepdims=True)
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
 
 
 def _model(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
+    """Return matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
     gain = np.asarray(channel.mean_gain)
@@ -309,7 +309,7 @@ def _steps(
 def _growth(
     graph: Graph, arrives: np.ndarray, alone: np.ndarray, pulled: np.ndarray, pushed: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Growth of the errors' second moments in a step, and in the end their sizes by node."""
+    """Return the growth of the errors' second moments in a step, and in the end their sizes by node."""
     nodes, n = alone.shape[:2]
     # Mean over what gets lost, and its variance.
     mean = arrives[:, :, None, None] * pulled

@@ -49,7 +49,7 @@ class MeshErrors:
     claim: Claim
 
     def mean_trace(self) -> Float[np.ndarray, " time"]:
-        """Mean over the nodes of tr E[e e'] at each step."""
+        """Return the mean over the nodes of tr E[e e'] at each step."""
         return np.asarray(np.trace(self.actual, axis1=-2, axis2=-1).mean(axis=-1))
 
 
@@ -158,7 +158,7 @@ def _parts(
 
 
 def _propagate_joint(mesh: Mesh, joint: np.ndarray, parts: MeshStep, arrived: np.ndarray) -> np.ndarray:
-    """Joint covariance (N, N) after a step."""
+    """Return the joint covariance (N, N) after a step."""
     gains, present, senders = parts.gains, mesh.edges.present, mesh.senders
     # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).
     for number, weights in enumerate(parts.exchanges):
@@ -225,7 +225,7 @@ def best_possible(
 
 @quickly_compiled
 def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> MeshStep:
-    """Parts of a step at which everything arrives, for the models of plant and measurements in it."""
+    """Return the parts of a step at which everything arrives, for the models of plant and measurements in it."""
     lossless = mesh.edges.lossless()
     there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     blocks = None
@@ -236,7 +236,7 @@ def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k
 
 
 def _extend_reach(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
-    """Matrix of what is known through one exchange more, earlier: a one where some message carried it."""
+    """Return the matrix of what is known through one exchange more, earlier: a one where some message carried it."""
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
     step = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
@@ -299,7 +299,7 @@ def mesh_named(network: Network, fusion: str) -> Mesh:
 
 
 def _flags(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
-    """Flags of each step, all of them where a number of steps is given."""
+    """Return the flags of each step, all of them where a number of steps is given."""
     if mesh.edges.past:
         raise fail("errors between neighbours before any data", "messages that arrive at once or are lost", "late ones")
     shape = (len(mesh.senders), mesh.edges.rounds, mesh.senders.shape[1])

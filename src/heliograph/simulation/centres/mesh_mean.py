@@ -114,7 +114,7 @@ def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Pat
 def _mean(
     mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: NodeGains, step: MeshStep
 ) -> np.ndarray:
-    """Joint covariance (N, N) after a step."""
+    """Return the joint covariance (N, N) after a step."""
     count, degree = mesh.senders.shape
     q, s, n = np.asarray(step.motion.noise), np.asarray(step.data.information), len(step.motion.shift)
 
@@ -160,7 +160,7 @@ def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
 
 
 def _get_known_probability(edge: str, link: Channel) -> float:
-    """Probability that a message of this edge arrives, at every step the same and drawn anew."""
+    """Return the probability that a message of this edge arrives, at every step the same and drawn anew."""
     chance = arrival_chance(link)
     if chance is None:
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"

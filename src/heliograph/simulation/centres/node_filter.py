@@ -90,7 +90,7 @@ class NodeFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: NodeState) -> Estimate:
-        """Mean and covariance of the node."""
+        """Return the mean and covariance of the node."""
         return Estimate(jnp.asarray(state.now.mean)[0], jnp.asarray(state.now.covariance)[0], self.claim)
 
     @in_float64
@@ -100,7 +100,7 @@ class NodeFilter(AbstractSizedFilter):
         return message if self.quantizer is None else _quantized(self.quantizer, *message)
 
     def _parts(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
-        """Measurements of node and neighbours, and their estimates, of mean NaN where none came."""
+        """Return the measurements of node and neighbours, and their estimates, of mean NaN where none came."""
         n, at_place = len(self.states), self.measured[0]
         sensed, means, covariances = [z[:at_place]], [before.mean[0]], [before.covariance[0]]
         for size in self.measured[1:]:
@@ -121,7 +121,7 @@ class NodeFilter(AbstractSizedFilter):
 
 
 def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
-    """Filter of a node of the fusion `fusion` between neighbours of `network`, on what its neighbours send.
+    """Return the filter of a node of the fusion `fusion` between neighbours of `network`, on what its neighbours send.
 
     Raises:
         ValueError: a rule that needs the joint covariance of all nodes' errors, more than one round, events, a plant
@@ -177,7 +177,7 @@ def _check_alone(what: str, network: Network, between: Fusion) -> None:
 
 
 def node_network(network: Network, node: str) -> Network:
-    """Network of one node of a fusion between neighbours: itself, and its neighbours as senders of messages.
+    """Return the network of one node of a fusion between neighbours: itself, and its neighbours as senders of messages.
 
     Args:
         network: the whole network.
@@ -200,5 +200,5 @@ def node_network(network: Network, node: str) -> Network:
 
 
 def _numbers(n: int, size: int) -> int:
-    """Numbers of a neighbour's message: mean, covariance, measurement."""
+    """Return the numbers of a neighbour's message: mean, covariance, measurement."""
     return n + n * n + size

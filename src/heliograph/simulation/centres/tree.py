@@ -78,7 +78,7 @@ def relay_tree(
     horizon: int,
     inputs: Float[ArrayLike, "horizon inputs"] | None = None,
 ) -> RelayTree:
-    """Covariances and weights of a tree of relays after `horizon` steps of complete data, before any data.
+    """Return the covariances and weights of a tree of relays after `horizon` steps of complete data, before any data.
 
     Time and memory are linear in leaves.
 
@@ -167,7 +167,7 @@ def _propagate_leaves(
 
 @quickly_compiled
 def _relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
-    """Weights of a relay for its children, and the error of its estimate."""
+    """Return the weights of a relay for its children, and the error of its estimate."""
     return _fuse(children)
 
 

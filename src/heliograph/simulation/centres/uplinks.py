@@ -204,7 +204,7 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
 def _model_links(
     known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
-    """Model of the uplinks for a centre, at each step if any varies."""
+    """Return the model of the uplinks for a centre, at each step if any varies."""
     model: ReportModel | OverTime = at_each_step(lambda *links: _links(links, received, error), *known)
     return model
 
@@ -234,9 +234,9 @@ class Uplink:
     symbols: np.ndarray
 
     def saturated_share(self) -> dict[str, float]:
-        """Share of the samples (runs, steps and components) that saturated, by node."""
+        """Return the share of the samples (runs, steps and components) that saturated, by node."""
         return {node: float(self.saturated[..., i, :].mean()) for i, node in enumerate(self.nodes)}
 
     def symbols_per_value(self) -> float:
-        """Mean number of symbols per component of an estimate."""
+        """Return the mean number of symbols per component of an estimate."""
         return float(self.symbols.mean())

@@ -15,7 +15,7 @@ from heliograph.simulation.network import FUSED, Network
 def reports_by_name(
     network: Network, outcome: dict[str, tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, dict[str, SentReports]]:
-    """Reports by fusion and node, without a node's padding, from (..., node, m) and (..., node)."""
+    """Return the reports by fusion and node, without a node's padding, from (..., node, m) and (..., node)."""
     reports: dict[str, dict[str, SentReports]] = {}
     for name, (values, delay) in outcome.items():
         if name in network.meshes:
@@ -63,7 +63,7 @@ def split_measurements(
 
 
 def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
+    """Return why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
     return {
         name: np.asarray(node_group)[..., i, :]
         for group, node_group in groups.items()
@@ -107,7 +107,7 @@ def split_by_name(
 
 
 def uplinks_by_name(network: Network, outcome: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
-    """Uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
+    """Return the uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
     uplinks = {}
     for name, fusion in network.fused.items() if outcome else ():
         if isinstance(fusion, Fusion) and name in outcome:

@@ -109,7 +109,7 @@ def nis(
 
 
 def _broadcast_to_steps(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]) -> Float[np.ndarray, "*steps n n"]:
-    """Covariance of each step; one matrix is that of all steps."""
+    """Return the covariance of each step; one matrix is that of all steps."""
     n = x.shape[-1]
     shape = (n, n) if rank("covariance", covariance) == 2 else (*x.shape, n)
     return np.broadcast_to(array("covariance", covariance, shape, missing=True), (*x.shape, n))
@@ -118,7 +118,7 @@ def _broadcast_to_steps(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"])
 def _square_normalised(
     x: Float[np.ndarray, "*steps n"], covariance: Float[np.ndarray, "*steps n n"], size: Float[np.ndarray, "*steps n"]
 ) -> Float[np.ndarray, "*steps"]:
-    """x' P^-1 x of each step, over the components that are not NaN; NaN where all are.
+    """Return x' P^-1 x of each step, over the components that are not NaN; NaN where all are.
 
     `size`: what x is a difference of, for its rounding.
     """
@@ -197,12 +197,12 @@ def consistency(
 
 
 def _interval(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Quantiles of the mean of `count` values with so many degrees of freedom together."""
+    """Return the quantiles of the mean of `count` values with so many degrees of freedom together."""
     return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 
 
 def _autocorrelation(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
-    """Correlation of deviations from their mean over 1, 2, ... steps, a missing one as zero."""
+    """Return the correlation of deviations from their mean over 1, 2, ... steps, a missing one as zero."""
     power = np.sum(apart**2)
     sums = [np.sum(apart[:, :-t] * apart[:, t:]) for t in range(1, lags + 1)]
     return np.asarray([s / power if power > 0 else 0.0 for s in sums])

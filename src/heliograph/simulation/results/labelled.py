@@ -24,7 +24,7 @@ SENT = ("saturated", "symbols")
 
 
 def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
-    """Table of a record's fields: a row for each time, or run and time; columns as in LEVELS."""
+    """Return the table of a record's fields: a row for each time, or run and time; columns as in LEVELS."""
     import pandas as pd
 
     # Columns: truth, measurements, estimates, uplinks.
@@ -51,7 +51,7 @@ def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
 
 
 def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
-    """Fields of the record of such a table.
+    """Return the fields of the record of such a table.
 
     Raises:
         ValueError: no such table.
@@ -94,7 +94,7 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
 
 
 def _labels(columns: Sequence[Column]) -> Any:
-    """Column labels as they are: none is converted to a number or to a missing value."""
+    """Return the column labels as they are: none is converted to a number or to a missing value."""
     import pandas as pd
 
     levels = [list(dict.fromkeys(column[i] for column in columns)) for i in range(len(LEVELS))]
@@ -157,7 +157,7 @@ FIELDS = {
 
 
 def axes_of(name: str, lead: Sequence[str]) -> list[str]:
-    """Axes of a field, with those of rows (`lead`) where it has them."""
+    """Return the axes of a field, with those of rows (`lead`) where it has them."""
     return [axis for part in FIELDS[name].axes.split() for axis in (lead if part == "..." else [part])]
 
 
@@ -296,7 +296,7 @@ def each_filter(
 
 
 def uplinks_from(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
-    """Uplinks of a dataset, by the fusion's name."""
+    """Return the uplinks of a dataset, by the fusion's name."""
     if "place" not in dataset:
         return {}
     senders, positions = names_of(dataset, "sender"), values_of(dataset, "place", lead)
@@ -310,7 +310,7 @@ def uplinks_from(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplin
 
 
 def text(names: Sequence[str]) -> np.ndarray:
-    """Names as an array of objects, whatever characters they have."""
+    """Return the names as an array of objects, whatever characters they have."""
     texts = np.empty(len(names), dtype=object)
     texts[:] = names
     return texts
@@ -324,14 +324,14 @@ def check_title(dataset: "xr.Dataset", title: str) -> None:
 
 
 def names_of(dataset: "xr.Dataset", axis: str) -> list[str]:
-    """Labels of a dimension."""
+    """Return the labels of a dimension."""
     if axis not in dataset.dims:
         raise fail("dataset", f"the dimension {axis!r}, also where it has one label", f"{list(dataset.dims)}")
     return [str(name) for name in dataset[axis].values]
 
 
 def values_of(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarray:
-    """Values of a field with its axes in their order."""
+    """Return the values of a field with its axes in their order."""
     axes = axes_of(name, lead)
     if name not in dataset or set(dataset[name].dims) != set(axes):
         came = list(dataset[name].dims) if name in dataset else "no such variable"
@@ -340,7 +340,7 @@ def values_of(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarr
 
 
 def units_of(dataset: "xr.Dataset") -> dict[str, str]:
-    """Units of the states and of time in a dataset."""
+    """Return the units of the states and of time in a dataset."""
     time = {TIME: str(dataset[TIME].attrs["units"])} if "units" in dataset[TIME].attrs else {}
     if "unit" not in dataset.coords:
         return time

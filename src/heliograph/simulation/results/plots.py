@@ -33,7 +33,7 @@ def chosen_filters(
 
 
 def state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
-    """Places of the named states, all by default."""
+    """Return the places of the named states, all by default."""
     chosen = list(known) if states is None else [states] if isinstance(states, str) else list(states)
     for name in chosen:
         if name not in known:
@@ -63,5 +63,5 @@ def legend_outside(axes: "Axes", title: str | None = None) -> None:
 
 
 def colour_of(number: int) -> str:
-    """Colour of the pages for a filter, by its number."""
+    """Return the colour of the pages for a filter, by its number."""
     return COLOURS[number % len(COLOURS)]

@@ -137,7 +137,7 @@ class Record(Saved):
         )
 
     def errors(self, node: str, name: str) -> np.ndarray:
-        """x - xhat of one filter of one node.
+        """Return x - xhat of one filter of one node.
 
         Raises:
             ValueError: a recording has no truth, or there is no such filter.
@@ -167,7 +167,7 @@ class Record(Saved):
         return dict(zip(self.states, np.sqrt(mean).tolist(), strict=True))
 
     def nees(self, node: str, name: str) -> np.ndarray:
-        """Normalised estimation error squared of each step (run, time), of the states whose truth is known.
+        """Return the normalised estimation error squared of each step (run, time), of the states whose truth is known.
 
         Its expectation is their number where the claim is exact; NaN where no state's truth is known, or nothing is
         claimed.
@@ -198,7 +198,7 @@ class Record(Saved):
         return self.weighed[node][name].summarise()
 
     def to_xarray(self) -> "xr.Dataset":
-        """Labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.
+        """Return the labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.
 
         A filter that a node does not have is NaN, and its `claim` is empty. `Record.from_xarray` converts them back.
 
@@ -227,7 +227,7 @@ class Record(Saved):
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "Record":
-        """Record from a dataset that `to_xarray` made, or from a part of one that keeps its dimensions.
+        """Return the record from a dataset that `to_xarray` made, or from a part of one that keeps its dimensions.
 
         Raises:
             ValueError: no such dataset.
@@ -253,7 +253,7 @@ class Record(Saved):
         )  # fmt: skip
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Table: a row for each time (and run), columns (node, filter, quantity, component, other).
+        """Return the table: a row for each time (and run), columns (node, filter, quantity, component, other).
 
         Quantities: truth, measurement, mean, "covariance (CLAIM)" of component and other, saturated, symbols.
 
@@ -264,7 +264,7 @@ class Record(Saved):
 
     @classmethod
     def from_pandas(cls, frame: "pd.DataFrame") -> "Record":
-        """Record from a table that `to_pandas` made; units are not in it.
+        """Return the record from a table that `to_pandas` made; units are not in it.
 
         Raises:
             ValueError: no such table.
@@ -272,7 +272,7 @@ class Record(Saved):
         return cls(**record_fields(frame))
 
     def apart(self) -> list[str]:
-        """Names of the parts that are saved separately."""
+        """Return the names of the parts that are saved separately."""
         return super().apart() + [name for name in ("reports", "transmissions", "weighed") if getattr(self, name)]
 
     def plot(

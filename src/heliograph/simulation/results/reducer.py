@@ -142,7 +142,7 @@ class Trajectories(AbstractReducer[Record]):
 
 
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
-    """Record from the scan's output; nodes in the network's order."""
+    """Return the record from the scan's output; nodes in the network's order."""
     measurements = split_measurements(network, batch["measurements"])
     mean = split_by_name(network, batch, attrgetter("mean"), -3)
     covariance = split_by_name(network, batch, attrgetter("covariance"), -4)

@@ -57,7 +57,7 @@ class Saved:
         raise NotImplementedError
 
     def apart(self) -> list[str]:
-        """Names of the parts that are not in the dataset, being results of their own."""
+        """Return the names of the parts that are not in the dataset, being results of their own."""
         return [] if self.smoothed is None else ["smoothed"]
 
     def save(self, path: str | Path) -> None:
@@ -136,7 +136,7 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
 
 
 def _kind(path: Path) -> str:
-    """Name of the package that writes the format."""
+    """Return the name of the package that writes the format."""
     kinds = {NETCDF: "h5netcdf", ZARR: "zarr"}
     if path.suffix.lower() not in kinds:
         raise fail(str(path), f"a name that ends in {' or '.join(kinds)}", repr(path.suffix))
@@ -144,7 +144,7 @@ def _kind(path: Path) -> str:
 
 
 def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
-    """Coordinates that are names."""
+    """Return the coordinates that are names."""
     return [(name, c) for name, c in dataset.coords.items() if c.dtype.kind in "OUT"]
 
 

@@ -74,17 +74,17 @@ class ErrorStatistics:
         return int(self.count.sum())
 
     def actual(self) -> np.ndarray:
-        """E[e e'] over the runs, (time, n, n)."""
+        """Return E[e e'] over the runs, (time, n, n)."""
         moments: np.ndarray = matrices(self.pairs.sum(axis=0)) / self.runs
         return moments
 
     def claimed(self) -> np.ndarray:
-        """Mean claimed covariance, (time, n, n)."""
+        """Return the mean claimed covariance, (time, n, n)."""
         covariance: np.ndarray = self.covariance.sum(axis=0) / self.runs
         return covariance
 
     def mean_trace(self) -> float:
-        """Mean over time of the trace of the claimed covariance."""
+        """Return the mean over time of the trace of the claimed covariance."""
         self._tell()
         return float(np.trace(self.claimed(), axis1=-2, axis2=-1).mean())
 
@@ -98,26 +98,26 @@ class ErrorStatistics:
         return _root_mean(squared, self.count)
 
     def rmse_by_state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
+        """Return the root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
         self._tell()
         squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
         results = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
         return np.array([root for root, _ in results]), np.array([error for _, error in results])
 
     def deviation_by_state(self) -> np.ndarray:
-        """Root of the mean over runs and steps of each state's claimed variance, (n,)."""
+        """Return the root of the mean over runs and steps of each state's claimed variance, (n,)."""
         self._tell()
         variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
         return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
     def rmse_over_time(self) -> np.ndarray:
-        """Root mean squared error at each step, (time,)."""
+        """Return the root mean squared error at each step, (time,)."""
         self._tell()
         rmse: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
         return rmse
 
     def nees_per_dimension(self, confidence: float = 0.95) -> tuple[float, float, float]:
-        """Mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
+        """Return the mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
 
         The interval is from the batch means, so correlation over time within a run does not matter.
         """
@@ -174,7 +174,7 @@ class ErrorStatistics:
 
 
 def matrices(pairs: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (..., n, n) from their entries i <= j, row by row."""
+    """Return the symmetric matrices (..., n, n) from their entries i <= j, row by row."""
     n = (math.isqrt(8 * pairs.shape[-1] + 1) - 1) // 2
     index = np.zeros((n, n), dtype=int)
     index[np.triu_indices(n)] = np.arange(pairs.shape[-1])
@@ -234,7 +234,7 @@ class WorstDirection:
 
 
 def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Mean of per-run values from batch sums, and its standard error from the scatter of batch means."""
+    """Return the mean of per-run values from batch sums, and its standard error from the scatter of batch means."""
     used = count > 0
     sums, count = sums[used], count[used]
     mean = float(sums.sum() / count.sum())
@@ -246,14 +246,14 @@ def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 
 
 def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Root of the mean of per-run values, and its standard error."""
+    """Return the root of the mean of per-run values, and its standard error."""
     mean, error = _batch_mean(sums, count)
     root = float(np.sqrt(mean))
     return root, error / (2 * root) if root else 0.0
 
 
 def _solve_generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
+    """Return the eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
 
     Each component is in units of its B_ii, and where that is zero of its A_ii.
     """

@@ -64,7 +64,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         self.smoothed: StatisticsByName | None = None
 
     def to_xarray(self) -> "xr.Dataset":
-        """Labelled arrays: RMSE, claimed deviation and NEES over time, and the sums that they are made from.
+        """Return the labelled arrays: RMSE, claimed deviation and NEES over time, and the sums that they are made from.
 
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
@@ -99,7 +99,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
-        """Statistics from a dataset that `to_xarray` made.
+        """Return the statistics from a dataset that `to_xarray` made.
 
         Raises:
             ValueError: no such dataset.

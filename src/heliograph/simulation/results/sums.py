@@ -51,7 +51,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
     """Reduce to error statistics of every filter of every node; memory does not grow with the number of runs."""
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Products of errors, e' B^-1 e, claimed covariances, and flags of invalid estimates."""
+        """Return the products of errors, e' B^-1 e, claimed covariances, and flags of invalid estimates."""
         truth = jnp.asarray(step["truth"])
         parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
         n = len(truth)

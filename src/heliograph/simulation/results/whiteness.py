@@ -84,7 +84,7 @@ def memory_test(
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     lags: int = 10,
 ) -> MemoryTest:
-    """Test from data whether links have memory that a filter ignores.
+    """Return the test from data whether links have memory that a filter ignores.
 
     The best linear filter's innovations are uncorrelated in time, and not independent: bursts come and go with the
     modes. Standard errors therefore allow for correlation among the products w_k w_(k+t) (Newey and West).
@@ -107,7 +107,7 @@ def memory_test(
 
 
 def _standardise(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
-    """Innovations of unknown covariance, each component in units of its deviation."""
+    """Return the innovations of unknown covariance, each component in units of its deviation."""
     values = array("innovations", data, (None,) * max(rank("innovations", data), 1), missing=True)
     value = values[:, None] if values.ndim == 1 else values
     largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
@@ -138,7 +138,7 @@ def whitened_innovations(
 
 
 def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
-    """Mean over the components that are not NaN; NaN where none is."""
+    """Return the mean over the components that are not NaN; NaN where none is."""
     there = np.sum(~np.isnan(parts), axis=1)
     return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
 
@@ -148,7 +148,7 @@ def score_innovations(
     data: Float[ArrayLike, "steps m"],
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
+    """Return the log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
 
     NaN where it did not arrive, counted less than half, or the components before it determine it. The same as
     `whitened_innovations`, in one pass with the likelihoods.

@@ -93,7 +93,7 @@ class Sweep(Module):
         return by_kind, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
 
     def outputs(self, steps: NetworkSmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
-        """Estimates after a step given what is later, by kind and by name; fused ones of these."""
+        """Return the estimates after a step given what is later, by kind and by name; fused ones of these."""
         by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
         parts = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:

@@ -71,7 +71,7 @@ def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
 
 
 def read_by(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
-    """Leaves of values (or their shapes) that a result of the function depends on."""
+    """Return the leaves of values (or their shapes) that a result of the function depends on."""
     leaves, tree = jax.tree.flatten(values)
     traced = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)))(*leaves)
     used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))[1]
@@ -96,7 +96,7 @@ def _drop_unused(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 def _find_dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
-    """Variables that depend on the marked inputs; each operation is assumed to use all its arguments."""
+    """Return the variables that depend on the marked inputs; each operation is assumed to use all its arguments."""
     marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
     for operation in program.jaxpr.eqns:
         if any(v in marked for v in operation.invars if not isinstance(v, Literal)):
@@ -105,7 +105,7 @@ def _find_dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
 
 
 def _dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
-    """Mask of the results that depend on the marked inputs."""
+    """Return the mask of the results that depend on the marked inputs."""
     marked = _find_dependent(program, inputs)
     return [not isinstance(v, Literal) and v in marked for v in program.jaxpr.outvars]
 

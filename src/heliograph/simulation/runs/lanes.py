@@ -83,7 +83,7 @@ class RunLanes:
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
     def total(self) -> PyTree:
-        """Sum of the lanes' carries, in their order."""
+        """Return the sum of the lanes' carries, in their order."""
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):
@@ -131,12 +131,12 @@ def in_chunks(
 
 
 def batch_counts(first_run: int, stop: int) -> np.ndarray:
-    """Number of runs of each batch, (batch,)."""
+    """Return the number of runs of each batch, (batch,)."""
     return np.bincount(np.arange(first_run, stop) % BATCHES, minlength=BATCHES).astype(float)
 
 
 def _order_blocks(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
+    """Return the blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
     ordered = np.empty_like(recorded)
     ordered[used] = recorded
     return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

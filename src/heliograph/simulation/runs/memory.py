@@ -29,12 +29,12 @@ class Needed(NamedTuple):
 
 
 def size_of(tree: PyTree) -> float:
-    """Bytes of the arrays of a tree, or of their shapes."""
+    """Return the bytes of the arrays of a tree, or of their shapes."""
     return float(sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree)))
 
 
 def available() -> float | None:
-    """Bytes that this machine can still give, at most all of its memory; None where it does not say."""
+    """Return the bytes that this machine can still give, at most all of its memory; None where it does not say."""
     try:
         lines = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
         return 1024.0 * int(lines["MemAvailable"].split()[0])

@@ -69,7 +69,7 @@ class NativeLanes:
         return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
 
     def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """Collected results of all runs, (run, ...); a view of one where they share it."""
+        """Return the collected results of all runs, (run, ...); a view of one where they share it."""
         leaves: list[Any] = []
         for fixed, *single in zip(self.code.begun.shared, *parts, strict=True):
             if fixed is not None:

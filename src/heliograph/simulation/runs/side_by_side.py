@@ -66,7 +66,7 @@ def filter_step(
 
 
 def get_weighed(innovation: Innovation) -> Weighed | None:
-    """The innovation by component, of a filter that weighs; None of all others."""
+    """Return the innovation by component, of a filter that weighs; None of all others."""
     if innovation.weight is None:
         return None
     return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
@@ -118,7 +118,7 @@ class StackedFilters(Module):
 
 
 def initial_state(filter: AbstractFilter) -> PyTree:
-    """State of a filter before the first step, on the device."""
+    """Return the state of a filter before the first step, on the device."""
     return jax.tree.map(jnp.asarray, filter.init())
 
 
