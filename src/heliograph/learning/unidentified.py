@@ -99,7 +99,7 @@ def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
 
 
 def _make_confounded(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
-    """Return A group, with what the data do identify: products of whole powers if those fit all points, else sums."""
+    """Return a group, with what the data do identify: products of whole powers if those fit all points, else sums."""
     places = list(group)
     size = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
     none = np.zeros((0, len(group)))

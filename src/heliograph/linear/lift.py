@@ -369,7 +369,7 @@ def _maps_of_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
 
 
 def each_step(model: T | OverTime, horizon: int) -> list[T]:
-    """Return A plant, sensor or channel at each of `horizon` steps."""
+    """Return a plant, sensor or channel at each of `horizon` steps."""
     check_horizon(horizon)
     check_horizon(horizon, steps_covered(model))
     return list_steps(model, horizon)

@@ -150,5 +150,5 @@ def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
 
 
 def first(model: object) -> PyTree:
-    """Return A plant, sensor or channel at its first step."""
+    """Return a plant, sensor or channel at its first step."""
     return at(model, 0) if isinstance(model, OverTime) else model

@@ -300,7 +300,7 @@ class Periodic(AbstractTrigger):
 
 
 def threshold(delta: ArrayLike) -> Float[Array, "..."]:
-    """Return A delta, which is positive, or one for each component."""
+    """Return a delta, which is positive, or one for each component."""
     report_domain("delta", delta, POSITIVE)
     checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
     if not is_traced(checked) and not np.all(checked > 0):

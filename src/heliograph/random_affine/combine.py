@@ -139,11 +139,11 @@ class Series(AbstractCombination):
         return [m for affine in self.maps for m in affine.in_series]
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return those that are known behind each map in turn."""
+        """Return the outputs that are known behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_known_gains(before), self.maps, known)
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those that are angles behind each map in turn."""
+        """Return the outputs that are angles behind each map in turn."""
         return reduce(lambda before, affine: affine.carry_angles(before), self.maps, sent)
 
     def degree_in(self, identity: str) -> int:
@@ -163,7 +163,7 @@ class Series(AbstractCombination):
         return combine([affine.list_atoms() for affine in self.maps], Component.then)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return those of each map, then of the next."""
+        """Return the joint moments of each map, then of the next."""
         return reduce(DisturbedGain.then, (affine.disturb_gain() for affine in self.maps))
 
     def in_words(self) -> str:
@@ -257,11 +257,11 @@ class Stack(AbstractCombination):
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return those of the maps, one after another."""
+        """Return the known gains of the maps, one after another."""
         return np.concatenate([affine.carry_known_gains(known) for affine in self.maps])
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those of the maps, whose outputs stand one after another."""
+        """Return the angles of the maps, whose outputs stand one after another."""
         starts = np.cumsum([0, *(affine.outputs for affine in self.maps)])
         items = zip(starts, self.maps, strict=False)
         return tuple(int(start) + i for start, affine in items for i in affine.carry_angles(sent))
@@ -279,7 +279,7 @@ class Stack(AbstractCombination):
         return combine([affine.list_atoms() for affine in self.maps], Component.above)
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return those of the maps, one above another."""
+        """Return the joint moments of the maps, one above another."""
         return stack_gains([affine.disturb_gain() for affine in self.maps], self.inputs)
 
     def in_words(self) -> str:

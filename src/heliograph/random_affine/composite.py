@@ -76,7 +76,7 @@ class AbstractUniform(AbstractRandomAffine):
         return self.maps[0].inputs
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those of every map: all choices must agree."""
+        """Return the angles of every map: all choices must agree."""
         results = {affine.carry_angles(sent) for affine in self.maps}
         if len(results) > 1:
             raise refuse_gain_on_angles(type(self).__name__)

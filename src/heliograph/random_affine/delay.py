@@ -73,7 +73,7 @@ class DelayLine(AbstractDelayLine):
         return self.steps
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those of the map, from the angles of what was sent at each of the steps that may arrive."""
+        """Return the angles of the map, from the angles of what was sent at each of the steps that may arrive."""
         size = signal_size(self)
         return self.line.carry_angles(tuple(t * size + i for t in range(1 + self.past) for i in sent))
 
@@ -141,7 +141,7 @@ class Delayed(AbstractDelayLine):
         return isinstance(self.delay, GainAndNoise)
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those of the link; a time stamp stands after them."""
+        """Return the angles of the link; a time stamp stands after them."""
         return self.link.carry_angles(sent)
 
     def in_words(self) -> str:
@@ -275,7 +275,7 @@ class Relayed(AbstractDelayLine):
         return whole
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those that are angles behind each stage in turn."""
+        """Return the outputs that are angles behind each stage in turn."""
         return reduce(lambda before, stage: stage.carry_angles(before), self.stages, sent)
 
     @property

@@ -48,7 +48,7 @@ class Erasure(AbstractWrapper):
         return [*listed, Outcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those of the map: what is lost is none."""
+        """Return the angles of the map: what is lost is none."""
         return self.base.carry_angles(sent)
 
     def in_words(self) -> str:

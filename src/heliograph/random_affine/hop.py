@@ -150,13 +150,13 @@ class GainAndNoise(AbstractHop):
         return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return those that take nothing but known inputs, by a constant gain."""
+        """Return the outputs that take nothing but known inputs, by a constant gain."""
         takes = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
         rows: KnownGains = (self.law.constant is not None) & ~np.any(takes & ~known, axis=1)
         return rows
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those that take one angle each by a gain of 1, and with it whole numbers of turns."""
+        """Return the outputs that take one angle each by a gain of 1, and with it whole numbers of turns."""
         if not sent:
             return ()
         if is_traced(self.matrix):
@@ -179,7 +179,7 @@ class GainAndNoise(AbstractHop):
         return [Component(p * q, g * self.matrix, c, r) for p, g in gains for q, c, r in noises]
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return those of [g A, N], N a root of the noise's covariance."""
+        """Return the joint moments of [g A, N], N a root of the noise's covariance."""
         root = noise_gain(np.asarray(self.noise.mean), np.asarray(self.noise.covariance))
         return disturb_hop(np.asarray(self.matrix), (float(self.law.moment(1)), float(self.law.moment(2))), root)
 

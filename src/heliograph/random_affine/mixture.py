@@ -93,7 +93,7 @@ class Mixture(AbstractUniform, AbstractCombination):
         return [c._replace(weight=p * c.weight) for p, affine in parts for c in affine.list_atoms()]
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return those of one of the maps, drawn."""
+        """Return the joint moments of one of the maps, drawn."""
         parts = [affine.disturb_gain() for affine in self.maps]
         return mix_gains(parts, np.asarray(self.choice.probabilities), self.inputs)
 

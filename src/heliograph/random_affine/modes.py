@@ -144,7 +144,7 @@ class OneStepLate(AbstractWrapper):
         return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return those of the map."""
+        """Return the angles of the map."""
         return self.base.carry_angles(sent)
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:

@@ -255,7 +255,7 @@ class Independent(AbstractNoise):
         return all(component.is_symmetric for component in self.parts)
 
     def branches(self) -> Branches:
-        """Return those of the parts, one above the other."""
+        """Return the branches of the parts, one above the other."""
         return stack_branches([component.branches() for component in self.parts])
 
     def without_outliers(self) -> NoiseWithoutOutliers:

@@ -198,7 +198,7 @@ class Contaminated(AbstractNoise):
         return not np.any(np.asarray(self.means) != 0)
 
     def branches(self) -> Branches:
-        """Return those of the law."""
+        """Return the branches of the law."""
         xp, n = library(self.shares), self.dimension
         shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T

@@ -145,17 +145,17 @@ class Superposed(AbstractCombination):
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return those that are known in every map."""
+        """Return the outputs that are known in every map."""
         parts = zip(self.maps, self.places, strict=True)
         rows: KnownGains = np.all([affine.carry_known_gains(known[list(at)]) for affine, at in parts], axis=0)
         return rows
 
     def list_atoms(self) -> list[Component]:
-        """Return those of the sum of a stack."""
+        """Return the atoms of the sum of a stack."""
         return self.as_stack.list_atoms()
 
     def disturb_gain(self) -> DisturbedGain:
-        """Return those of the sum of a stack."""
+        """Return the joint moments of the sum of a stack."""
         return self.as_stack.disturb_gain()
 
     def in_words(self) -> str:

@@ -94,7 +94,7 @@ class AdaptiveFilter(AbstractSizedFilter):
     memory: Float[jax.Array | np.ndarray, ""]
 
     def angles_used(self) -> FilterAngles | None:
-        """Return those of the filter within."""
+        """Return the angles of the filter within."""
         return self.base.angles_used()
 
     @in_float64

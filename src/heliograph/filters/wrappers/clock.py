@@ -91,7 +91,7 @@ class ClockFilter(AbstractSizedFilter):
     offsets: tuple[int, ...] = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles | None:
-        """Return those of the filter within."""
+        """Return the angles of the filter within."""
         return self.base.angles_used()
 
     @in_float64

@@ -84,7 +84,7 @@ class PartFilter(AbstractPartFilter):
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
     def angles_used(self) -> FilterAngles | None:
-        """Return those of the larger filter among its first states."""
+        """Return the angles of the larger filter among its first states."""
         angles = self.base.angles_used()
         return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
 
@@ -231,7 +231,7 @@ class LateFilter(AbstractSizedFilter):
         self.inputs, self.received = base.inputs, base.received
 
     def angles_used(self) -> FilterAngles | None:
-        """Return those of the filter within."""
+        """Return the angles of the filter within."""
         return self.base.angles_used()
 
     @in_float64

@@ -53,7 +53,7 @@ class PredictionFilter(AbstractSizedFilter):
         self.states, self.inputs, self.received, self.kept = base.states, base.inputs, base.received, base.kept
 
     def angles_used(self) -> FilterAngles | None:
-        """Return those of the filter within."""
+        """Return the angles of the filter within."""
         return self.base.angles_used()
 
     @in_float64

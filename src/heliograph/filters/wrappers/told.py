@@ -117,7 +117,7 @@ class ToldFilter(AbstractSizedFilter):
         return filter.smoother_step(step._replace(z=values))
 
     def angles_used(self) -> FilterAngles | None:
-        """Return those of the filter within, at their rows; what is told is none."""
+        """Return the angles of the filter within, at their rows; what is told is none."""
         angles = self.base.angles_used()
         return angles and angles._replace(received=tuple(self.values[i] for i in angles.received))
 
