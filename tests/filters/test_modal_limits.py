@@ -74,8 +74,8 @@ def test_what_does_not_arrive_is_left_out():
     item = hg.linear_filter(PLANT, SENSOR, bursts())
     state = item.predict(item.init())
     after, innovation = item.correct(state, [np.nan])
-    np.testing.assert_allclose(after.mean, state.mean, atol=0)
-    np.testing.assert_allclose(after.covariance, state.covariance, rtol=1e-15)
+    np.testing.assert_allclose(after.gaussian.mean, state.gaussian.mean, atol=0)
+    np.testing.assert_allclose(after.gaussian.covariance, state.gaussian.covariance, rtol=1e-15)
     assert innovation.log_likelihood == 0
 
 

@@ -158,11 +158,12 @@ def no_c(operation: str, where: str) -> InputError:
 
 
 def names_of(state: PyTree) -> list[str]:
-    """Return names in C for the arrays of a state, from their field names."""
+    """Return names in C for the arrays of a state, from their field names; the Gaussian that it holds has no name."""
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
-        parts = (str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path)
-        text = "_".join("".join(c if c.isalnum() and c.isascii() else "_" for c in p) for p in parts)
+        parts = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
+        own = "_".join(part for part in parts if part != "gaussian")
+        text = "".join(c if c.isalnum() and c.isascii() else "_" for c in own)
         text = f"state_{text}".rstrip("_") if not text or not text[0].isalpha() else text
         while text in RESERVED | ADDED or text in names:
             text += "_"

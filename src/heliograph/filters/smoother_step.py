@@ -1,7 +1,8 @@
 """Smoother step of a filter: what the way back, or the way ahead of one earlier state, needs of a step forward."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -30,6 +31,10 @@ class StepTrace(NamedTuple):
     z: ArrayLike
     u: ArrayLike
     k: int | np.integer | Int[jax.Array, ""]
+
+    def map_states(self, read: Callable[[PyTree], PyTree]) -> "StepTrace":
+        """Return the same step of a filter whose states are what `read` returns of these."""
+        return self._replace(before=read(self.before), prior=read(self.prior), after=read(self.after))
 
 
 class EarlierState(NamedTuple):
@@ -125,46 +130,37 @@ class SmootherStep(Module):
         return Estimate(wrap_angles(mean, self.angles), columns.covariance, self.claim)
 
 
-class HasMoments(Protocol):
-    """A filter's state with mean (N,) and factors of its covariance, as `Gaussian` has them."""
+def gaussian_of(state: PyTree) -> Any:
+    """Return the Gaussian that a filter's state holds beside what it adds; a state that holds none is it itself."""
+    return getattr(state, "gaussian", state)
 
-    @property
-    def mean(self) -> Float[Array, " N"]:
-        """Mean of the state."""
 
-    @property
-    def lower(self) -> Float[Array, " entries"]:
-        """Entries of L below its diagonal."""
-
-    @property
-    def variances(self) -> Float[Array, " N"]:
-        """Variances d."""
+def with_gaussian(state: PyTree, x: Gaussian) -> PyTree:
+    """Return a filter's state that holds another Gaussian."""
+    return state._replace(gaussian=x) if hasattr(state, "gaussian") else x
 
 
 def smoother_step_of(
-    before: HasMoments,
-    prior: HasMoments,
-    after: HasMoments,
+    step: StepTrace,
     moved: tuple[Array, Columns],
     claim: Claim,
     angles: Angles = (),
     projection: Array | None = None,
 ) -> SmootherStep:
-    """Build the step from the filter's states around it, `before` it, `prior` to the correction and `after` it.
+    """Build the smoother step from the Gaussians that a filter's states hold.
 
     Args:
-        before: with mean m and factors L, d.
-        prior: of the state x+.
-        after: of the same, given the step's data.
+        step: with the states around it; m + L xi is that before it.
         moved: slopes (N, N) and noise (N, columns) of the move x+ = E x+ + slopes xi + w from x = m + L xi.
         claim: of smoothed estimates.
         angles: places of angles among the plant's states.
         projection: from the filter's state to the plant's (n, N).
     """
     slopes, noise = moved
+    before, prior, after = (Gaussian(*map(jnp.asarray, gaussian_of(state))) for state in step[:3])
     return SmootherStep(
-        _gaussian_of(after),
-        condition_on_next_state(_gaussian_of(before), jnp.asarray(slopes), jnp.asarray(prior.mean), noise),
+        after,
+        condition_on_next_state(before, jnp.asarray(slopes), prior.mean, noise),
         claim=claim,
         angles=angles,
         projection=None if projection is None else jnp.asarray(projection),
@@ -175,8 +171,3 @@ def add_nis(step: SmootherStep, innovation: Innovation) -> SmootherStep:
     """Return the step with the normalised innovation squared, e' S^-1 e."""
     nis, count = innovation_distance(innovation)
     return replace(step, nis=nis, received=count)
-
-
-def _gaussian_of(state: HasMoments) -> Gaussian:
-    """Return a filter's state as a Gaussian."""
-    return Gaussian(*map(jnp.asarray, (state.mean, state.lower, state.variances)))

@@ -12,6 +12,7 @@ import numpy as np
 from heliograph.engine.choice import chosen, compile_on_call, compute_once, map_arrays
 from heliograph.filters.base import AbstractFilter, make_sizes
 from heliograph.filters.linear.plan import LinearStep
+from heliograph.filters.smoother_step import gaussian_of
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
@@ -118,8 +119,8 @@ class AllFilters(Module):
     def _init_centre(
         self, centre: Centre | LinearisedCentre, states: Sequence[PyTree]
     ) -> CentreState | dict[str, Followed]:
-        means = [states[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
-        return centre.init(means)
+        beliefs = [(gaussian_of(states[kind]), self.alike[kind].count, f) for kind, f in centre.sources]
+        return centre.init([x.mean.reshape(count, -1, self.n)[f] for x, count, f in beliefs])
 
     @property
     def informed(self) -> tuple[Centre, ...]:

@@ -88,21 +88,9 @@ def _condition(update: AbstractUpdate, signal: Signal, channel: SecondOrder, z: 
 class Propagated(NamedTuple):
     """A belief, and half the differences and the means (n, n) of the pairs of points that were moved to predict it."""
 
-    mean: jax.Array
-    lower: jax.Array
-    variances: jax.Array
+    gaussian: Gaussian
     ahead: jax.Array
     behind: jax.Array
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the state."""
-        return self.belief.covariance
-
-    @property
-    def belief(self) -> Gaussian:
-        """The state given the data."""
-        return Gaussian(*self[:3])
 
 
 class MixedCross(AbstractFilter):
@@ -123,21 +111,21 @@ class MixedCross(AbstractFilter):
         """The prior."""
         start = self.base.init()
         none = jnp.zeros((len(start.mean), len(start.mean)))
-        return Propagated(*start, none, none)
+        return Propagated(start, none, none)
 
     @predicts
     def predict(self, state: Propagated, u: ArrayLike = (), k: Step = 0) -> Propagated:
         """Move the points, and keep them."""
-        plant, x = at(self.base.plant, k), state.belief
+        plant, x = at(self.base.plant, k), state.gaussian
         moved = evaluate_beside_mean(
             lambda x: plant.transition(x, jnp.asarray(u)), x, square_root(len(x.mean) * x.variances)
         )
-        return Propagated(*self.base.predict(x, u, k), *moved)
+        return Propagated(self.base.predict(x, u, k), *moved)
 
     @corrects
     def correct(self, state: Propagated, z: ArrayLike, k: Step = 0) -> tuple[Propagated, Innovation]:
         """Redraw for y only, correct."""
-        sensor, channel, x = at(self.base.sensor, k), at(self.base.channel, k), state.belief
+        sensor, channel, x = at(self.base.sensor, k), at(self.base.channel, k), state.gaussian
         ahead, behind = evaluate_beside_mean(sensor.measure, x, square_root(len(x.mean) * x.variances))
         y = jnp.concatenate([ahead, behind], axis=1)
         points = jnp.concatenate([state.ahead, state.behind], axis=1)
@@ -151,11 +139,11 @@ class MixedCross(AbstractFilter):
         second = spread + jnp.outer(mean, mean)
         signal = Signal(x, mean, slopes, Columns(vectors, weights), second, jnp.diagonal(second))
         after, innovation = correct_signal(signal, channel, self.base.rule, jnp.asarray(z))
-        return Propagated(*after, state.ahead, state.behind), innovation
+        return state._replace(gaussian=after), innovation
 
     def estimate(self, state: Propagated) -> Estimate:
         """The belief."""
-        return Estimate(state.mean, state.belief.covariance, self.claim)
+        return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
 
 def variants(s: Scenario, node: int) -> dict[str, AbstractFilter]:

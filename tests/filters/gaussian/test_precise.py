@@ -60,7 +60,7 @@ def test_a_run_takes_the_form_that_its_numbers_need():
 
     def variance(noise):
         item = hg.linear_filter(plant, hg.LinearSensor(C, noise), hg.perfect(1))
-        return item.correct(item.predict(item.init()), np.zeros(1))[0].covariance
+        return item.correct(item.predict(item.init()), np.zeros(1))[0].gaussian.covariance
 
     with jax.enable_x64(True):
         together = jax.jit(jax.vmap(variance))(np.array([[[1e-9]], [[1.0]]]))
@@ -74,7 +74,7 @@ def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
     item = hg.linear_filter(hg.LinearPlant(A, 0.01, [0.0, 0.0], 1.0), hg.LinearSensor(C, 0.1), hg.perfect(1))
 
     def moved(z):
-        return item.correct(item.predict(item.init()), z)[0].mean.sum()
+        return item.correct(item.predict(item.init()), z)[0].gaussian.mean.sum()
 
     z = np.array([[1.0], [2.0]])
     with jax.enable_x64(True):
@@ -202,7 +202,7 @@ def test_a_noise_free_output_has_a_gradient():
     def mean(wide):
         plant = hg.LinearPlant(A, 0.0, [0.0, 0.0], wide * jnp.eye(2))
         item = hg.linear_filter(plant, hg.LinearSensor(C, 0.0), hg.perfect(1))
-        return item.correct(item.init(), jnp.ones(1))[0].mean.sum()
+        return item.correct(item.init(), jnp.ones(1))[0].gaussian.mean.sum()
 
     with jax.enable_x64(True):
         assert float(jax.jit(jax.grad(mean))(2.0)) == pytest.approx(0.0, abs=1e-15)
@@ -253,7 +253,7 @@ def test_where_noise_is_none_a_little_more_of_it_is_known_to_matter():
     def variance(n):
         noise = jnp.array([[1.0, 1.0], [1.0, 1.0]]) + n * jnp.diag(jnp.array([0.0, 1.0]))
         item = hg.linear_filter(plant, hg.LinearSensor([[1.0], [2.0]], noise), hg.perfect(2))
-        return item.correct(item.predict(item.init()), jnp.zeros(2))[0].covariance[0, 0]
+        return item.correct(item.predict(item.init()), jnp.zeros(2))[0].gaussian.covariance[0, 0]
 
     with jax.enable_x64(True):
         with_slope = jax.jit(jax.value_and_grad(variance))
@@ -307,7 +307,7 @@ def test_behind_a_random_gain_far_from_zero_a_combination_that_says_nothing_is_l
     plant = hg.LinearPlant(np.eye(2), 0.0, [1400.0, -50.0], 1.0)
     item = hg.linear_filter(plant, hg.LinearSensor(matrix, 0.0), hg.dropout(hg.perfect(3), 0.7))
     state, _ = item.correct(item.predict(item.init()), np.zeros(3))
-    np.testing.assert_allclose(state.covariance, exact_after_dropout(matrix, [1400, -50], 7), rtol=1e-6)
+    np.testing.assert_allclose(state.gaussian.covariance, exact_after_dropout(matrix, [1400, -50], 7), rtol=1e-6)
 
 
 def exact_after_dropout(matrix, mean, tenths):

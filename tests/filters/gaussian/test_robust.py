@@ -169,7 +169,7 @@ def over(item, rows):
 
     def step(state, row):
         after, _ = item.correct(item.predict(state), row)
-        return after, after
+        return after, item.estimate(after)
 
     return jax.lax.scan(step, jax.tree.map(jax.numpy.asarray, item.init()), rows)[1]
 

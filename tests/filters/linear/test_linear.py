@@ -149,13 +149,13 @@ def test_a_random_gain_makes_the_claim_one_for_inputs_known_in_advance(closed, l
         # Gain and covariance depend on the planned inputs alone: u = -1.2, then 0.
         planned = -1.2 if k == 0 else 0.0
         prior = item.predict(state, [planned], k)
-        state, gain = item.correct(prior, [0.0], k)[0], item.correct(prior, [1.0], k)[0].mean[0]
-        gain = gain - state.mean[0]
+        state, other = (item.correct(prior, [z], k)[0] for z in (0.0, 1.0))
+        gain = other.gaussian.mean[0] - state.gaussian.mean[0]
         u = -1.2 * m if closed else planned
         x, m = 1.2 * x + u + np.sqrt(0.1) * rng.normal(size=runs), 1.2 * m + u
         sent = rng.choice([0.6, 1.4], size=runs) * (x + np.sqrt(0.1) * rng.normal(size=runs))
         m = m + gain * (sent + np.sqrt(0.05) * rng.normal(size=runs) - m)
-    assert low < np.mean((x - m) ** 2) / state.covariance[0, 0] < high
+    assert low < np.mean((x - m) ** 2) / state.gaussian.covariance[0, 0] < high
 
 
 SCALAR_SENSOR = hg.LinearSensor([[1.0]], 0.1)

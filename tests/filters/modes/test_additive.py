@@ -42,7 +42,7 @@ def check_equal(channel, count, parts, steps=6, missing=(2,)):
     made = hg.linear_filter(PLANT, sensor(count), channel)
     joint = modal_filter(PLANT, sensor(count), channel)
     assert made.claim == joint.claim == "exact"
-    assert len(made.init().mean) == 3 * parts
+    assert len(made.init().gaussian.mean) == 3 * parts
     for mine, other in zip(run(made, steps, missing), run(joint, steps, missing), strict=True):
         np.testing.assert_allclose(mine, other, rtol=1e-10, atol=1e-12)
 
@@ -73,8 +73,8 @@ def test_six_links_need_seven_functions_of_their_64_modes():
     channel = hg.superposed([chain(1.0 - 0.1 * i, 0.2, stay=0.6 + 0.05 * i) for i in range(6)], 0.1, same=True)
     one = hg.LinearSensor([[1.0]], [[0.05]])
     made, joint = hg.linear_filter(plant, one, channel), modal_filter(plant, one, channel)
-    assert len(made.init().mean) == 7 * 2
-    assert len(joint.init().mean) == 64 * 2
+    assert len(made.init().gaussian.mean) == 7 * 2
+    assert len(joint.init().gaussian.mean) == 64 * 2
     for mine, other in zip(run(made, 3), run(joint, 3), strict=True):
         np.testing.assert_allclose(mine, other, rtol=1e-10)
 
@@ -84,4 +84,4 @@ def test_as_many_links_as_no_joint_modes_could_describe_have_a_filter():
     channel = hg.superposed([chain(1.0, 0.2) for _ in range(40)], 0.1, same=True)
     made = hg.linear_filter(PLANT, sensor(1), channel)
     assert made.claim == "exact"
-    assert len(made.init().mean) == 41 * 3
+    assert len(made.init().gaussian.mean) == 41 * 3

@@ -117,12 +117,13 @@ def test_modes_are_weighed_with_their_atoms():
         moved = item.predict(state, (), k)
         law = law if k == 0 else law @ CHAIN.transition
         np.testing.assert_allclose(moved.law, law, rtol=1e-12)
-        p = moved.covariance[0, 0]
+        x = moved.gaussian
+        p = x.covariance[0, 0]
         likelihood = np.zeros(2)
         for i, m in enumerate(MODES):
             for c in hg.random_affine.Series([hg.hop(1.0, TWO), m]).list_atoms():
                 g = c.gain[0, 0]
-                density = stats.norm.pdf(z, g * moved.mean[0] + c.offset[0], np.sqrt(g * p * g + c.noise[0, 0]))
+                density = stats.norm.pdf(z, g * x.mean[0] + c.offset[0], np.sqrt(g * p * g + c.noise[0, 0]))
                 likelihood[i] += c.weight * density
         state, innovation = item.correct(moved, [z], k)
         np.testing.assert_allclose(innovation.log_likelihood, np.log(law @ likelihood), rtol=1e-12)

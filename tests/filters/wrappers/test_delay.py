@@ -145,7 +145,7 @@ def test_known_the_claim_is_the_best_linear_error_given_the_delays(filters, seed
         best = oracle.best_linear(parts, received, k + 1)
         np.testing.assert_allclose(estimate.covariance, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
     unknown = filters["informed"].correct(state, [0.3, np.nan], k=12)[0]
-    np.testing.assert_array_equal(unknown.mean, state.mean)
+    np.testing.assert_array_equal(unknown.gaussian.mean, state.gaussian.mean)
 
 
 def test_a_constant_delay_is_predicted_over(filters):

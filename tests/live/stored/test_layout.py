@@ -58,7 +58,7 @@ def test_a_sum_of_an_event_filter_has_its_parts_in_the_order_that_they_had_with_
     start = hg.event_filter(hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), sensor, hg.perfect(1), hg.SendOnDelta(0.5)).init()
     before = describe_old_layout({path: part.shape for path, part in split_by_path(start).items()})
     assert list(before) == [".weight", ".mean", ".covariance", ".label", ".begun", ".moved"]
-    assert before[".covariance"] == list(start.covariance.shape)
+    assert before[".covariance"] == list(start.gaussian.covariance.shape)
 
 
 @pytest.mark.parametrize("count", [1, 63, 130])

@@ -1,6 +1,6 @@
 """State of a filter behind a sender that decides when to send: a sum of Gaussians, and what is known of the sender."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +12,12 @@ from heliograph.filters.event.gaussian_sum import GaussianSum, safe_log
 class EventBelief(NamedTuple):
     """The sum: Gaussians of (x, r), r the sender's reference, and labels (mode, steps since sent, number lost).
 
-    Shapes, with N = n + m: weight (H,), mean, variances (H, N), lower (H, N (N - 1) / 2), label (H, S, M, A, C) with
-    S = 1 where y is sent as a whole, else m; `begun` (S,) once there is a reference, `moved` once the chain was used.
+    Shapes: weight (H,), the Gaussians (H, n + m), label (H, S, M, A, C) with S = 1 where y is sent as a whole, else m;
+    `begun` (S,) once there is a reference, `moved` once the chain was used.
     """
 
     weight: jax.Array
-    mean: jax.Array
-    lower: jax.Array
-    variances: jax.Array
+    gaussian: Gaussian
     label: jax.Array
     begun: jax.Array
     moved: jax.Array
@@ -27,19 +25,14 @@ class EventBelief(NamedTuple):
     @property
     def components(self) -> tuple[jax.Array, Gaussian]:
         """The mixture: weights (H,), and the Gaussians of (x, r)."""
-        return self.weight, Gaussian(self.mean, self.lower, self.variances)
-
-    @property
-    def covariance(self) -> Any:
-        """Covariances of (x, r)."""
-        return self.components[1].covariance
+        return self.weight, self.gaussian
 
     @property
     def parts(self) -> GaussianSum:
         """The sum, with the logarithms of its weights."""
-        return GaussianSum(safe_log(self.weight), self.components[1], self.label)
+        return GaussianSum(safe_log(self.weight), self.gaussian, self.label)
 
     @staticmethod
     def of(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """Return the state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
-        return EventBelief(jnp.exp(parts.log_weight), *parts.gaussian, parts.label, begun, moved)
+        return EventBelief(jnp.exp(parts.log_weight), parts.gaussian, parts.label, begun, moved)

@@ -128,7 +128,7 @@ class EventFilter(AbstractSizedFilter):
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
         """Move x and the modes; r stays, or is the prediction; the age of the last value sent grows by one step."""
         plant, u, start = at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant)
-        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.parts.gaussian)
+        both = jax.vmap(lambda x: predict_jointly(plant, self.transform, x, u, start))(state.gaussian)
         if self.trigger.reference == "prediction":
             expected, places = (
                 self.reference(self._merge_state(state).mean, u, k),
@@ -141,7 +141,7 @@ class EventFilter(AbstractSizedFilter):
             older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
             age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
             label = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, label, 0.0)
-        return EventBelief(state.weight, *both, label, state.begun, jnp.asarray(True))
+        return EventBelief(state.weight, both, label, state.begun, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
@@ -321,7 +321,7 @@ class EventFilter(AbstractSizedFilter):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the one of the joined sums' moments around the update."""
-        return smoother_step_by_transform(self, step, first(self.plant), self._merge_state)
+        return smoother_step_by_transform(self, step.map_states(self._merge_state), first(self.plant))
 
     def _merge_state(self, state: EventBelief) -> Gaussian:
         """Merge the sum into one Gaussian of the plant's state."""

@@ -1,6 +1,6 @@
 """One Gaussian behind a sender whose silence is Gaussian: one that sends by chance, or by schedule."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,27 +30,12 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 
 class StochasticBelief(NamedTuple):
-    """Mean (n,), factors, the modes' law (M,) and the shared reference (m,) of the sender.
+    """The state (n,) given the data, the modes' law (M,) and the shared reference (m,) of the sender."""
 
-    Shapes: mean, variances (n,), lower (n (n - 1) / 2,).
-    """
-
-    mean: Float[jax.Array, " n"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " n"]
+    gaussian: Gaussian
     law: Float[jax.Array, " M"]
     reference: Float[jax.Array, " m"]
     moved: jax.Array
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """The state given the data."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the state."""
-        return self.gaussian.covariance
 
 
 class StochasticEventFilter(AbstractSizedFilter):
@@ -80,7 +65,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Return the prior."""
         start = at(self.plant, 0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
-        return StochasticBelief(*x, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False))
+        return StochasticBelief(x, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False))
 
     @predicts
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
@@ -91,8 +76,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         law = jnp.where(state.moved, state.law @ rows, state.law)
         reference = state.reference
         if self.trigger.reference == "prediction":
-            reference = self.reference(state.mean, u, k)
-        return StochasticBelief(*moved, law, reference, jnp.asarray(True))
+            reference = self.reference(state.gaussian.mean, u, k)
+        return StochasticBelief(moved, law, reference, jnp.asarray(True))
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
@@ -139,7 +124,7 @@ class StochasticEventFilter(AbstractSizedFilter):
             flag_innovation, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, flag_innovation)
         x: Gaussian = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
-        following = StochasticBelief(*x, after.label[0, 0], state.reference, state.moved)
+        following = StochasticBelief(x, after.label[0, 0], state.reference, state.moved)
         return following, Innovation(value, covariance, total)
 
     def _mix_silence_and_outage(
@@ -226,7 +211,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
         """Return the Gaussian."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the Gaussian's, around the update."""

@@ -1,6 +1,6 @@
 """A filter that learns the variances of its sensor's noise on line, by variational Bayes with forgetting."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,26 +47,14 @@ PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: as much as six n
 
 
 class AdaptiveBelief(NamedTuple):
-    """Mean and factors of the state, and of each noise variance the inverse gamma law: R = b / a (m,).
+    """The state (n,) given the data, and of each noise variance the inverse gamma law: R = b / a (m,).
 
-    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), shape a, scale b (m,).
+    Shapes: shape a, scale b (m,).
     """
 
-    mean: Float[jax.Array, " n"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " n"]
+    gaussian: Gaussian
     shape: Float[jax.Array, " m"]
     scale: Float[jax.Array, " m"]
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """The state given the data."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the state."""
-        return self.gaussian.covariance
 
 
 class AdaptiveFilter(AbstractSizedFilter):
@@ -102,12 +90,12 @@ class AdaptiveFilter(AbstractSizedFilter):
         """Return the filter's prior, and the variances' with as much weight as forgetting leaves them."""
         shape = jnp.full(self.received, PRIOR_SHAPE)
         variance = jnp.diagonal(jnp.asarray(at(self.noise, 0).covariance))
-        return AdaptiveBelief(*self.base.init(), shape, shape * variance)
+        return AdaptiveBelief(self.base.init(), shape, shape * variance)
 
     @predicts
     def predict(self, state: AdaptiveBelief, u: ArrayLike = (), k: Step = 0) -> AdaptiveBelief:
         """Return the state as the filter does; what is known of the variances stays until something arrives."""
-        return AdaptiveBelief(*self.base.predict(state.gaussian, u, k), state.shape, state.scale)
+        return AdaptiveBelief(self.base.predict(state.gaussian, u, k), state.shape, state.scale)
 
     @corrects
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
@@ -136,7 +124,7 @@ class AdaptiveFilter(AbstractSizedFilter):
         both = present[:, None] & present[None]
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(before.signal))
         innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
-        return AdaptiveBelief(*learned.state, learned.shape, learned.scale), innovation
+        return AdaptiveBelief(learned.state, learned.shape, learned.scale), innovation
 
     @estimates
     def estimate(self, state: AdaptiveBelief) -> Estimate:

@@ -1,6 +1,5 @@
 """Filters whose state is a mean and a covariance: their prior, prediction and estimate, and the one without data."""
 
-from collections.abc import Callable
 from typing import Protocol
 
 import jax
@@ -20,7 +19,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
-from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
@@ -28,7 +27,7 @@ from heliograph.model.premises.premise import believes
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise
 
 
@@ -123,21 +122,12 @@ class PredictsByTransform(Protocol):
     claim: Claim
 
 
-def smoother_step_by_transform(
-    filter: PredictsByTransform,
-    step: StepTrace,
-    start: HasStart,
-    whole: Callable[[PyTree], Gaussian] | None = None,
-) -> SmootherStep:
-    """Return the smoother step of x+ = f(x, u) + w; `whole` reads Gaussians off states of another form.
-
-    `start`: whose law of the first state says how large numbers are.
-    """
+def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasStart) -> SmootherStep:
+    """Return the smoother step of x+ = f(x, u) + w; `start`: of which law at the start numbers have their size."""
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
-    before, prior, after = step[:3] if whole is None else map(whole, step[:3])
-    image = image_of(plant, filter.transform, before, u)
+    image = image_of(plant, filter.transform, gaussian_of(step.before), u)
     rest = sum_unexplained(image, process_noise(plant, u, second_moments_at_start(filter.plant, start)))
-    return smoother_step_of(before, prior, after, (image.slopes, rest), filter.claim, plant.angles)
+    return smoother_step_of(step, (image.slopes, rest), filter.claim, plant.angles)
 
 
 def prior_of(

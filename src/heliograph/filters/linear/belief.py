@@ -1,6 +1,6 @@
 """State of a linear filter: the estimate, and the plant's moments without any data, both predicted with the plant."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,41 +35,29 @@ def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> Plant
 
 
 class LinearBelief(NamedTuple):
-    """The estimate's mean and factors, and the state's mean and covariance before any data.
+    """The state given the data, and its mean and covariance before any data.
 
-    The latter is never diminished by a measurement, and so needs no factors. Shapes: mean, variances, state_mean (n,),
-    lower (n (n - 1) / 2,), state_covariance (n, n).
+    The latter is never diminished by a measurement, and so needs no factors. Shapes: the state (n,), state_mean (n,),
+    state_covariance (n, n).
     """
 
-    mean: Float[jax.Array, " n"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " n"]
+    gaussian: Gaussian
     state_mean: Float[jax.Array, " n"]
     state_covariance: Float[jax.Array, "n n"]
-
-    @property
-    def estimate(self) -> Gaussian:
-        """The state given the data."""
-        return Gaussian(self.mean, self.lower, self.variances)
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the estimate's error."""
-        return self.estimate.covariance
 
 
 def prior_belief(start: AbstractPlant) -> LinearBelief:
     """Return the prior, both as estimate and as the state's moments before data."""
     mean, covariance = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
-    return LinearBelief(*from_covariance(start.initial_mean, start.initial_covariance), mean, covariance)
+    return LinearBelief(from_covariance(start.initial_mean, start.initial_covariance), mean, covariance)
 
 
 def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
     """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
-    estimate = predict_affine(belief.estimate, step.matrix, step.shift, step.noise)
+    gaussian = predict_affine(belief.gaussian, step.matrix, step.shift, step.noise)
     mean = step.matrix @ belief.state_mean + step.shift
     covariance = step.matrix @ belief.state_covariance @ step.matrix.T + step.covariance
-    return LinearBelief(*estimate, *_within_range(mean, symmetric(covariance)))
+    return LinearBelief(gaussian, *_within_range(mean, symmetric(covariance)))
 
 
 def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -84,7 +84,7 @@ class LinearFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: LinearBelief) -> Estimate:
         """Return the mean and covariance of the estimate."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of the state before the step given its prediction: the state moves with a white noise.
@@ -92,9 +92,9 @@ class LinearFilter(AbstractSizedFilter):
         That no random gain and no draw of the past tells of, so that Rauch's recursion is the best linear one.
         """
         move = motion_of_plant(at(self.plant, step.k), jnp.asarray(step.u), second_moments_at_start(self.plant))
-        moved = move.matrix @ step.before.estimate.root, move.noise
+        moved = move.matrix @ step.before.gaussian.root, move.noise
         claim: Claim = self.claim if self.mean_known else "nominal"
-        return smoother_step_of(step.before, step.prior, step.after, moved, claim)
+        return smoother_step_of(step, moved, claim)
 
     @property
     def is_linear(self) -> bool:
@@ -115,8 +115,8 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     matrix, law = jnp.asarray(sensor.matrix), sensor.noise
     mean = matrix @ state.state_mean + law.mean
     second = matrix @ state.state_covariance @ matrix.T + law.covariance + jnp.outer(mean, mean)
-    slopes = matrix @ state.estimate.root
-    return Signal(state.estimate, mean, slopes, law.columns, symmetric(second), signal_size_at_start(sensor, start))
+    slopes = matrix @ state.gaussian.root
+    return Signal(state.gaussian, mean, slopes, law.columns, symmetric(second), signal_size_at_start(sensor, start))
 
 
 def correct_linear(
@@ -124,9 +124,9 @@ def correct_linear(
 ) -> tuple[LinearBelief, Innovation]:
     """Correct with the components of z that arrived: the signal's mean by the estimate, all else before any data."""
     before = signal_before_data(state, sensor, start)
-    now = before._replace(mean=jnp.asarray(sensor.matrix @ state.mean + sensor.noise.mean))
+    now = before._replace(mean=jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean))
     after, innovation = correct_signal(now, channel, rule, z, unknown=before)
-    return LinearBelief(*after, state.state_mean, state.state_covariance), innovation
+    return state._replace(gaussian=after), innovation
 
 
 @believes

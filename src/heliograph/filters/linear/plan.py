@@ -10,7 +10,7 @@ from heliograph.engine.choice import compute_once
 from heliograph.engine.limits import SHORT
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
@@ -131,7 +131,7 @@ def _stage(state: PlannedMean, stage: Step) -> jax.Array:
 def plan_filter(
     filter: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
 ) -> PlannedFilter:
-    """Run a filter over complete data and record its matrices; its state has a `mean` and a `covariance`.
+    """Run a filter over complete data and record its matrices; its state is a Gaussian, or holds one.
 
     Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
     `projection` (n, N) maps the filter's mean to the plant's states.
@@ -151,18 +151,18 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
         step, prior, after = plan_step(filter, state, quiet, row[1], row[0])
-        return after, (step, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
+        return after, (step, jnp.stack([_seen(prior, projection), _seen(after, projection)]))
 
     start = filter.init()
     start = jax.tree.map(jnp.asarray, start)
     _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
     # Covariances in the order of `PlannedMean.stage`.
     in_order = covariances.reshape(-1, *covariances.shape[2:])
-    by_stage = jnp.concatenate([_seen(start.covariance, projection)[None], in_order])
+    by_stage = jnp.concatenate([_seen(start, projection)[None], in_order])
     return PlannedFilter(
         steps=OverTime(steps),
         covariances=by_stage,
-        start=start.mean,
+        start=gaussian_of(start).mean,
         projection=projection,
         **make_sizes(filter.claim, filter, filter.received),
     )
@@ -176,18 +176,18 @@ def plan_step(
 ) -> tuple[LinearStep, PyTree, PyTree]:
     """Return matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
     # F and f: the prior mean is affine in the mean.
-    none = jnp.zeros_like(state.mean)
+    none = jnp.zeros_like(gaussian_of(state).mean)
 
     def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
-        prior = filter.predict(state._replace(mean=mean), u, k)
-        return jnp.asarray(prior.mean), prior
+        prior = filter.predict(_with_mean(state, mean), u, k)
+        return jnp.asarray(gaussian_of(prior).mean), prior
 
     transition, prior = jax.jacfwd(predict, has_aux=True)(none)
     # K and C: derivatives of posterior mean and innovation.
     (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, none, z, k)
     step = LinearStep(
         transition=transition,
-        drift=jnp.asarray(prior.mean),
+        drift=jnp.asarray(gaussian_of(prior).mean),
         gain=gain,
         output=-output,
         offset=-jnp.asarray(innovation.value),
@@ -196,14 +196,19 @@ def plan_step(
     return step, prior, after
 
 
+def _with_mean(state: PyTree, mean: jax.Array) -> PyTree:
+    """Return a filter's state with another mean."""
+    return with_gaussian(state, gaussian_of(state)._replace(mean=mean))
+
+
 def _correction_slopes(
     filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
     """Differentiate the corrected mean and the innovation by prior mean and z; return slopes and both themselves."""
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
-        after, innovation = filter.correct(prior._replace(mean=mean), z, k)
-        return (jnp.asarray(after.mean), jnp.asarray(innovation.value)), (after, innovation)
+        after, innovation = filter.correct(_with_mean(prior, mean), z, k)
+        return (jnp.asarray(gaussian_of(after).mean), jnp.asarray(innovation.value)), (after, innovation)
 
     (mean_slopes, innovation_slopes), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
     return mean_slopes, innovation_slopes, after, received
@@ -241,16 +246,18 @@ class Linearised(NamedTuple):
 def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
     """Linearise a filter's correction at its prediction, with its covariance held.
 
-    The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
+    The filter's state is a Gaussian, or holds one. S = Cov(innovation) - C P C', for its predicted P.
     """
     prior = filter.predict(state, u, k)
-    (_, gain), (output, _), _, innovation = _correction_slopes(filter, prior, jnp.asarray(prior.mean), z, k)
+    x = gaussian_of(prior)
+    (_, gain), (output, _), _, innovation = _correction_slopes(filter, prior, jnp.asarray(x.mean), z, k)
     present = ~jnp.isnan(z)
     output = jnp.where(present[:, None], -output, 0.0)
     total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
-    return Linearised(prior.mean, jnp.where(present, gain, 0.0), output, total - output @ prior.covariance @ output.T)
+    return Linearised(x.mean, jnp.where(present, gain, 0.0), output, total - output @ x.covariance @ output.T)
 
 
-def _seen(covariance: jax.Array, projection: Array | None) -> jax.Array:
+def _seen(state: PyTree, projection: Array | None) -> jax.Array:
     """Return the covariance of the plant's state, by the projection if there is one."""
+    covariance = jnp.asarray(gaussian_of(state).covariance)
     return covariance if projection is None else jnp.asarray(projection) @ covariance @ jnp.asarray(projection).T

@@ -168,8 +168,7 @@ class PolynomialFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the lifted system, about the mean."""
         z = monomials(_subtract_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
-        before, prior, after = (state.inner for state in step[:3])
-        inner = step._replace(before=before, prior=prior, after=after, z=z)
+        inner = step.map_states(lambda state: state.inner)._replace(z=z)
         return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:

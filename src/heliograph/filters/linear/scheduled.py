@@ -182,7 +182,7 @@ class LinearSystemFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of the system's state before the step given its prediction."""
         moved = at(self.steps, step.k).transition @ step.before.root, at(self.noises, step.k).process
-        return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=self.projection)
+        return smoother_step_of(step, moved, self.claim, projection=self.projection)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

@@ -11,7 +11,7 @@ products Gamma x E[x~ x~'], x~ = (x - c, 1) with c = E[x] before data.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,31 +53,18 @@ Laws = tuple[jax.Array, ...]  # of the modes of each term
 
 
 class AdditiveBelief(NamedTuple):
-    """Estimate of zeta, factors of its error's covariance, and before any data E[x~ x~'] and the laws of the modes.
+    """zeta given the data, and before any data E[x~ x~'] and the laws of the modes.
 
     centre c = E[x] before data. `moved` is true from the first prediction on.
 
-    Shapes: with N = (1 + functions) (n + 1): mean, variances (N,), lower (N (N - 1) / 2,), second (n + 1, n + 1),
-    centre (n,).
+    Shapes: zeta ((1 + functions) (n + 1),), second (n + 1, n + 1), centre (n,).
     """
 
-    mean: Float[jax.Array, " N"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " N"]
+    gaussian: Gaussian
     second: Float[jax.Array, "n1 n1"]
     laws: Laws
     centre: Float[jax.Array, " n"]
     moved: Bool[jax.Array, ""]
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """zeta given the data."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the error of zeta."""
-        return self.gaussian.covariance
 
 
 class AdditiveModalFilter(AbstractModalFilter):
@@ -105,7 +92,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         parts = [spread, *(jnp.kron(_indicator_covariance(law), second) for law in laws if len(law) > 1)]
         centre = jnp.asarray(start.initial_mean)
         mean = self._embed_first_block(jnp.append(centre, 1.0))
-        return AdditiveBelief(*from_covariance(mean, block_diag(*parts)), second, laws, centre, jnp.asarray(False))
+        return AdditiveBelief(from_covariance(mean, block_diag(*parts)), second, laws, centre, jnp.asarray(False))
 
     @predicts
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
@@ -113,14 +100,14 @@ class AdditiveModalFilter(AbstractModalFilter):
         move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
         rows = self._transition_matrices(state, k)
         # F zeta about the moving centre.
-        centred = state.mean - self._mean_from_centre(state.centre)
+        centred = state.gaussian.mean - self._mean_from_centre(state.centre)
         mean = predict_by_mode(centred[:, None], move, _function_transition(rows).T)[:, 0] + self._mean_from_centre(
             centre
         )
         root, fresh = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(Columns(root, state.variances), fresh))
+        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), fresh))
         second = move @ state.second @ move.T + noise
-        return AdditiveBelief(*after, second, _next_laws(state.laws, rows), centre, jnp.asarray(True))
+        return AdditiveBelief(after, second, _next_laws(state.laws, rows), centre, jnp.asarray(True))
 
     @corrects
     def correct(self, state: AdditiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdditiveBelief, Innovation]:
@@ -129,15 +116,15 @@ class AdditiveModalFilter(AbstractModalFilter):
         Cov(z - E[z | zeta]) = T(C~ E[x~ x~'] C~' + R~) + sum_ab Gamma_ab D_a R D_b' + Cov n, T the mean spread of the
         gains given the modes, D_0 = Hbar.
         """
-        output = self._measurement_model(state, k)
-        after, innovation = observe_modes(state.gaussian, state.mean - self._mean_from_centre(state.centre), output, z)
-        return state._replace(mean=after.mean, lower=after.lower, variances=after.variances), innovation
+        output, x = self._measurement_model(state, k), state.gaussian
+        after, innovation = observe_modes(x, x.mean - self._mean_from_centre(state.centre), output, z)
+        return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step given its prediction."""
         slopes, fresh = self._transition_factors(step.before, step.u, step.k)
         moved, projection = (slopes, triangularise(fresh)), self._projection_to_state()
-        return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
+        return smoother_step_of(step, moved, self.claim, projection=projection)
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
         """Return the matrix (n, N) that maps zeta to x."""

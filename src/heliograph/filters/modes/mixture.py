@@ -1,6 +1,6 @@
 """Filter for laws of finite support: every combination of gains and noises, then one Gaussian by moment matching."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -67,26 +67,11 @@ class AtomCombinations(Module):
 
 
 class MixtureBelief(NamedTuple):
-    """One Gaussian for the state, and the modes' probabilities.
+    """One Gaussian for the state (n,), and the modes' probabilities (M,). `moved`: from the first prediction on."""
 
-    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), law (M,). `moved` is true from the first prediction on.
-    """
-
-    mean: Float[jax.Array, " n"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " n"]
+    gaussian: Gaussian
     law: Float[jax.Array, " M"]
     moved: Bool[jax.Array, ""]
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """The state given the data."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the state."""
-        return self.gaussian.covariance
 
 
 class MixtureFilter(AbstractSizedFilter):
@@ -121,7 +106,7 @@ class MixtureFilter(AbstractSizedFilter):
         """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
-        return MixtureBelief(*prior, jnp.asarray(self.initial), jnp.asarray(False))
+        return MixtureBelief(prior, jnp.asarray(self.initial), jnp.asarray(False))
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
@@ -130,7 +115,7 @@ class MixtureFilter(AbstractSizedFilter):
         noise = process_noise(plant, u, second_moments_at_start(self.plant))
         moved = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
-        return MixtureBelief(*moved, law, jnp.asarray(True))
+        return MixtureBelief(moved, law, jnp.asarray(True))
 
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
@@ -155,22 +140,23 @@ class MixtureFilter(AbstractSizedFilter):
         total = jnp.where(present[:, None] & present, total, jnp.nan)
         innovation = mixed_innovation(prior, value, total, density)
         modes = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
-        updated = MixtureBelief(*merge_mixture(after, weight), modes, state.moved)
+        updated = MixtureBelief(merge_mixture(after, weight), modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @estimates
     def estimate(self, state: MixtureBelief) -> Estimate:
         """Return the mean and covariance of the belief, angles between -pi and pi."""
-        return Estimate(wrap_angles(state.mean, first(self.plant).angles), state.covariance, self.claim)
+        x = state.gaussian
+        return Estimate(wrap_angles(x.mean, first(self.plant).angles), x.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of the state before the step given its prediction."""
-        plant, u, (before, prior, after, *_) = at(self.plant, step.k), jnp.asarray(step.u), step
+        plant, u = at(self.plant, step.k), jnp.asarray(step.u)
         moved = (
-            plant.transition_matrix(u) @ before.gaussian.root,
+            plant.transition_matrix(u) @ step.before.gaussian.root,
             process_noise(plant, u, second_moments_at_start(self.plant)),
         )
-        return smoother_step_of(before, prior, after, moved, "nominal", plant.angles)
+        return smoother_step_of(step, moved, "nominal", plant.angles)
 
 
 def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:

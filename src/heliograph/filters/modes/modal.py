@@ -10,7 +10,7 @@ matrices.
 """
 
 from abc import abstractmethod
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -67,30 +67,18 @@ class ChannelByMode(Module):
 
 
 class ModalBelief(NamedTuple):
-    """Estimate of zeta, mode by mode, factors of its error's covariance, and E[x~ x~' 1{mode}] before any data.
+    """zeta, mode by mode, given the data, and E[x~ x~' 1{mode}] before any data.
 
     centre c = E[x] before data; P(mode) c is part of the mean, whose sum over the modes is that of x. `moved` is true
     from the first prediction on.
 
-    Shapes: with N = M (n + 1): mean, variances (N,), lower (N (N - 1) / 2,), moments (M, n + 1, n + 1), centre (n,).
+    Shapes: zeta (M (n + 1),), moments (M, n + 1, n + 1), centre (n,).
     """
 
-    mean: Float[jax.Array, " N"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " N"]
+    gaussian: Gaussian
     moments: Float[jax.Array, "M n1 n1"]
     centre: Float[jax.Array, " n"]
     moved: Bool[jax.Array, ""]
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """zeta given the data."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the error of zeta."""
-        return self.gaussian.covariance
 
     @property
     def law(self) -> jax.Array:
@@ -161,7 +149,7 @@ class ModalFilter(AbstractJointModalFilter):
         """Return the prior, independent of the mode."""
         law, (prior, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
         moments, centre = law[:, None, None] * second, jnp.asarray(at(self.plant, 0).initial_mean)
-        return ModalBelief(*prior, moments, centre, jnp.asarray(False))
+        return ModalBelief(prior, moments, centre, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
@@ -175,12 +163,12 @@ class ModalFilter(AbstractJointModalFilter):
         )
         law = state.law @ rows
         # F zeta about the moving centre.
-        centred = state.mean - mean_from_centre(state.law, state.centre)
+        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
         root, fresh = self._transition_factors(state, u, k)
-        after = from_columns(mean, join_columns(Columns(root, state.variances), fresh))
+        after = from_columns(mean, join_columns(Columns(root, state.gaussian.variances), fresh))
         moments = jnp.einsum("ij,iab->jab", rows, _propagate_moments(state, move)) + law[:, None, None] * noise
-        return ModalBelief(*after, moments, centre, jnp.asarray(True))
+        return ModalBelief(after, moments, centre, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
@@ -189,9 +177,9 @@ class ModalFilter(AbstractJointModalFilter):
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) (Hbar_j R~ Hbar_j' + Cov n_j), T_j the spread of
         the gains in mode j.
         """
-        centred = state.mean - mean_from_centre(state.law, state.centre)
+        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         after, innovation = observe_modes(state.gaussian, centred, self._measurement_model(state, k), z)
-        return ModalBelief(*after, *state[3:]), innovation
+        return state._replace(gaussian=after), innovation
 
     def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
         """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
@@ -221,7 +209,7 @@ class ModalFilter(AbstractJointModalFilter):
         """Return the law of zeta before the step given its prediction."""
         slopes, fresh = self._transition_factors(step.before, step.u, step.k)
         moved, projection = (slopes, triangularise(fresh)), self._projection_to_state()
-        return smoother_step_of(step.before, step.prior, step.after, moved, self.claim, projection=projection)
+        return smoother_step_of(step, moved, self.claim, projection=projection)
 
 
 def _propagate_moments(state: ModalBelief, move: jax.Array) -> jax.Array:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.update import Polytope
@@ -46,9 +47,9 @@ class ModeObservedBelief(NamedTuple):
     begun: Bool[jax.Array, ""]
 
     @property
-    def mean(self) -> Float[jax.Array, " n"]:
-        """Mean of the estimate."""
-        return self.belief.mean
+    def gaussian(self) -> Gaussian:
+        """The state given the data."""
+        return self.belief.gaussian
 
 
 class ModeObservedFilter(AbstractSizedFilter):
@@ -71,7 +72,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         """Return the belief before any data."""
         belief = prior_belief(at(self.plant, 0))
         nothing = jnp.full(first(self.channel).outputs, jnp.nan)
-        n = len(belief.mean)
+        n = len(belief.gaussian.mean)
         none = jnp.zeros((n, n))
         still = PlantMotion(jnp.eye(n), jnp.zeros(n), none, Columns(none, jnp.zeros(n)))
         return ModeObservedBelief(belief, belief, nothing, still, jnp.asarray(False))
@@ -120,7 +121,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: ModeObservedBelief) -> Estimate:
         """Return the mean and covariance of the estimate."""
-        return Estimate(state.belief.mean, state.belief.covariance, self.claim)
+        return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
 
 def _condition_channel(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:

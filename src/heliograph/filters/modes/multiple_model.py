@@ -121,30 +121,17 @@ def _check_random(channel: SideInformation) -> None:
 class ModalBeliefs(NamedTuple):
     """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
 
-    Shapes: mean, variances (M, n), lower (M, n (n - 1) / 2), weight (M, M). `moved` is true from the first prediction
-    on.
+    Shapes: the Gaussians (M, n), weight (M, M). `moved` is true from the first prediction on.
     """
 
-    mean: Float[jax.Array, "M n"]
-    lower: Float[jax.Array, "M entries"]
-    variances: Float[jax.Array, "M n"]
+    gaussian: Gaussian
     weight: Float[jax.Array, "M M"]
     moved: Bool[jax.Array, ""]
 
     @property
-    def parts(self) -> Gaussian:
-        """The components."""
-        return Gaussian(*self[:3])
-
-    @property
     def components(self) -> tuple[jax.Array, Gaussian]:
         """The mixture: probabilities (M,) of the components, and these."""
-        return jnp.sum(self.weight, axis=1), self.parts
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of each component."""
-        return self.parts.covariance
+        return jnp.sum(self.weight, axis=1), self.gaussian
 
 
 NODES = 3  # modes that stand for a gain that drifts
@@ -173,7 +160,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Return the prior in every component, and the initial law of the modes."""
         start = at(self.plant, 0)
         parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(self.initial))
-        return ModalBeliefs(*parts, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
+        return ModalBeliefs(parts, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
@@ -181,10 +168,10 @@ class MultipleModelFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         mixing, weight = self.merging.mixing_weights(state.weight, rows)
-        moved = mix_and_predict(plant, self.transform, state.parts, mixing, u, second_moments_at_start(self.plant))
+        moved = mix_and_predict(plant, self.transform, state.gaussian, mixing, u, second_moments_at_start(self.plant))
         parts: Gaussian = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(rows), leaf.shape[1])), moved)
         parts = parts._replace(mean=align_angles(plant, parts.mean, jnp.sum(weight, axis=1)))
-        return ModalBeliefs(*parts, weight, jnp.asarray(True))
+        return ModalBeliefs(parts, weight, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
@@ -192,28 +179,30 @@ class MultipleModelFilter(AbstractSizedFilter):
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         i, j = self.merging.update_pairs(len(self.initial))
         start = second_moments_at_start(self.plant)
-        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
+        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.gaussian)
         signal = jax.tree.map(lambda leaf: leaf[i], signals)
         after, weight, mixed = correct_in_every_mode(
             signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles
         )
         parts, law = self.merging.kept(after._replace(mean=align_angles(plant, after.mean, weight)), weight)
-        return ModalBeliefs(*parts, jnp.diag(law), state.moved), mixed
+        return ModalBeliefs(parts, jnp.diag(law), state.moved), mixed
 
     @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
         """Return the mean and covariance of the whole mixture, angles between -pi and pi."""
-        mean, covariance = moments_of_mixture(state.mean, state.covariance, jnp.sum(state.weight, axis=1))
+        weights, parts = state.components
+        mean, covariance = moments_of_mixture(parts.mean, parts.covariance, weights)
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return that of the whole mixture's moments around the update; modes are not smoothed."""
-        return smoother_step_by_transform(self, step, first(self.plant), _merge_mixture)
+        return smoother_step_by_transform(self, step.map_states(_merge_mixture), first(self.plant))
 
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:
     """Merge the mixture: mean and covariance of the state."""
-    return merge_mixture(state.parts, jnp.sum(state.weight, axis=1))
+    weights, parts = state.components
+    return merge_mixture(parts, weights)
 
 
 def replicate(x: T, count: int) -> T:

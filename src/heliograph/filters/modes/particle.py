@@ -1,6 +1,6 @@
 """Rao-Blackwellised particle filter: particles for the modes of links with memory, each with a Gaussian state."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -43,32 +43,19 @@ NODES = 9  # modes that stand for a gain that drifts: they cost no more than few
 class Particles(NamedTuple):
     """Gaussian, present mode and weight of each particle, and the key of the next random numbers.
 
-    Shapes: mean, variances (N, n), lower (N, n (n - 1) / 2), mode (N,), weight (N,), key (2,). `moved` is true from the
-    first prediction on.
+    Shapes: the Gaussians (N, n), mode (N,), weight (N,), key (2,). `moved` is true from the first prediction on.
     """
 
-    mean: Float[jax.Array, "N n"]
-    lower: Float[jax.Array, "N entries"]
-    variances: Float[jax.Array, "N n"]
+    gaussian: Gaussian
     mode: Int[jax.Array, " N"]
     weight: Float[jax.Array, " N"]
     key: Int[jax.Array, " 2"]
     moved: Bool[jax.Array, ""]
 
     @property
-    def parts(self) -> Gaussian:
-        """The Gaussian of each particle."""
-        return Gaussian(*self[:3])
-
-    @property
     def components(self) -> tuple[jax.Array, Gaussian]:
         """The mixture: weights (N,), and the Gaussian of each particle."""
-        return self.weight, self.parts
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of each particle."""
-        return self.parts.covariance
+        return self.weight, self.gaussian
 
 
 class ParticleFilter(AbstractSizedFilter):
@@ -97,7 +84,7 @@ class ParticleFilter(AbstractSizedFilter):
         start, n = at(self.plant, 0), self.particles
         parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
         mode = _invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
-        return Particles(*parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
+        return Particles(parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
 
     @predicts
     def predict(self, state: Particles, u: ArrayLike = (), k: Step = 0) -> Particles:
@@ -107,17 +94,17 @@ class ParticleFilter(AbstractSizedFilter):
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
         drawn = jax.vmap(_invert_distribution)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
         start = second_moments_at_start(self.plant)
-        parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.parts)
+        parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
         mode = jnp.where(state.moved, drawn, state.mode)
         parts = parts._replace(mean=align_angles(plant, parts.mean, state.weight))
-        return Particles(*parts, mode, state.weight, key, jnp.asarray(True))
+        return Particles(parts, mode, state.weight, key, jnp.asarray(True))
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         start = second_moments_at_start(self.plant)
-        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.parts)
+        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.gaussian)
         after, weight, mixed = correct_in_every_mode(
             signals, channel, state.mode, state.weight, z, self.observed_angles
         )
@@ -129,12 +116,12 @@ class ParticleFilter(AbstractSizedFilter):
         which = jnp.where(poor, chosen, jnp.arange(self.particles))
         weight = jnp.where(poor, 1 / self.particles, weight)
         kept: Gaussian = jax.tree.map(lambda leaf: leaf[which], after)
-        return Particles(*kept, state.mode[which], weight, key, state.moved), mixed
+        return Particles(kept, state.mode[which], weight, key, state.moved), mixed
 
     @estimates
     def estimate(self, state: Particles) -> Estimate:
         """Return the mean and covariance of the whole mixture, angles between -pi and pi."""
-        mean, covariance = moments_of_mixture(state.mean, state.covariance, state.weight)
+        mean, covariance = moments_of_mixture(state.gaussian.mean, state.gaussian.covariance, state.weight)
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
 

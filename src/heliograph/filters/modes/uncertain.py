@@ -5,7 +5,7 @@ Sigma- <= (1 + b) F Sigma F' + (1 + 1/b) D + W with D >= sum_i p_i Delta_i Delta
 Terms that depend on the law p of the modes are bounded over the interval of possible p.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,32 +42,20 @@ from heliograph.numerics.types import ArrayLike, Bool, Float
 
 
 class UncertainBelief(NamedTuple):
-    """Estimate of zeta, factors of a bound on its error's covariance, E[x~ x~'], and bounds on the modes' law.
+    """zeta given the data, with a bound as its covariance, E[x~ x~'], and bounds on the modes' law.
 
     x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`. `moved` is true from the first prediction on.
 
-    Shapes: mean, variances (N,), lower (N (N - 1) / 2,), second (n + 1, n + 1), centre (n,), law, low and high (M,).
+    Shapes: zeta (M (n + 1),), second (n + 1, n + 1), centre (n,), law, low and high (M,).
     """
 
-    mean: Float[jax.Array, " N"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " N"]
+    gaussian: Gaussian
     second: Float[jax.Array, "n1 n1"]
     centre: Float[jax.Array, " n"]
     law: Float[jax.Array, " M"]
     low: Float[jax.Array, " M"]
     high: Float[jax.Array, " M"]
     moved: Bool[jax.Array, ""]
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """zeta given the data, with the bound."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Bound on the covariance of the error of zeta."""
-        return self.gaussian.covariance
 
 
 class UncertainModalFilter(AbstractJointModalFilter):
@@ -81,7 +69,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         """Return the prior, independent of the mode, whose initial law is known."""
         law, (prior, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
         centre = jnp.asarray(at(self.plant, 0).initial_mean)
-        return UncertainBelief(*prior, second, centre, law, law, law, jnp.asarray(False))
+        return UncertainBelief(prior, second, centre, law, law, law, jnp.asarray(False))
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
@@ -94,7 +82,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         after = from_columns(mean, join_columns(Columns(root, (1 + young) * x.variances), fresh))
         # E[x~ x~'] and nominal law one step later.
         second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
-        return UncertainBelief(*after, second, centre, law, low, high, jnp.asarray(True))
+        return UncertainBelief(after, second, centre, law, low, high, jnp.asarray(True))
 
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
         """Chain of the modes and the radius of its entries; before the first prediction the mode stays as it is."""
@@ -116,8 +104,8 @@ class UncertainModalFilter(AbstractJointModalFilter):
             _bound_mean(matrices, *_middle_law(state.low, state.high)) for matrices in _bound_moves(rows, radius)
         )
         # Young's inequality, b = root(tr D / tr F Sigma F').
-        root = predict_by_mode(state.gaussian.root, move, rows)
-        young = jnp.sqrt(_divide_or_zero(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ state.variances)))
+        root, weights = predict_by_mode(state.gaussian.root, move, rows), state.gaussian.variances
+        young = jnp.sqrt(_divide_or_zero(jnp.trace(wandering) * jnp.trace(carried), jnp.sum(root**2 @ weights)))
         wide = chosen + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * wandering
         # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
         low, high = _bound_next_law(rows, radius, state.low, state.high)
@@ -135,17 +123,17 @@ class UncertainModalFilter(AbstractJointModalFilter):
         added = _bound_mean(random + gains @ noise @ gains.swapaxes(1, 2), *_middle_law(state.low, state.high))
         matrix, common = subtract_mean_output(gains @ measure, state.law)
         rounding = rounding_of_received(gains, state.law[:, None, None] * second)
-        centred = state.mean - mean_from_centre(state.law, state.centre)
+        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         output = MeasurementModel(concatenate_modes(matrix), common, join_columns(rounding, factor_spread(added)))
         after, innovation = observe_modes(state.gaussian, centred, output, z)
-        return UncertainBelief(*after, *state[3:]), innovation
+        return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the law of zeta before the step; the filter's bound is not proved for smoothed estimates."""
         slopes, young, fresh = self._transition_factors(step.before, step.u, step.k)
-        noise = triangularise(join_columns(Columns(slopes, young * step.before.variances), fresh))
+        noise = triangularise(join_columns(Columns(slopes, young * step.before.gaussian.variances), fresh))
         moved, projection = (slopes, noise), self._projection_to_state()
-        return smoother_step_of(step.before, step.prior, step.after, moved, "nominal", projection=projection)
+        return smoother_step_of(step, moved, "nominal", projection=projection)
 
 
 def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:

@@ -1,7 +1,7 @@
 """Filter of a plant and its nodes' clocks that estimates a clock only while the data make it observable."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -44,28 +44,16 @@ RANK = 1e-12  # of the largest eigenvalue: directions below are unobservable
 
 
 class ClockBelief(NamedTuple):
-    """Joint mean and factors of plant and clocks, the last input, and which clocks the last data made observable.
+    """Plant and clocks given the data, the last input, and which clocks the last data made observable.
 
-    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), inputs (inputs,), silence (received,), observed (clocks,).
+    Shapes: plant and clocks (n,), inputs (inputs,), silence (received,), observed (clocks,).
     `silence` counts the steps since each component of z last arrived.
     """
 
-    mean: Float[jax.Array, " n"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " n"]
+    gaussian: Gaussian
     inputs: Float[jax.Array, " inputs"]
     silence: Int[jax.Array, " received"]
     observed: Bool[jax.Array, " clocks"]
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """Plant and clocks given the data."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of plant and clocks."""
-        return self.gaussian.covariance
 
 
 class ClockFilter(AbstractSizedFilter):
@@ -100,13 +88,13 @@ class ClockFilter(AbstractSizedFilter):
         start = self.base.init()
         silence = jnp.full(self.received, len(self.states))
         none = jnp.zeros(len(self.offsets), dtype=bool)
-        return ClockBelief(*start, jnp.zeros(len(self.inputs)), silence, none)
+        return ClockBelief(start, jnp.zeros(len(self.inputs)), silence, none)
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
         """Predict plant and clocks over step k."""
         moved = self.base.predict(state.gaussian, u, k)
-        return ClockBelief(*moved, jnp.asarray(u, dtype=float), state.silence + 1, state.observed)
+        return ClockBelief(moved, jnp.asarray(u, dtype=float), state.silence + 1, state.observed)
 
     @corrects
     def correct(self, state: ClockBelief, z: ArrayLike, k: Step = 0) -> tuple[ClockBelief, Innovation]:
@@ -128,7 +116,7 @@ class ClockFilter(AbstractSizedFilter):
         gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
         gain = gain * self._mask_estimated(observed)[:, None]
         after = _correct_by_gain(signal, channel, gain, jnp.where(present, z - expected, 0.0))
-        belief = ClockBelief(*after, state.inputs, silence, observed)
+        belief = ClockBelief(after, state.inputs, silence, observed)
         return belief, gaussian_innovation(z, expected, total)
 
     def _mask_estimated(self, observed: jax.Array) -> jax.Array:
@@ -141,11 +129,11 @@ class ClockFilter(AbstractSizedFilter):
     def _test_observable(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
         """Test whether each clock is observable: dy/dt is significant, and its derivatives are linearly independent."""
         slope = jax.jacfwd(observe)
-        rate, curve = slope(state.mean), jax.jacfwd(slope)(state.mean)
+        rate, curve = slope(state.gaussian.mean), jax.jacfwd(slope)(state.gaussian.mean)
         seen = self._independent_shares(state, observe, k)
         observable = []
         for i, offset in enumerate(self.offsets):
-            variance = jnp.einsum("ri,ij,rj->r", curve[:, offset], state.covariance, curve[:, offset])
+            variance = jnp.einsum("ri,ij,rj->r", curve[:, offset], state.gaussian.covariance, curve[:, offset])
             moves = jnp.any(rate[:, offset] ** 2 > SIGNIFICANT * variance)
             observable.append(moves & (seen[i] > SHARE))
         return jnp.stack(observable)
@@ -162,13 +150,14 @@ class ClockFilter(AbstractSizedFilter):
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
             return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
 
-        _, squares = jax.lax.scan(add_derivative, (state.mean, jnp.eye(n)), None, length=n)
+        _, squares = jax.lax.scan(add_derivative, (state.gaussian.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
     @estimates
     def estimate(self, state: ClockBelief) -> Estimate:
         """Return the mean and covariance of the belief, angles between -pi and pi."""
-        return Estimate(wrap_angles(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
+        x = state.gaussian
+        return Estimate(wrap_angles(x.mean, first(self.base.plant).angles), x.covariance, self.claim)
 
 
 def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:

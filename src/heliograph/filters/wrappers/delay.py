@@ -154,7 +154,7 @@ def _receive_at(state: LinearBelief, link: SecondOrder, start: int, length: int,
     """Receive r = G l + n and put it at `position`; l is the line of `length` from `start` on."""
     # x+ = matrix x + shift: the received signal replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
-    total, m = len(state.mean), len(offset)
+    total, m = len(state.gaussian.mean), len(offset)
     line, place = slice(start, start + length), slice(position, position + m)
     matrix = jnp.eye(total).at[place, :].set(0.0).at[place, line].set(gain)
     shift = jnp.zeros(total).at[place].set(offset)

@@ -1,6 +1,6 @@
 """Filters whose prediction is used: as the estimate, or fed back to the sensor, which subtracts it to save power."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -98,25 +98,10 @@ def prediction_of(filter: AbstractFilter) -> PredictionFilter:
 
 
 class FedBackBelief(NamedTuple):
-    """Mean (n,) and factors of the state, and the reference (m,) that the sensor subtracts from y.
+    """The state (n,) given the data, and the reference (m,) that the sensor subtracts from y."""
 
-    Shapes: mean, variances (n,), lower (n (n - 1) / 2,), reference (m,).
-    """
-
-    mean: Float[jax.Array, " n"]
-    lower: Float[jax.Array, " entries"]
-    variances: Float[jax.Array, " n"]
+    gaussian: Gaussian
     reference: Float[jax.Array, " m"]
-
-    @property
-    def gaussian(self) -> Gaussian:
-        """The state given the data."""
-        return Gaussian(*self[:3])
-
-    @property
-    def covariance(self) -> Any:
-        """Covariance of the state."""
-        return self.gaussian.covariance
 
 
 class FedBackFilter(AbstractSizedFilter):
@@ -142,13 +127,13 @@ class FedBackFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> FedBackBelief:
         """Return the belief before any data."""
-        return FedBackBelief(*self.base.init(), jnp.zeros(len(first(self.base.sensor).outputs)))
+        return FedBackBelief(self.base.init(), jnp.zeros(len(first(self.base.sensor).outputs)))
 
     @predicts
     def predict(self, state: FedBackBelief, u: ArrayLike = (), k: Step = 0) -> FedBackBelief:
         """Return the mean and covariance of f(x, u) + w, and the reference that the sensor will subtract."""
         moved = self.base.predict(state.gaussian, u, k)
-        return FedBackBelief(*moved, self.reference(state.mean, jnp.asarray(u), k))
+        return FedBackBelief(moved, self.reference(state.gaussian.mean, jnp.asarray(u), k))
 
     @corrects
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
@@ -164,12 +149,12 @@ class FedBackFilter(AbstractSizedFilter):
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
         after, innovation = correct_signal(sent, at(base.channel, k), base.rule, jnp.asarray(z))
-        return FedBackBelief(*after, state.reference), innovation
+        return FedBackBelief(after, state.reference), innovation
 
     @estimates
     def estimate(self, state: FedBackBelief) -> Estimate:
         """Return the mean and covariance of the belief."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
 
 @believes

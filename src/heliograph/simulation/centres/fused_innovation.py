@@ -12,6 +12,7 @@ from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.gaussian.adaptive import AdaptiveBelief
 from heliograph.filters.linear.belief import LinearBelief
 from heliograph.filters.plausibility import innovation_distance
+from heliograph.filters.smoother_step import gaussian_of, with_gaussian
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
@@ -72,15 +73,15 @@ class FusedInnovation(Module):
             # Prediction from the fused estimate, by the first node's model of the plant.
             if carry is None:
                 head, state = jax.tree.map(lambda a: a[0], (numbers, beliefs))
-                start = eqx.combine(head, static).predict(_replace_estimate(state, before), u, k)
-                carry = _gaussian(start), jnp.zeros(()), jnp.zeros(())
+                start = eqx.combine(head, static).predict(with_gaussian(state, before), u, k)
+                carry = gaussian_of(start), jnp.zeros(()), jnp.zeros(())
 
             def correct(carry: PyTree, row: PyTree, static: PyTree = static) -> tuple[PyTree, None]:
                 x, distance, arrived = carry
                 numbers, prior, z_i = row
-                after, innovation = eqx.combine(numbers, static).correct(_replace_estimate(prior, x), z_i, k)
+                after, innovation = eqx.combine(numbers, static).correct(with_gaussian(prior, x), z_i, k)
                 more, count = innovation_distance(innovation)
-                return (_gaussian(after), distance + more, arrived + count), None
+                return (gaussian_of(after), distance + more, arrived + count), None
 
             # What else a filter's state holds, predicted; then correction by node after node.
             predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
@@ -89,14 +90,6 @@ class FusedInnovation(Module):
         assert carry is not None  # there is at least one node
         _, distance, arrived = carry
         return FusedDistance(jnp.where(arrived > 0, distance, jnp.nan), arrived)
-
-
-def _replace_estimate(state: PyTree, x: Gaussian) -> PyTree:
-    return state._replace(**x._asdict())
-
-
-def _gaussian(state: PyTree) -> Gaussian:
-    return Gaussian(state.mean, state.lower, state.variances)
 
 
 def following_prior(estimate: Estimate) -> Gaussian:
@@ -122,6 +115,6 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
             sources, _ = sources_of(network, places, network.nodes_with(fusion.filter), fusion.filter)
             beliefs = [eqx.filter_eval_shape(alike[kind].init) for kind, _ in sources]
-            if all(isinstance(b, WHOLE) and b.mean.shape[-1] == len(network.states) for b in beliefs):
+            if all(isinstance(b, WHOLE) and gaussian_of(b).mean.shape[-1] == len(network.states) for b in beliefs):
                 tests[name] = FusedInnovation(start, sources)
     return tests

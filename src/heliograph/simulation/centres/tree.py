@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.smoother_step import gaussian_of
 from heliograph.fusion.cross_covariance import ErrorSources, initial_factors
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights
@@ -146,7 +147,7 @@ def _propagate_leaves(
     # Errors by their sources, over the horizon.
     state = alike.init()
     n = len(first(plant).states)
-    begin = initial_factors(centre.init([state.mean]).errors, n * len(u))
+    begin = initial_factors(centre.init([gaussian_of(state).mean]).errors, n * len(u))
     factors = centre.factors(
         (state, begin),
         lambda states, u_k, k: alike.matrices(centre.read, states, 0, quiet, u_k, k),
