@@ -32,7 +32,7 @@ def command() -> None:
     try:
         code = make_room(main)()
     except BaseException as error:
-        code = _code_of(error)
+        code = _find_exit_code(error)
     for number in (signal.SIGINT, signal.SIGTERM):  # all is done
         signal.signal(number, signal.SIG_IGN)
     if code <= SIGNALLED:  # what was interrupted may still be used by other threads
@@ -43,7 +43,7 @@ def command() -> None:
     os._exit(code)
 
 
-def _code_of(error: BaseException) -> int:
+def _find_exit_code(error: BaseException) -> int:
     """Return the exit code of an exception, as the interpreter does: traces of errors are written to stderr."""
     if isinstance(error, SystemExit) and (error.code is None or isinstance(error.code, int)):
         return error.code or 0

@@ -18,9 +18,9 @@ def trouble(tmp_path, monkeypatch):
     """A file that makes the settings with gain 0.7 fail, in the way that is written in it."""
     path = tmp_path / "trouble"
     monkeypatch.setenv("TROUBLE", str(path))
-    work._network.cache_clear()
+    work._build_network.cache_clear()
     yield path
-    work._network.cache_clear()
+    work._build_network.cache_clear()
 
 
 def fail_chunk(monkeypatch, times: int) -> list[tuple[int, int]]:

@@ -212,15 +212,15 @@ def _submit_jobs(
             jobs[future] = job
             flying.add(future)
         # Wait for any job; without one for too long, give all up.
-        future = _next(client, flying, timeout)
+        future = _wait_for_next(client, flying, timeout)
         if future is None:
             client.cancel(list(jobs))
             yield from ((job, _too_late(timeout)) for job in jobs.values())
             return
-        yield jobs.pop(future), _result(future)
+        yield jobs.pop(future), _read_reply(future)
 
 
-def _next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
+def _wait_for_next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
     """Wait for the next job that is done; None after `timeout` seconds without one."""
     waited = 0.0
     while not flying.has_ready():
@@ -244,7 +244,8 @@ def _line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _result(future: Untyped) -> Reply:
+def _read_reply(future: Untyped) -> Reply:
+    """Return the reply of a job that is done, or one that says why it has none."""
     if future.status == "finished":
         reply: Reply = future.result()
         return reply

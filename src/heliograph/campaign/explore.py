@@ -58,14 +58,14 @@ def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Seq
     results: list[Detail] = []
     for setting in settings:
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
-        parts = [_sums(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
+        parts = [_sum_errors(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
         if parts:
             sums = [np.sum(totals, axis=0) for totals in zip(*parts, strict=True)]
             results += _compute_details(setting, labels, claims[setting], [0, *steps], sums)
     return results
 
 
-def _sums(
+def _sum_errors(
     group: zarr.Group, setting: int, runs: slice, claims: np.ndarray, steps: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Count finite runs (node, filter); sum squared errors, claimed variances and their ratios, and the squares."""
@@ -164,7 +164,7 @@ def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None 
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
     )
-    return explore_html(page, _tables(campaign, shown, look))
+    return explore_html(page, _make_tables(campaign, shown, look))
 
 
 MEANING = (
@@ -198,7 +198,7 @@ def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
     return shown
 
 
-def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[Explored]:
+def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[Explored]:
     """Return scores over all steps, of single states too if there are several; then of single states over time."""
     scored = [
         Detail(s.setting, s.node, s.filter, s.claim, ALL, 0, s.rmse, s.rmse_error, math.nan, s.nees_per_dimension,
@@ -218,7 +218,7 @@ def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> l
 
 def _table_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     """Make the table of the page that shows each filter's scores over all steps, and how to draw it at first."""
-    columns, parameters = _columns(campaign, rows, SCORED), list(campaign.parameters)
+    columns, parameters = _make_columns(campaign, rows, SCORED), list(campaign.parameters)
     x = _axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")
     whole = {"setting", "node", "filter", x, panel, *(parameters if x == "setting" else ())} - {""}
@@ -231,7 +231,7 @@ def _table_scores(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
 def _table_steps(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     """Make the table of the page that shows scores step by step, and how to draw it at first."""
     steps = {"time": [row.step for row in rows]}
-    columns = steps | _columns(campaign, rows, OVER_TIME)
+    columns = steps | _make_columns(campaign, rows, OVER_TIME)
     dimensions = ["time", "setting", *campaign.parameters, *NAMES]
     whole = ["filter", "setting", "state", "time"]
     return Explored(
@@ -239,7 +239,8 @@ def _table_steps(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
     )
 
 
-def _columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[str]) -> dict[str, list[Value]]:
+def _make_columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[str]) -> dict[str, list[Value]]:
+    """Return columns of the settings' numbers, parameters and names, and of these quantities, row by row."""
     parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {
         "setting": [row.setting for row in rows],

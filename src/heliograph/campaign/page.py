@@ -47,7 +47,7 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
         f"{there} of {len(campaign.settings) * campaign.runs} runs are there. {_describe_failures(failures)} A case "
         "is a node in a setting.",
         sections=[
-            *([_failures(failures)] if failures else []),
+            *([_list_failures(failures)] if failures else []),
             Section("Results", pictures(campaign, scores)),
             Section("All scores", [score_table(campaign, scores)]),
             _explain_reading(campaign),
@@ -78,7 +78,8 @@ def _describe_failures(failures: Sequence[Failure]) -> str:
     return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
 
 
-def _failures(failures: Sequence[Failure]) -> Section:
+def _list_failures(failures: Sequence[Failure]) -> Section:
+    """Return the section that lists the jobs that failed, with their errors."""
     points = [
         f"setting {failure.setting} {failure.parameters}, runs {failure.runs[0]} to {failure.runs[1]}: {failure.error}"
         for failure in failures[:REPORTED]

@@ -45,7 +45,7 @@ def load_campaign(path: str | Path) -> Campaign:
     except UnicodeDecodeError as error:
         raise fail(f"campaign {path}", "a TOML file in UTF-8", str(error)) from None
     table = _parse(text, path.name)
-    file = path.parent / _network(table, path.name).rpartition(":")[0]
+    file = path.parent / _read_network(table, path.name).rpartition(":")[0]
     if not file.is_file():
         raise fail(f"{path.name}, network", f"a Python file in {path.parent}", f"{file.name}: nothing of that name")
     campaign = read_campaign(text, file.read_text(encoding="utf-8"), path)
@@ -71,7 +71,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
     # Each reader checks its key and raises one line.
     return Campaign(
         text=text,
-        network=_network(table, name),
+        network=_read_network(table, name),
         source=source,
         path=str(path.absolute()),
         horizon=horizon,
@@ -93,7 +93,8 @@ def _parse(text: str, name: str) -> dict[str, object]:
         raise fail(f"campaign {name}", "TOML", str(error)) from None
 
 
-def _network(table: Mapping[str, object], name: str) -> str:
+def _read_network(table: Mapping[str, object], name: str) -> str:
+    """Return the name of the function that makes the network, as FILE:FUNCTION."""
     value = table.get("network")
     file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     if not file.endswith(".py") or not function.isidentifier():
@@ -151,7 +152,7 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     """Return the settings of a campaign's file, from [grid] or [[settings]]; names free in the store, no two equal."""
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
-    settings = _grid(table["grid"], name) if "grid" in table else _list_settings(table["settings"], name)
+    settings = _expand_grid(table["grid"], name) if "grid" in table else _list_settings(table["settings"], name)
     taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
     # Parameters become coordinates of the store: their names must be free there, their values plain.
     for i, setting in enumerate(settings):
@@ -170,7 +171,8 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     return settings
 
 
-def _grid(grid: object, name: str) -> list[Setting]:
+def _expand_grid(grid: object, name: str) -> list[Setting]:
+    """Return every combination of the values of [grid]."""
     if not isinstance(grid, dict) or not grid:
         raise fail(f"{name}, grid", "a table of lists of values by parameter", _show_value(grid))
     for key, values in grid.items():

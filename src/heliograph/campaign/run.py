@@ -126,7 +126,7 @@ def _compute_missing(
         count = _count(workers, len(missing) or 1)
         with start_engine(campaign.as_json(), store, count, scheduler, campaign.timeout) as engine:
             (out / SUMMARY).unlink(missing_ok=True)  # it would not hold for what follows
-            failed = _compute(engine, campaign, store, missing, already, progress)
+            failed = _compute_settings(engine, campaign, store, missing, already, progress)
     remove_partial(store)
     # Reports are written again after every call.
     failures = [failure(campaign, out, job, reply) for job, reply in failed.items()]
@@ -136,7 +136,7 @@ def _compute_missing(
     return CampaignRun(out, already, len(missing) - lacking, failures, damaged)
 
 
-def _compute(
+def _compute_settings(
     engine: Engine,
     campaign: Campaign,
     store: Path,
@@ -145,11 +145,11 @@ def _compute(
     progress: Progress,
 ) -> dict[Job, Reply]:
     """Describe new settings, then compute the chunks of those that can be built; return failures, in order."""
-    failed = _describe(engine, campaign, store, {job.setting for job in missing}, progress)
+    failed = _make_store(engine, campaign, store, {job.setting for job in missing}, progress)
     possible = [job for job in missing if Job(job.setting) not in failed]
     total = already + len(missing)
     progress("simulating", already, total)
-    failed |= _try(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
+    failed |= _try_jobs(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
     return dict(sorted(failed.items(), key=lambda failure: (failure[0].setting, failure[0].chunk or 0)))
 
 
@@ -173,7 +173,7 @@ def _count(workers: int | None, jobs: int) -> int:
     return min(check_count("workers", workers, 0), jobs)
 
 
-def _describe(
+def _make_store(
     engine: Engine, campaign: Campaign, store: Path, settings: set[int], progress: Progress
 ) -> dict[Job, Reply]:
     """Make the store if needed, and write missing claims; return the settings that cannot be built."""
@@ -190,7 +190,7 @@ def _describe(
         results[job.setting] = value
         progress("building", done, len(jobs))
 
-    failed = _try(engine, jobs, accept)
+    failed = _try_jobs(engine, jobs, accept)
     if new and not results:
         first = next(iter(failed.values()))
         raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
@@ -204,7 +204,7 @@ def _describe(
     return failed
 
 
-def _try(
+def _try_jobs(
     engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, Description | None, int], None]
 ) -> dict[Job, Reply]:
     """Do jobs, repeat failed ones, call accept(job, value, number done) for the others; return the last failures."""

@@ -59,7 +59,7 @@ def perform(campaign: str, store: str, setting: int, chunk: int | None) -> Reply
     try:
         plan = parse_campaign(campaign)
         _check_versions(plan)
-        network = _network(campaign, setting)
+        network = _build_network(campaign, setting)
         if chunk is None:
             return Reply(describe(network))
         compute(plan, network, plan.chunks(setting)[chunk], Path(store))
@@ -89,7 +89,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
         campaign.chunk,
         first_run=chunk.start,
     )
-    arrays = _arrays(recorded, labels)
+    arrays = _arrange_results(recorded, labels)
     write_chunk(store, chunk, {name: values[: chunk.stop - chunk.start] for name, values in arrays.items()})
 
 
@@ -110,7 +110,8 @@ def _check_versions(campaign: Campaign) -> None:
 
 
 @lru_cache(maxsize=4)
-def _network(campaign: str, setting: int) -> Network:
+def _build_network(campaign: str, setting: int) -> Network:
+    """Return the network of a setting, built once and kept for the setting's chunks."""
     plan = parse_campaign(campaign)
     network = plan.function()(**plan.settings[setting])
     network.check_horizon(plan.horizon)
@@ -132,7 +133,7 @@ def _bound_memory(network: Network) -> None:
     _seen.append(network)
 
 
-def _arrays(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
+def _arrange_results(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
     """Arrange the reducer's results on the axes of the store, (run, time, ...); NaN where a node lacks a filter."""
     estimates = recorded["estimates"]
     # Shapes are those of any filter; all have the same states.

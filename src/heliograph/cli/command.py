@@ -73,7 +73,7 @@ def _run_command(arguments: Sequence[str] | None) -> int:
     # Parse and run; what a user can mend becomes one line on stderr.
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
-        with _plain_warnings():
+        with _print_plain_warnings():
             code: int | None = command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
         return code or 0
@@ -99,7 +99,7 @@ def _run_command(arguments: Sequence[str] | None) -> int:
 
 
 @contextmanager
-def _plain_warnings() -> Iterator[None]:
+def _print_plain_warnings() -> Iterator[None]:
     """Print warnings to users as lines of the command, without the place in the source that gave them."""
     with warnings.catch_warnings():
         of_python = warnings.showwarning

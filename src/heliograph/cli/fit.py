@@ -99,7 +99,7 @@ def learn(
     if has_deciding_sender(start):
         again = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
         raise fail("network to be learned", f"no trigger of a node (in Python {again} learns it)", "one with a trigger")
-    data = _data(measurements, network, start, advance, truth, reading)
+    data = _read_data(measurements, network, start, advance, truth, reading)
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
@@ -112,12 +112,12 @@ def learn(
     judged = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, cut) if cut < rows else []) or []
     uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, judged, z, u, cut) if judged else []) or []
     advance("looking at losses")
-    lossy = {name: fate for name, fate in _fates(start, recording).items() if any(0 < f.mean() < 1 for f in fate)}
+    lossy = {name: fate for name, fate in _find_fates(start, recording).items() if any(0 < f.mean() < 1 for f in fate)}
     losses = stop.unless_stopped(lambda: {name: learn_losses(fate) for name, fate in lossy.items()}) or {}
     return Learned(network, str(measurements), fitted, cut, rows - cut, judged, uniform, losses)
 
 
-def _fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
+def _find_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
     """Return the fates of each node's messages; of one that is not due in each row, of those that were due.
 
     None of a node that nobody knows to be due: where rows are messages, of one without a rate of its own.
@@ -137,7 +137,7 @@ def _fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
     return fates
 
 
-def _data(
+def _read_data(
     measurements: Path, reference: str, network: "Network", advance: "Advance", truth: bool, reading: ReadingOptions
 ) -> Measured:
     """Read rows of a table, or messages, which are rows in the order of measuring; say what was left out."""
@@ -197,11 +197,11 @@ def results(learned: "Learned", out: Path, network: str) -> "Results":
     def write(folder: Path) -> None:
         write_fitted(content, network, learned.measurements, folder, out)
 
-    summary = {**content, "held_out_rows": learned.held_out, **_judgement(learned)}
+    summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison(learned)}
     return Results(fit_figures(learned), pages(learned), summary, write)
 
 
-def _judgement(learned: "Learned") -> "dict[str, Json]":
+def _convert_comparison(learned: "Learned") -> "dict[str, Json]":
     """Return filters before and after, and losses, for JSON."""
     # Each filter: gain of the log-likelihood per row, size and whiteness of its innovations.
     filters: list[Json] = [

@@ -39,7 +39,7 @@ def inspect(
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
     # What there is, and what to paste.
-    topics, broken = _topics(recording, seconds)
+    topics, broken = _collect_topics(recording, seconds)
     _print_table(topics)
     if topics:
         print(suggestion(topics, names))
@@ -47,7 +47,7 @@ def inspect(
         print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)
 
 
-def _topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
+def _collect_topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
     """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
     from heliograph.files.inspection import inspect_bag, inspect_file
     from heliograph.files.message_files import LINES

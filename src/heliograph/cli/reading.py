@@ -89,7 +89,7 @@ def read_measured(
     if events is None:
         if options.of_messages:
             raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
-        return [_rows(path, network, options)]
+        return [_read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]
     measured = [_convert_events(events.of(plant), plant, options) for plant in wanted]
     # What was read is said once.
@@ -138,7 +138,8 @@ def read_events(
     return read_messages(path, network, sources, progress, options.strict, options.ignore_unknown)
 
 
-def _rows(path: Path, network: "Network", options: ReadingOptions) -> Measured:
+def _read_rows(path: Path, network: "Network", options: ReadingOptions) -> Measured:
+    """Return the rows of a table as the measured data of its only plant."""
     from heliograph.files.recording import read_recording
 
     with warnings.catch_warnings(record=True) as doubts:

@@ -88,10 +88,10 @@ def run(
             place = out and _place(out, data.plant, len(measured) > 1)
             written = _select_rows(record, data.rows)
             lines = [*_describe_doubted(loaded, record), *data.summary]
-            future = _forecast(record, ahead, lines)
+            future = _make_forecasts(record, ahead, lines)
             if place is not None:
                 advance(f"writing {place}")
-                write = _writer(data.events, module)
+                write = _choose_writer(data.events, module)
                 _write_rows(write, written, future, place)
                 lines += _write_lagged(loaded, data, lag, options, place, write)
             done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines, future))
@@ -100,7 +100,7 @@ def run(
         plants = {data.plant: (record, data.recording, future) for data, record, *_, future in done}
         _write_report(network, loaded, plants, report)
     for _, _, written, place, doubts, lines, _ in done:
-        _print_lines(list(dict.fromkeys(doubts)), [*_write_results(written, place, report), *lines])
+        _print_lines(list(dict.fromkeys(doubts)), [*_describe_results(written, place, report), *lines])
 
 
 def _parse_smoothing(word: str) -> "AbstractSmoothing | None":
@@ -155,7 +155,7 @@ def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
     )
 
 
-def _forecast(record: "Record", ahead: "Horizons | None", lines: list[str]) -> "ByFilter":
+def _make_forecasts(record: "Record", ahead: "Horizons | None", lines: list[str]) -> "ByFilter":
     """Forecast each estimate from the last row, and add a line on how far and with which inputs; {} unless asked."""
     if ahead is None:
         return {}
@@ -224,7 +224,7 @@ def _check_options(
     _check_places(measurements, out, report)
 
 
-def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Write":
+def _choose_writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Write":
     """Return the function that writes estimates: to a table, or to MCAP with the pose that the network's file names."""
     from heliograph.files.bags.output import write_bag
     from heliograph.files.recording import write_estimates
@@ -250,7 +250,7 @@ def _filter_rows(
     return record, [str(doubt.message) for doubt in doubts]
 
 
-def _write_results(record: "Record", out: Path | None, report: Path | None) -> list[str]:
+def _describe_results(record: "Record", out: Path | None, report: Path | None) -> list[str]:
     """Describe what was written where in a line, and the errors of each filter."""
     filters = [
         f"{node}/{name} ({_claim(estimate)})"
@@ -258,10 +258,10 @@ def _write_results(record: "Record", out: Path | None, report: Path | None) -> l
         for name, estimate in estimates.items()
     ]
     places = " and ".join(str(path) for path in (out, report and report / "report.html") if path is not None)
-    return [f"{places}: {len(record.time)} rows of {', '.join(filters)}", *_errors(record)]
+    return [f"{places}: {len(record.time)} rows of {', '.join(filters)}", *_describe_errors(record)]
 
 
-def _errors(record: "Record") -> list[str]:
+def _describe_errors(record: "Record") -> list[str]:
     """Compare each filter with the truth, a line each: RMSE by state, and NEES, which is 1 where the claim holds."""
     from heliograph.report.outputs import errors_of, round_to
 

@@ -152,11 +152,11 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
 def _clear(path: Path) -> None:
     """Remove temporary files of processes that no longer run."""
     for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
-        if not _lives(left.name.split(".")[-2]):
+        if not _is_running(left.name.split(".")[-2]):
             left.unlink(missing_ok=True)
 
 
-def _lives(process: str) -> bool:
+def _is_running(process: str) -> bool:
     """Return whether a process of this number runs; True where that is unknown."""
     try:
         os.kill(int(process), 0)

@@ -135,14 +135,14 @@ def cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> 
         folder, name = Path(temporary), source.stem
         for path in (header, source):
             shutil.copy(path, folder)
-        (folder / "main.c").write_text(_timer(name, received, inputs, real), encoding="utf-8")
+        (folder / "main.c").write_text(_write_timer(name, received, inputs, real), encoding="utf-8")
         _run(compiler, *FLAGS, "-c", source.name, "-o", "step.o", folder=folder)
         timer = ["-D_POSIX_C_SOURCE=199309L", *FLAGS, "main.c", "step.o", "-lm", "-o", "timer"]
         _run(compiler, *timer, folder=folder)
-        return Cost(_code_bytes(folder), float(_run(str(folder / "timer"), folder=folder)))
+        return Cost(_measure_code(folder), float(_run(str(folder / "timer"), folder=folder)))
 
 
-def _code_bytes(folder: Path) -> int | None:
+def _measure_code(folder: Path) -> int | None:
     """Return the bytes of text and constants of the object file, without debugging data."""
     if shutil.which("size") is None:
         return None
@@ -154,7 +154,7 @@ def _run(*command: str, folder: Path) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
-def _timer(name: str, received: int, inputs: int, real: Real) -> str:
+def _write_timer(name: str, received: int, inputs: int, real: Real) -> str:
     """Return a program that prints the time of a step. After a refusal (the end of a horizon) it starts again."""
     return f"""#include <stdio.h>
 #include <time.h>

@@ -83,7 +83,7 @@ def step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram
     named += [Member("estimate_mean", np.asarray(estimate.mean))]
     named += [Member("estimate_covariance", np.asarray(estimate.covariance))]
     try:
-        symmetric = _symmetric(step, examples)
+        symmetric = _find_symmetric(step, examples)
         whole = _write_step(step, examples, symmetric, prefix, real)
         # The estimate is a member of its own only if it is no array of the state.
         kept = list(range(len(leaves)))
@@ -138,7 +138,7 @@ def _write_step(
     )
 
 
-def _symmetric(step: Callable[..., Any], examples: tuple[Any, ...]) -> set[int]:
+def _find_symmetric(step: Callable[..., Any], examples: tuple[Any, ...]) -> set[int]:
     """Return which arrays of the state are always symmetric, of which one triangle is read.
 
     By induction: symmetric at the start, and after a step from symmetric ones. Assume all, drop those that are not.

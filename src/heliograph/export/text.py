@@ -48,8 +48,8 @@ def c_text(program: StepProgram, form: Form) -> CText:
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
         functions="\n\n".join(_static(code) for code in (program.initial, program.compute)),
         start=_start(program),
-        checks="\n".join(_checks(program)),
-        step="\n".join(_step(program)),
+        checks="\n".join(_write_checks(program)),
+        step="\n".join(_write_step(program)),
         mean=program.mean,
         covariance=program.covariance,
         real=real,
@@ -59,12 +59,12 @@ def c_text(program: StepProgram, form: Form) -> CText:
     header = _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
-        comment=_comment(program, form),
+        comment=_write_comment(program, form),
         members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _counter(program)),
         real=real,
     )
     sizes = [(SIZES[kind], count) for kind, _, count in fields] + ([(8, 1)] if program.counts else [])
-    return CText(header, text, program.compute.operations, _size(sizes))
+    return CText(header, text, program.compute.operations, _measure_state(sizes))
 
 
 def _static(code: Any) -> str:
@@ -77,7 +77,7 @@ def _counter(program: StepProgram) -> list[str]:
     return ["    int64_t step;"] if program.counts else []
 
 
-def _size(fields: Sequence[tuple[int, int]]) -> int:
+def _measure_state(fields: Sequence[tuple[int, int]]) -> int:
     """Return the bytes of the state, each number aligned to its own size."""
     total = 0
     for size, count in fields:
@@ -92,7 +92,7 @@ def _start(program: StepProgram) -> str:
     return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")
 
 
-def _checks(program: StepProgram) -> list[str]:
+def _write_checks(program: StepProgram) -> list[str]:
     """Return the statements that refuse invalid inputs before the computation."""
     filter = program.filter
     lines = [f"    if (isinf(z[{i}])) return 1;" for i in range(filter.received)]
@@ -100,7 +100,7 @@ def _checks(program: StepProgram) -> list[str]:
     return [*lines, f"    if (state->step >= {filter.horizon}) return 3;"] if filter.horizon is not None else lines
 
 
-def _step(program: StepProgram) -> list[str]:
+def _write_step(program: StepProgram) -> list[str]:
     """Return the statements that compute a step, refuse an implausible one, and then write all that changed."""
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
     written = [*(f"after.{m.name}" for m in program.members), "implausible", "spoilt"]
@@ -121,7 +121,7 @@ def claim_of(filter: AbstractFilter, real: Real) -> Claim:
     return filter.claim if real == "double" or filter.claim == "none" else "nominal"
 
 
-def _comment(program: StepProgram, form: Form) -> str:
+def _write_comment(program: StepProgram, form: Form) -> str:
     """Return the explanation for a reader of the header."""
     filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
     # States that are angles say so.

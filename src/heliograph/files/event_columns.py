@@ -170,12 +170,12 @@ def judge(
     kept = np.flatnonzero(verdicts != FUTURE)
     some = events.of(kept)
     # In a row of its own an event stands after inputs of its time, then by node and count.
-    rank = _ranks(some.time) if joint else _ranks(some.time, some.node, some.sequence)
-    name = _ranks(some.time, some.node, some.sequence)
-    base = _base(some, rank, window)
+    rank = _rank_rows(some.time) if joint else _rank_rows(some.time, some.node, some.sequence)
+    name = _rank_rows(some.time, some.node, some.sequence)
+    base = _find_newest_final(some, rank, window)
     # Of what has one name, and of a node's values in a joint row, the first stays.
     verdicts[kept[rank <= base if joint else rank < base]] = LATE
-    rivals = _ranks(some.time, some.node) if joint else name
+    rivals = _rank_rows(some.time, some.node) if joint else name
     several: Bool[np.ndarray, " names"] = np.bincount(rivals, minlength=1) > 1
     held, filled = dict[int, int](), dict[int, np.ndarray]()
     for i in np.flatnonzero(several[rivals] & (rank >= base)).tolist():
@@ -218,7 +218,7 @@ def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: i
 
 def order_within(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return the number of each row among those that are equal to it, in their order, from 0."""
-    ranks = _ranks(*columns)
+    ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
     first = np.searchsorted(ranks[order], ranks[order])
     numbers = np.empty(len(order), dtype=np.int64)
@@ -226,7 +226,7 @@ def order_within(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     return numbers
 
 
-def _ranks(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
+def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return the dense rank of each row by these columns, the first of which matters most."""
     order = np.lexsort(columns[::-1])
     new = np.zeros(len(order), dtype=bool)
@@ -237,7 +237,7 @@ def _ranks(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     return ranks
 
 
-def _base(events: Events, rank: Int[np.ndarray, " events"], window: float) -> Int[np.ndarray, " events"]:
+def _find_newest_final(events: Events, rank: Int[np.ndarray, " events"], window: float) -> Int[np.ndarray, " events"]:
     """Return the rank of the newest row that is final when each event comes, -1 for none.
 
     An event of time t is final for the events that come after it at more than t + window.

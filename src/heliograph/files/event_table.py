@@ -181,9 +181,9 @@ class EventTable:
         Raises:
             ValueError: no events.
         """
-        return 0 if self.steps or self.numbers else self._first()
+        return 0 if self.steps or self.numbers else self._find_first_moment()
 
-    def _first(self) -> int:
+    def _find_first_moment(self) -> int:
         """Return the first moment, in the unit of the columns, or that of step 0."""
         if self.start is not None:
             return self.start
@@ -210,7 +210,7 @@ class EventTable:
     @property
     def date(self) -> np.datetime64:
         """Return the date from which the times of the events count."""
-        return np.datetime64(self._first() if self.dated else 0, "ns")
+        return np.datetime64(self._find_first_moment() if self.dated else 0, "ns")
 
     def sort_events(self) -> Iterator[Event]:
         """Yield the events in order of arrival, with times in seconds from the origin, in steps, or as they are."""
@@ -331,7 +331,7 @@ class EventTable:
             tables.append(table)
         for n, name in enumerate(self.network.names):
             self._fill_losses(name, tables[n], row, events, n)
-        inputs = self._inputs(fill_forward(tables.pop()), times)
+        inputs = self._make_inputs(fill_forward(tables.pop()), times)
         origin = self.origin
         time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
@@ -375,7 +375,7 @@ class EventTable:
         # Moments to the nearest step from the first.
         if self.step is None:
             return events
-        first, half = self._first(), self.step // 2
+        first, half = self._find_first_moment(), self.step // 2
         time, arrival = ((moments - first + half) // self.step for moments in (events.time, events.arrival))
         return events._replace(time=time, arrival=arrival)
 
@@ -389,7 +389,7 @@ class EventTable:
         limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]
         return events, judge(events, values, self._joint, *limits)
 
-    def _inputs(self, held: Float[np.ndarray, "rows given"], times: np.ndarray) -> np.ndarray:
+    def _make_inputs(self, held: Float[np.ndarray, "rows given"], times: np.ndarray) -> np.ndarray:
         """Return the plant's inputs (rows, inputs): those held after the row before, and the time since that row."""
         if self.steps:
             return held

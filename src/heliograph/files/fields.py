@@ -35,8 +35,8 @@ class DoubledFieldError(ValueError):
     """An object of JSON has a field twice."""
 
 
-def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of JSON.
+def _refuse_doubled(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the fields of an object of JSON by name; raise where one is there twice.
 
     Raises:
         DoubledFieldError: a field that is there twice, of which the last would win.
@@ -55,7 +55,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
         ValueError: no JSON, or a field that is there twice; one line.
     """
     try:
-        return json.loads(text, object_pairs_hook=_distinct)
+        return json.loads(text, object_pairs_hook=_refuse_doubled)
     except DoubledFieldError as error:
         raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
     except ValueError:
@@ -65,7 +65,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
     try:
         words = text.decode() if isinstance(text, bytes) else text
         words = NO_NUMBERS.sub(lambda match: match[0] if match[0][0] == '"' else "null", words)
-        return json.loads(words, object_pairs_hook=_distinct)
+        return json.loads(words, object_pairs_hook=_refuse_doubled)
     except DoubledFieldError as error:
         raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
     except (ValueError, RecursionError):  # also bytes that are no text
@@ -106,7 +106,7 @@ def at(message: object, path: str, where: str) -> Any:
         elif hasattr(value, name) and not isinstance(value, list | tuple | np.ndarray | Mapping | str | int | float):
             value = getattr(value, name)
         else:
-            raise MissingFieldError(str(fail(where, f"a field {path!r}", f"no {name!r} in {_fields(value)}")))
+            raise MissingFieldError(str(fail(where, f"a field {path!r}", f"no {name!r} in {_name_fields(value)}")))
     return value
 
 
@@ -201,7 +201,7 @@ def name_of(value: Any, name: str) -> str:
     return value
 
 
-def _fields(value: object) -> str:
+def _name_fields(value: object) -> str:
     """Name the fields of a value, for an error."""
     if isinstance(value, Mapping):
         names = [str(key) for key in value]

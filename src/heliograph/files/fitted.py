@@ -65,7 +65,7 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
 def write_fitted(content: Mapping[str, object], reference: str, measurements: str, folder: Path, target: Path) -> None:
     """Write `fitted.json` and `fitted_network.py` into a folder that will be renamed to `target`."""
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    path, colon, name = _parts(reference)
+    path, colon, name = _split_reference(reference)
     if path is None:
         source = repr(reference)
     else:
@@ -107,7 +107,7 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _parts(reference: str) -> tuple[Path | None, str, str]:
+def _split_reference(reference: str) -> tuple[Path | None, str, str]:
     """Split a reference into path, colon and name; modules have no path."""
     module, colon, name = reference.rpartition(":")
     if not module or not name.isidentifier():

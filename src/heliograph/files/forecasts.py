@@ -40,7 +40,7 @@ def forecast_columns(record: Record, forecasts: ByFilter) -> dict[str, np.ndarra
     for node, filters in forecasts.items():
         for name, forecast in filters.items():
             prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
-            columns |= _outputs(f"{prefix}{FORECAST}.", forecast, len(record.time))
+            columns |= _make_output_columns(f"{prefix}{FORECAST}.", forecast, len(record.time))
     return columns
 
 
@@ -66,7 +66,7 @@ def _joined(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarra
     return np.concatenate([above, below.astype(above.dtype)])
 
 
-def _outputs(prefix: str, forecast: "heliograph.forecasting.Forecast", rows: int) -> dict[str, np.ndarray]:
+def _make_output_columns(prefix: str, forecast: "heliograph.forecasting.Forecast", rows: int) -> dict[str, np.ndarray]:
     """Return the columns of what the sensor would measure, and of its deviations where there is a claim."""
     if forecast.outputs is None:
         return {}

@@ -77,7 +77,7 @@ class Topic:
 
     def list_measured(self) -> list[str]:
         """Return the fields, those first that look like measurements."""
-        return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_unlikely)
+        return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_rank_field)
 
     def row(self) -> list[str]:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
@@ -143,7 +143,7 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
     topic.messages += 1
     if arrival is not None:
         topic.logged.append(arrival)
-    for path, value in _leaves(content):
+    for path, value in _yield_leaves(content):
         if isinstance(value, int | float) and path not in topic.fields:
             topic.fields.append(path)
         # A date in a message may be the time of its measurement.
@@ -215,7 +215,7 @@ def suggestion(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) 
     return "\n".join([*lines, "}"])
 
 
-def _unlikely(path: str) -> int:
+def _rank_field(path: str) -> int:
     """Return how little a field looks like a measurement: 0 under a payload, 2 for what devices say of themselves."""
     words = path.lower().split(".")
     if any(HOUSEKEEPING.fullmatch(word) for word in words):
@@ -229,10 +229,10 @@ def _stamp(data: bytes) -> int:
     return int(seconds) * 10**9 + int(rest)
 
 
-def _leaves(content: object, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, object]]:
+def _yield_leaves(content: object, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, object]]:
     """Yield dotted path and value of what is no dictionary or list in decoded JSON."""
     if isinstance(content, dict) and depth:
         for key, value in content.items():
-            yield from _leaves(value, f"{prefix}{key}.", depth - 1)
+            yield from _yield_leaves(value, f"{prefix}{key}.", depth - 1)
     elif not isinstance(content, dict | list):
         yield prefix.rstrip("."), content

@@ -244,7 +244,7 @@ def json_field(
     return Source(
         paths, whose, outputs, factors, shifts, stamp, time_unit, count,
         None if of is None else _check_name("plant", of),
-        seconds, *_conditions(where), flag("json_field, quoted", quoted),
+        seconds, *_split_conditions(where), flag("json_field, quoted", quoted),
     )  # fmt: skip
 
 
@@ -352,7 +352,7 @@ def _check_name(name: str, value: object) -> Any:
     return value
 
 
-def _conditions(where: object) -> tuple[Containers, tuple[Available, ...]]:
+def _split_conditions(where: object) -> tuple[Containers, tuple[Available, ...]]:
     """Return the conditions on fields, and those on what devices say of themselves."""
     several = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
     available = tuple(single for single in several if isinstance(single, Available))

@@ -79,7 +79,7 @@ def messages_of(path: Path) -> Iterator[FileMessage | InputError]:
     if kind in LINES:
         yield from _read_lines(path)
         return
-    for where, row in _csv_rows(path) if kind == ".csv" else _parquet_rows(path):
+    for where, row in _read_csv_rows(path) if kind == ".csv" else _read_parquet_rows(path):
         yield row if isinstance(row, InputError) else _convert_row(where, row)
 
 
@@ -165,7 +165,7 @@ def _convert_object(where: str, content: object) -> FileMessage:
     return FileMessage(where, topic, payload, arrival, stored)
 
 
-def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any] | InputError]]:
+def _read_csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any] | InputError]]:
     """Yield the rows from 1, with numbers as numbers and empty cells as None; of annotated CSV each table's."""
     header: list[str] | None = None
     with csv_lines(path) as lines:
@@ -190,7 +190,7 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any] | InputError]]:
             yield where, {name: cell if name == PAYLOAD else _cell(cell) for name, cell in cells}
 
 
-def _parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the rows from 1; moments are dates of ISO 8601, in UTC where they have no zone."""
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -67,11 +67,11 @@ def read_messages(
         for part in parts_of(path) or [path]:
             read_bag(part, known, events, progress, strict)
     elif holds_events(path):
-        events = _own(path, network, strict, ignore_unknown)
+        events = _read_own_table(path, network, strict, ignore_unknown)
     else:
         events = _map_messages(path, network, known, strict)
     if known is not None:
-        _conclude(path, known, events)
+        _warn_of_left_out(path, known, events)
     events.finish(str(path))
     return events
 
@@ -85,7 +85,7 @@ def is_mapped(path: Path, sources: object) -> bool:
     return message_name(path) in sources or path.name in sources or table_has_topics(path)
 
 
-def _own(path: Path, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
+def _read_own_table(path: Path, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
     """Read a table of events in our own form."""
     own = OwnMessages(network, path, ignore_unknown)
     for message in messages_of(path):
@@ -103,7 +103,7 @@ def _map_messages(path: Path, network: Network, sources: Sources | None, strict:
             continue
         if events is None or sources is None:
             raise fail(message.where, "a message in our own form, or sources for its topic", message.topic or "none")
-        _read(path, message, sources, events, strict)
+        _append_message(path, message, sources, events, strict)
     if events is None or own.used:
         if events is not None and len(events):
             raise fail(str(path), "messages in our own form, or of topics", "both")
@@ -113,7 +113,7 @@ def _map_messages(path: Path, network: Network, sources: Sources | None, strict:
     return events
 
 
-def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable, strict: bool) -> None:
+def _append_message(path: Path, message: FileMessage, sources: Sources, events: EventTable, strict: bool) -> None:
     """Append what a message says; what cannot be read is refused alone."""
     topic = message.topic
     if topic is None:
@@ -143,7 +143,7 @@ def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable
         events.refuse(error, strict)
 
 
-def _conclude(path: Path, sources: Sources, events: EventTable) -> None:
+def _warn_of_left_out(path: Path, sources: Sources, events: EventTable) -> None:
     """Say which messages were left out.
 
     Raises:

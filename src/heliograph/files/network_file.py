@@ -47,12 +47,12 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
         if not path.is_file():
             got = "a folder" if path.is_dir() else "nothing of that name"
             raise fail(f"network {source_name}", "a Python file", got)
-        with _importing_from(path.parent):
+        with _import_from(path.parent):
             module = _call_user_code(lambda: _run_source(path, path.read_bytes()), source_name, path)
             return _find_network(module, name, source_name, path), vars(module)
     # A module, by its name.
-    with _importing_from(Path.cwd()):
-        source = _call_user_code(lambda: _source(source_name), source_name, None)
+    with _import_from(Path.cwd()):
+        source = _call_user_code(lambda: _find_source(source_name), source_name, None)
         module = _call_user_code(lambda: importlib.import_module(source_name), source_name, source)
         return _find_network(module, name, source_name, source), vars(module)
 
@@ -68,7 +68,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     """
     reference = f"{path.name}:{name}"
     # The module itself, then the function in it.
-    with _importing_from(path.parent):
+    with _import_from(path.parent):
         module = _call_user_code(lambda: _run_source(path, source), path.name, path)
     function = getattr(module, name, None)
     if not callable(function):
@@ -78,7 +78,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     # Each call may import more modules of the folder, and may fail in the user's code.
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
-        with _importing_from(path.parent):
+        with _import_from(path.parent):
             network = _call_user_code(lambda: function(*args, **kwargs), reference, path)
         if not isinstance(network, Network):
             raise fail(f"network {reference}", "a heliograph.Network", type(network).__name__)
@@ -115,7 +115,7 @@ def _read_name(module: ModuleType, name: str, file: str, path: Path | None, netw
     return value
 
 
-def _source(module: str) -> Path | None:
+def _find_source(module: str) -> Path | None:
     """Return the file of an importable module, so that errors are reported with their line."""
     spec = find_spec(module)
     if spec is None:
@@ -144,11 +144,11 @@ def _call_user_code(call: Callable[[], T], name: str, path: Path | None) -> T:
     try:
         return call()
     except (Exception, SystemExit) as error:
-        came = f"{type(error).__name__}{_line(error, path)}: {error}"
+        came = f"{type(error).__name__}{_find_line(error, path)}: {error}"
         raise fail(f"network {name}", "Python that runs", " ".join(came.split())) from error
 
 
-def _line(error: BaseException, path: Path | None) -> str:
+def _find_line(error: BaseException, path: Path | None) -> str:
     """Return the line in the user's file where an error was raised: the innermost frame there."""
     if isinstance(error, SyntaxError):
         return f" in line {error.lineno}"
@@ -159,7 +159,7 @@ def _line(error: BaseException, path: Path | None) -> str:
 
 
 @contextmanager
-def _importing_from(folder: Path) -> Iterator[None]:
+def _import_from(folder: Path) -> Iterator[None]:
     """Let imports find modules in `folder` first."""
     entry = str(folder.resolve())
     sys.path.insert(0, entry)

@@ -101,11 +101,11 @@ class OwnMessages:
         node = row[NODE]
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
-        sequence = _whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
-        time, dated = self._moment(row[TIME], f"{where}, column {TIME!r}")
+        sequence = _parse_whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
+        time, dated = self._read_moment(row[TIME], f"{where}, column {TIME!r}")
         arrival = time
         if ARRIVAL in row and (row[ARRIVAL] is not None or "line" not in where):
-            arrival, _ = self._moment(row[ARRIVAL], f"{where}, column {ARRIVAL!r}")
+            arrival, _ = self._read_moment(row[ARRIVAL], f"{where}, column {ARRIVAL!r}")
         plant = "" if row.get(PLANT) is None else name_of(row[PLANT], f"{where}, column {PLANT!r}")
         if self._table is None:
             self._table = EventTable(self.network, numbers=not dated)
@@ -133,7 +133,7 @@ class OwnMessages:
                 raise HeaderError(str(fail(f"{self.path}, header", f"a column {name!r}", f"only {', '.join(row)}")))
         self._columns = row.keys()
 
-    def _moment(self, cell: Any, name: str) -> tuple[Any, bool]:
+    def _read_moment(self, cell: Any, name: str) -> tuple[Any, bool]:
         """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
         dated = isinstance(cell, str) and looks_like_date(cell)
         expected = "a number"
@@ -184,7 +184,7 @@ def _items(cell: Any) -> list[Any]:
     return list(cell) if isinstance(cell, list | tuple | np.ndarray) else [cell]
 
 
-def _whole(cell: Any, name: str) -> int:
+def _parse_whole(cell: Any, name: str) -> int:
     """Return a count with every digit; a float is accepted if it is an exact integer."""
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
         return check_63_bits(name, int(cell))

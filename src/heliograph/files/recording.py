@@ -61,7 +61,7 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
     """
     instance("network", network, Network, "a Network")
     source = str(table) if isinstance(table, str | Path) else name
-    headers = _headers(network)
+    headers = _map_headers(network)
     columns = columns_of(table, source, headers if flag("ignore_unknown", ignore_unknown) else None)
     return _make_recording({headers.get(name, name): values for name, values in columns.items()}, network, source)
 
@@ -95,7 +95,7 @@ def _truth_columns(network: Network) -> dict[str, str]:
     return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
 
 
-def _headers(network: Network) -> dict[str, str]:
+def _map_headers(network: Network) -> dict[str, str]:
     """Return the name that a column has here by the header that it may have.
 
     That is the name, with the unit of its state, input or output ("range (m)") or without, also as `write_table` writes
@@ -131,7 +131,7 @@ def _make_recording(columns: Mapping[str, np.ndarray], network: Network, source:
         return _find(columns, names, source)
 
     # Time must not go backwards.
-    time = _times(columns, find((TIME,)), source)
+    time = _read_times(columns, find((TIME,)), source)
     row = backwards(time)
     if row is not None:
         came = backwards_text(time, row)
@@ -257,7 +257,8 @@ def _find(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str
     return present[0]
 
 
-def _times(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+def _read_times(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    """Return the times of the rows, dates where the column holds dates."""
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
         return _complete(columns, name, source)

@@ -240,12 +240,12 @@ class Sources:
             return None
         if node not in places:
             raise fail(f"{where}, node", f"one of {', '.join(places)}", _near(node, places))
-        sequence, missing = self._sequence(source, pattern, message, where)
+        sequence, missing = self._find_count(source, pattern, message, where)
         # Values; of a message that has its count they may be absent.
         values = np.full(len(self.names[node]), np.nan)
         for column, path, scale, offset in zip(places[node], source.paths, source.scale, source.offset, strict=True):
             try:
-                values[column] = scale * _value(message, path, where, source.quoted) + offset
+                values[column] = scale * _read_value(message, path, where, source.quoted) + offset
                 if sequence is not None:
                     self.found.add((pattern, str(path)))
             except MissingFieldError as error:
@@ -259,7 +259,7 @@ class Sources:
         """Read plant, node, count and time of a message that is unreadable otherwise; None where these are too."""
         try:
             plant, node = _read_names(mapped, topic, message, where)
-            sequence, missing = self._sequence(mapped.source, mapped.pattern, message, where)
+            sequence, missing = self._find_count(mapped.source, mapped.pattern, message, where)
         except InputError:
             return None
         if sequence is None or missing or node not in mapped.places:
@@ -272,7 +272,7 @@ class Sources:
         period = 0 if mapped.source.sequence is None else mapped.source.sequence.period
         return Reading(plant, node, sequence, time, nothing, period)
 
-    def _sequence(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
+    def _find_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
         """Return the count of a message, None where there are none, and whether it is absent, and so 0."""
         if source.sequence is None:
             return None, False
@@ -363,10 +363,10 @@ def _more(count: int) -> str:
     return "" if count <= LISTED else f" and {count - LISTED} more"
 
 
-def _value(message: object, path: str | Yaw, where: str, quoted: bool) -> float:
+def _read_value(message: object, path: str | Yaw, where: str, quoted: bool) -> float:
     """Return the number at a path, or the heading of a quaternion; NaN for what did not arrive."""
     if isinstance(path, Yaw):
-        return float(Yaw.of(*(_value(message, part, where, quoted) for part in path.parts)))
+        return float(Yaw.of(*(_read_value(message, part, where, quoted) for part in path.parts)))
     value = at(message, path, where)
     if type(value) is float:  # names its place only where there may be something to say
         return value if np.isfinite(value) else np.nan

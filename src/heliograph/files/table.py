@@ -49,10 +49,10 @@ def columns_of(table: object, name: str = "table", only: Container[str] | None =
     for column in [column for column in named if not isinstance(column, str)]:
         raise fail(f"{name}, columns", "names that are text", show_value(column))
     kept = {column: values for column, values in named.items() if only is None or column in only}
-    return {column: _values(values, f"{name}, column {column!r}") for column, values in kept.items()}
+    return {column: _convert_column(values, f"{name}, column {column!r}") for column, values in kept.items()}
 
 
-def _values(values: Any, name: str) -> np.ndarray:
+def _convert_column(values: Any, name: str) -> np.ndarray:
     """Convert one column, which may have a missing value other than NaN."""
     missing = values.isna() if hasattr(values, "isna") else None
     if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
@@ -233,11 +233,11 @@ def _read_csv(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
         for row, cells in enumerate(rows, 1)
     ]
     values = np.array(numbers, dtype=np.float64).reshape(len(rows), len(header))
-    columns = {name: _exact(values[:, i].copy(), [cells[i] for cells in rows]) for i, name in enumerate(header)}
+    columns = {name: _keep_exact(values[:, i].copy(), [cells[i] for cells in rows]) for i, name in enumerate(header)}
     return columns | {header[i]: dates((cells[i] for cells in rows), f"{path}, column {header[i]!r}") for i in dated}
 
 
-def _exact(values: np.ndarray, cells: Sequence[str]) -> np.ndarray:
+def _keep_exact(values: np.ndarray, cells: Sequence[str]) -> np.ndarray:
     """Return a column as int64 if its cells are whole numbers that doubles cannot tell apart."""
     if not np.any(np.abs(values) >= EXACT) or not all(
         re.fullmatch(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}", c) for c in cells

@@ -190,7 +190,7 @@ def _score_filter(target: Target, record: Record, u: np.ndarray, ahead: list[int
     if record.truth is not None:
         parts.append(("state", filter.states, states, record.truth, used.states if used else ()))
     return [
-        _score((node, target.filter, part, name), h, _law(moments, i, j), values[:, i], first, i in angles)
+        _score_number((node, target.filter, part, name), h, _law(moments, i, j), values[:, i], first, i in angles)
         for part, names, moments, values, angles in parts
         for i, name in enumerate(names)
         for j, h in enumerate(ahead)
@@ -203,7 +203,7 @@ def _law(moments: Moments, number: int, horizon: int) -> Law:
     return Law(np.asarray(moments.weights)[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 
 
-def _score(
+def _score_number(
     of: tuple[str, str, str, str], horizon: int, law: Law, values: np.ndarray, first: int, is_angle: bool
 ) -> Score:
     """Score forecasts from each row against the number `horizon` rows later."""

@@ -79,7 +79,7 @@ def forecasts_from(origin: Origin, horizons: Horizons, inputs: Inputs) -> Foreca
     forecasts: Forecasts = {}
     for target in targets_of(origin):
         check_covered(target.outlook.filter, origin.step, len(ahead.u))
-        forecasts.setdefault(target.node, {})[target.filter] = _one(target, origin.step, ahead)
+        forecasts.setdefault(target.node, {})[target.filter] = _forecast_one(target, origin.step, ahead)
     return forecasts
 
 
@@ -128,8 +128,8 @@ def targets_of(origin: Origin) -> list[Target]:
                 assert isinstance(known, AbstractFilter)
                 filter, state = known, central[name]
             else:
-                filter, state = _moved_alone(model, estimate)
-            outlook = outlook_of(filter, _sensor_of(model, node), model.plant)
+                filter, state = _predict_without_nodes(model, estimate)
+            outlook = outlook_of(filter, _find_sensor(model, node), model.plant)
             found.append(Target(node, name, outlook, state, _received(model, node)))
     return found
 
@@ -139,8 +139,8 @@ def _entry(stacked: PyTree, place: int) -> PyTree:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[place], stacked)
 
 
-def _moved_alone(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
-    """A fused estimate as the state of a filter that only predicts: exact and upper covariances stay so if linear."""
+def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
+    """Return a filter that only predicts, at a fused estimate; its claim stays where plant and angles allow."""
     plant = first(network.plant)
     linear = isinstance(plant, LinearPlant) and not plant.circular
     claim = estimate.claim if linear or estimate.claim == "none" else weakest([estimate.claim, "nominal"])
@@ -151,7 +151,7 @@ def _moved_alone(network: Network, estimate: Estimate) -> tuple[AbstractFilter, 
     return lowered, from_covariance(mean, covariance if claim != "none" else np.zeros_like(covariance))
 
 
-def _sensor_of(network: Network, node: str) -> AnySensor | None:
+def _find_sensor(network: Network, node: str) -> AnySensor | None:
     """Return the sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary."""
     if node != FUSED:
         single = network.nodes[node]
@@ -174,7 +174,7 @@ def check_covered(filter: AbstractFilter, step: int, count: int) -> None:
         raise fail("horizons", f"at most {left} steps, which the model covers behind the data", count)
 
 
-def _one(target: Target, step: int, ahead: Ahead) -> Forecast:
+def _forecast_one(target: Target, step: int, ahead: Ahead) -> Forecast:
     """Return the forecast of one filter."""
     outlook, filter = target.outlook, target.outlook.filter
     check_ahead(filter.inputs, ahead, filter, step)

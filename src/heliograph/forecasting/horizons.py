@@ -51,28 +51,32 @@ def ahead_of(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: I
             rows, none of a plant that has some, or none to hold.
     """
     continuous = TIME_STEP in names
-    distances = _in_time(origin, horizons) if continuous else _in_steps(origin, horizons)
+    distances = _convert_to_times(origin, horizons) if continuous else _convert_to_steps(origin, horizons)
     if np.any(np.diff(distances, prepend=0.0) <= 0):
         raise fail("horizons", "times after the data, each later than the one before", show_value(horizons))
     count = len(distances) if continuous else int(distances[-1])
     others = [name for name in names if name != TIME_STEP]
-    given, said = _inputs_of(origin, names, others, inputs, count)
+    given, said = _complete_inputs(origin, names, others, inputs, count)
     u = given
     if continuous:
         u = np.insert(given, list(names).index(TIME_STEP), np.diff(distances, prepend=0.0), axis=1)
     rows = np.arange(count) if continuous else distances.astype(int) - 1
     return Ahead(
-        u, rows, distances if continuous else distances.astype(int), _clock(origin, distances, continuous), said
+        u,
+        rows,
+        distances if continuous else distances.astype(int),
+        _place_on_clock(origin, distances, continuous),
+        said,
     )
 
 
-def _in_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
+def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
     """Return the horizons as numbers of steps."""
     if is_whole(horizons):
         return np.arange(1.0, _count(horizons) + 1)
     steps = []
-    for one in _listed(horizons):
-        if (seconds := _seconds(origin, one)) is None:
+    for one in _list_horizons(horizons):
+        if (seconds := _convert_to_seconds(origin, one)) is None:
             steps.append(float(_count(one)))
             continue
         if not origin.spacing > 0:
@@ -86,13 +90,13 @@ def _in_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
     return np.array(steps)
 
 
-def _in_time(origin: Origin, horizons: Horizons) -> np.ndarray:
+def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
     """Horizons as times ahead in the unit of dt, of dates in seconds; a whole number counts steps of the usual size."""
     if is_whole(horizons):
         if not origin.spacing > 0:
             raise fail("horizons", "times ahead, such as [1.0, 5.0], where no step is usual", horizons)
         return origin.spacing * np.arange(1, _count(horizons) + 1)
-    listed = [(one, _seconds(origin, one)) for one in _listed(horizons)]
+    listed = [(one, _convert_to_seconds(origin, one)) for one in _list_horizons(horizons)]
     return np.array(
         [float(array("horizon", cast(ArrayLike, one), ())) if seconds is None else seconds for one, seconds in listed]
     )
@@ -105,7 +109,8 @@ def _count(value: object) -> int:
     return count
 
 
-def _listed(horizons: object) -> list[object]:
+def _list_horizons(horizons: object) -> list[object]:
+    """Return horizons as a list, one of them as a list of one."""
     single = isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64)
     listed: list[object] = [horizons] if single else list(horizons) if rank("horizons", horizons) == 1 else []  # type: ignore[call-overload]
     if not listed:
@@ -113,7 +118,7 @@ def _listed(horizons: object) -> list[object]:
     return listed
 
 
-def _seconds(origin: Origin, one: object) -> float | None:
+def _convert_to_seconds(origin: Origin, one: object) -> float | None:
     """Return the seconds ahead of a span of time or a date; None of a number."""
     if isinstance(one, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
@@ -130,7 +135,7 @@ def _seconds(origin: Origin, one: object) -> float | None:
     return float(ahead.astype(np.int64)) / SECOND
 
 
-def _inputs_of(
+def _complete_inputs(
     origin: Origin, names: Sequence[str], others: Sequence[str], inputs: Inputs, count: int
 ) -> tuple[np.ndarray, InputsAhead]:
     """Return the rows of inputs other than dt, and whether they were given or held."""
@@ -156,7 +161,7 @@ def check_ahead(names: Sequence[str], ahead: Ahead, models: object, step: int) -
     check_inputs(names, ahead.u, models, step)
 
 
-def _clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
+def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
     """Return the time of each horizon on the clock of the data."""
     spacing = 1.0 if continuous else origin.spacing
     if not isinstance(origin.time, np.datetime64):

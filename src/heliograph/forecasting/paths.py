@@ -75,14 +75,14 @@ def draw_paths(
     if plant is None:
         raise fail("paths", "a filter that says what its plant is", type(target.outlook.filter).__name__)
     count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
-    start = _starts(target, count, np.random.default_rng(seed))
-    x, y = _drawn(plant, sensor, start, ahead.u, jax.random.split(key, count), np.asarray(origin.step))
+    start = _draw_starts(target, count, np.random.default_rng(seed))
+    x, y = _draw_from_starts(plant, sensor, start, ahead.u, jax.random.split(key, count), np.asarray(origin.step))
     outputs = () if sensor is None else tuple(first(sensor).outputs)
     states = target.outlook.filter.states
     return Paths(ahead.steps, ahead.time, states, outputs, np.asarray(x)[:, ahead.rows], np.asarray(y)[:, ahead.rows])
 
 
-def _starts(target: Target, draws: int, generator: np.random.Generator) -> np.ndarray:
+def _draw_starts(target: Target, draws: int, generator: np.random.Generator) -> np.ndarray:
     """Draw states (draws, n) from the last estimate: a part of its mixture by its weight, then from its Gaussian."""
     filter = target.outlook.filter
     if filter.claim == "none":
@@ -98,7 +98,7 @@ def _starts(target: Target, draws: int, generator: np.random.Generator) -> np.nd
 
 
 @compile_in_float64
-def _drawn(
+def _draw_from_starts(
     plant: AnyPlant, sensor: AnySensor | None, start: Array, u: Array, keys: jax.Array, step: Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states and outputs of each path (draws, rows, ...)."""

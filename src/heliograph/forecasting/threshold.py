@@ -98,14 +98,14 @@ def crossing(
     """
     limit = float(scalar("level", level))
     paths = draw_paths(source, horizons, inputs, draws, seed, node, filter)
-    values = _values(paths, name)
+    values = _select_number(paths, name)
     beyond = values > limit if above else values < limit
     shares = beyond.mean(axis=0), np.logical_or.accumulate(beyond, axis=1).mean(axis=0)
     (now, now_error), (ever, ever_error) = ((p, np.sqrt(p * (1 - p) / draws)) for p in shares)
     return Crossing(name, limit, above, paths.steps, paths.time, now, now_error, ever, ever_error, draws)
 
 
-def _values(paths: Paths, name: str) -> np.ndarray:
+def _select_number(paths: Paths, name: str) -> np.ndarray:
     """Return the values of a state or an output along all paths (draws, times)."""
     if name in paths.states:
         return paths.x[:, :, paths.states.index(name)]

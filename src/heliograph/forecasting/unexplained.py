@@ -144,8 +144,8 @@ def residuals(
     columns = [values[:, i] for i in range(values.shape[1])]
     correlations = np.stack([_autocorrelation(e, count) for e in columns], axis=1)
     came = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)
-    white = np.array([_ljung_box(e, count) for e in columns])
-    normal, steady = (np.array([test(e) for e in columns]) for test in (_jarque_bera, _same_variance))
+    white = np.array([_test_correlation(e, count) for e in columns])
+    normal, steady = (np.array([test(e) for e in columns]) for test in (_test_normality, _test_same_variance))
     band = NORMAL / np.sqrt(came)
     return Residuals(law.names, values, predicted, correlations, band, white, normal, steady)
 
@@ -163,7 +163,7 @@ def _autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
     return np.array([_pairs(e, lag).sum() / total if total > 0 else np.nan for lag in range(1, lags + 1)])
 
 
-def _ljung_box(e: np.ndarray, lags: int) -> float:
+def _test_correlation(e: np.ndarray, lags: int) -> float:
     """P-value of n (n + 2) sum r_l^2 / n_l, n_l pairs of lag l, which is chi-squared."""
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:
@@ -172,7 +172,7 @@ def _ljung_box(e: np.ndarray, lags: int) -> float:
     return float(chi2.sf(n * (n + 2) * np.sum(_autocorrelation(e, lags) ** 2 / counts), lags))
 
 
-def _jarque_bera(e: np.ndarray) -> float:
+def _test_normality(e: np.ndarray) -> float:
     """P-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis."""
     came = e[~np.isnan(e)]
     if len(came) < LEAST:
@@ -181,7 +181,7 @@ def _jarque_bera(e: np.ndarray) -> float:
     return float(chi2.sf(len(came) * (np.mean(t**3) ** 2 + (np.mean(t**4) - 3) ** 2 / 4) / 6, 2))
 
 
-def _same_variance(e: np.ndarray) -> float:
+def _test_same_variance(e: np.ndarray) -> float:
     """P-value, of both sides, of the ratio of the sums of squares in the last and in the first third."""
     came = e[~np.isnan(e)]
     h = len(came) // 3

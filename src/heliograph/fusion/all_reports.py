@@ -123,7 +123,7 @@ def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportMo
     # Noise: w is common to all, nu enters by each node's gain; estimates are known to the rounding of x.
     noise = join_columns(
         columns_of(step.process).through(step.of_noise),
-        _measurement_noise(step.gain, step.received).through(np.eye(moved, nodes * n, -n)),
+        _factor_measurement_noise(step.gain, step.received).through(np.eye(moved, nodes * n, -n)),
         rounding_of(jnp.tile(_square_mean(errors), 1 + nodes)),
     )
     # Past reports move on by one place, without a noise.
@@ -158,21 +158,21 @@ def correct_with_reports(
     that K times these slopes is an eps too.
     """
     x, past, values = state.gaussian, state.past, jnp.ravel(reports)
-    output, offset = _output_matrix(past, len(x.mean)), jnp.ravel(past.offset)
+    output, offset = _make_output_matrix(past, len(x.mean)), jnp.ravel(past.offset)
     expected, present, noise = output @ x.mean + offset, ~jnp.isnan(values), _factor_each(past.noise)
-    gain, unexpected = _gain_of_reports(x, output, past, present), jnp.where(present, values - expected, 0.0)
+    gain, unexpected = _compute_gain(x, output, past, present), jnp.where(present, values - expected, 0.0)
     # Joseph's form, sums of squares; the errors mu themselves enter the bound (Young, Cauchy).
     keep = jnp.eye(len(x.mean)) - gain @ output
     kept = join_columns(Columns(keep @ x.root, x.variances), noise.through(gain))
     spill = None
     if state.spill is not None:
-        push = _cauchy_bound(gain @ _block_diagonal(past.gain), jnp.ravel(past.error))
-        spill = symmetric(_young_sum(propagate_by_mode(keep, state.spill, 0.0), push))
+        push = _cauchy_bound(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
+        spill = symmetric(_bound_sum(propagate_by_mode(keep, state.spill, 0.0), push))
     law = PredictedReports(expected, join_columns(Columns(output @ x.root, x.variances), noise).covariance)
     return ReportsBelief(from_columns(x.mean + gain @ unexpected, kept), past, spill), law
 
 
-def _gain_of_reports(
+def _compute_gain(
     x: Gaussian, output: Float[jax.Array, "M N"], past: PastReports, present: Bool[jax.Array, " M"]
 ) -> Float[jax.Array, "N M"]:
     """Return the gain of what arrived, with quantizers' errors and rounding as noise of each report."""
@@ -190,7 +190,7 @@ def _gain_of_reports(
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
     """Return the estimate of x, with the covariance of its error or a bound on it."""
     x = take_leading(state.gaussian, n)
-    return x.mean, x.covariance if state.spill is None else _young_sum(x.covariance, state.spill[:n, :n])
+    return x.mean, x.covariance if state.spill is None else _bound_sum(x.covariance, state.spill[:n, :n])
 
 
 def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
@@ -211,7 +211,7 @@ def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel
     return PastReports(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
 
 
-def _output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
+def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
     """Return the output matrix of the reports: mean gains on x - e_i now, and on the reports of earlier steps."""
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
@@ -221,22 +221,22 @@ def _output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
     return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
 
 
-def _measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Columns:
+def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Columns:
     """Return the columns of K_i S_ij K_j', as many as measurements; S_ij is zero between nodes that share nothing."""
     nodes, _, m = gain.shape
     each = noise.ndim == 3
     received = _factor_each(jnp.asarray(noise)[None]) if each else columns_of(noise.reshape(nodes * m, nodes * m))
-    return received.through(_block_diagonal(gain[None]))
+    return received.through(_place_on_diagonal(gain[None]))
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> Columns:
     """Return the factors of the covariance of noises that are independent of each other, of all reports together."""
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
-    return Columns(_block_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
+    return Columns(_place_on_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
 
 
-def _block_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
+def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
     """Return the block-diagonal matrix of these blocks."""
     ages, nodes, rows, columns = blocks.shape
     items = jnp.arange(ages * nodes)
@@ -251,8 +251,8 @@ def _cauchy_bound(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) 
     return jnp.sum(used) * (into * used) @ into.T
 
 
-def _young_sum(a: jax.Array, b: jax.Array) -> jax.Array:
-    """(1 + s / r) A + (1 + r / s) B, a bound on E[(u + v)(u + v)'] of least trace: r^2 = tr A, s^2 = tr B (Young)."""
+def _bound_sum(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], of least trace: r^2 = tr A, s^2 = tr B (Young)."""
     r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
     both = (r > 0) & (s > 0)
     ratio = jnp.where(both, s / jnp.where(r > 0, r, 1.0), 1.0)

@@ -50,7 +50,7 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
         w, slack, _, iteration = carry
         value, gradient, hessian = _trace_derivatives(scaled, w)
         slack = jnp.where(iteration == 0, gradient - jnp.min(gradient) + 0.1 * value, slack)
-        moved = _newton_step(_Point(w, slack, gradient, hessian))
+        moved = _take_newton_step(_Point(w, slack, gradient, hessian))
         # Certificate of the excess: weights below it stay where they are.
         going = jnp.max(-gradient) > (1 + rounding(GAP, value, LOOP)) * value
         w, slack = (jnp.where(going, new, old) for new, old in zip(moved, (w, slack), strict=True))
@@ -88,7 +88,7 @@ def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "
     return jnp.einsum("k,kab->ab", w, information)
 
 
-def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
+def _take_newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     """Take one Newton step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
 
     The target follows from where the step with target 0 would end (Mehrotra's predictor and corrector).

@@ -173,10 +173,10 @@ def component_weights(
 ) -> Float[jax.Array, "degree n"]:
     """Return the diagonals c_i of the weights of each component by itself."""
     component = jnp.stack([joint[:, a, :, a] for a in range(joint.shape[1])])
-    return jax.vmap(_weights_of_component, in_axes=(0, None), out_axes=1)(component, present.astype(joint.dtype))
+    return jax.vmap(_weigh_component, in_axes=(0, None), out_axes=1)(component, present.astype(joint.dtype))
 
 
-def _weights_of_component(
+def _weigh_component(
     joint: Float[jax.Array, "degree degree"], there: Float[jax.Array, " degree"]
 ) -> Float[jax.Array, " degree"]:
     """Return c = U^-1 1 / 1' U^-1 1 over those that are there, by the factor of U, as `solve_regularised_weights`."""

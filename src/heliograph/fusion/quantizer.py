@@ -187,7 +187,7 @@ class UniformQuantizer(AbstractQuantizer):
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the fixed amplitude."""
-        return state, _uniform_quantize(
+        return state, _quantize_uniformly(
             jnp.asarray(fill_masked(value), dtype=float), self.amplitude, self.levels, self.scale
         )
 
@@ -198,7 +198,7 @@ class UniformQuantizer(AbstractQuantizer):
         return bound
 
 
-def _uniform_quantize(
+def _quantize_uniformly(
     x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
 ) -> Quantized:
     """Return midpoint of the segment that holds x; d for values from d on and -d below -d, without a bound there."""

@@ -111,7 +111,7 @@ def certify_level(
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
     assumed: list[str] = []
     for letter, of in (("f", system.growth), ("h", system.output_growth)):
-        reasons += _reasons_against(of, findings[letter])
+        reasons += _list_objections(of, findings[letter])
         assumed += _list_assumed(letter, of, findings[letter])
     count = T if negative.all() else int(np.argmin(negative))
     about = tuple(findings["f"] + findings["h"]), tuple(reasons), tuple(assumed)
@@ -123,7 +123,7 @@ def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFind
     return [instance(name, finding, GrowthFinding, FINDINGS) for finding in items(name, given, FINDINGS)]
 
 
-def _reasons_against(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
+def _list_objections(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """Reasons against a certificate: refuted constants, and findings about constants that the system does not have."""
     reasons, constants = [], _list_positive(growth.state) + _list_positive(growth.error)
     for finding in findings:

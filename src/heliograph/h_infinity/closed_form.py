@@ -57,18 +57,18 @@ def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarr
     design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
     # step by step: K and P2 in closed form, P1 small enough that it does no harm
     for k, step in enumerate(step_matrices(system, separate=True)):
-        gain_and_error = _best_gain(system, step, weights[k, n:, n:], inner, multipliers[k])
+        gain_and_error = _compute_best_gain(system, step, weights[k, n:, n:], inner, multipliers[k])
         if gain_and_error is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)
         gains[k], error = gain_and_error
-        state, of_growth = _state_weight(system, k, state)
+        state, of_growth = _compute_state_weight(system, k, state)
         weights[k + 1] = np.block([[state * np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), error]])
         design.multipliers[k] = [of_growth[0], multipliers[k, 0], of_growth[1], multipliers[k, 1]]
     return design._replace(feasible=True, status="optimal")
 
 
-def _best_gain(
+def _compute_best_gain(
     system: GrowthSystem,
     step: StepMatrices,
     weight: Float[np.ndarray, "n n"],
@@ -92,7 +92,7 @@ def _best_gain(
     return best, (1 - SLACK) * (following + following.T) / 2
 
 
-def _state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
+def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
     """Return the next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
 
     |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do.

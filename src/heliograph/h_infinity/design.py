@@ -163,16 +163,18 @@ def horizon_design(
     status = run_solver(problem.problem, solver)
     values = problem.unknowns.value
     if not status.startswith("optimal") or values is None:
-        return _unsolved_design(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
+        return _make_unsolved_design(
+            system, separate, float("nan"), f"no level could be proven over the horizon ({status})"
+        )
     # the solver's answer must satisfy every step's inequality itself
     parts = [np.asarray(values[entries]) for entries in problem.places]
     solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
     weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_next_weight, solved)]
-    failed = _first_failing(steps, solved, weights, square)
+    failed = _find_first_failing(steps, solved, weights, square)
     if failed is not None:
         text = f"the solver's answer fails at step {failed} ({status})"
-        return _unsolved_design(system, separate, float("nan"), text)._replace(failed_step=failed)
+        return _make_unsolved_design(system, separate, float("nan"), text)._replace(failed_step=failed)
     # back to the user's units
     chosen = given_gains
     if chosen is None:
@@ -183,7 +185,7 @@ def horizon_design(
     return HInfinityDesign(float(np.sqrt(square)) * coordinates.unit, chosen, unscaled, proven, True, status)
 
 
-def _first_failing(
+def _find_first_failing(
     steps: Sequence[StepMatrices], solved: Sequence[Unknowns], weights: Sequence[np.ndarray], square: float
 ) -> int | None:
     """Return the number of the first step, with these weights before each, at which an inequality does not hold."""
@@ -209,7 +211,7 @@ class _Recursion:
         system, n, c = self.system, self.system.states, self.coordinates
         # P_0 in scaled coordinates, and the initial condition
         relative = (level / c.unit) ** 2
-        design = _unsolved_design(system, self.separate, level, "")
+        design = _make_unsolved_design(system, self.separate, level, "")
         too_low = design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
         if relative < LARGEST**-2:  # P_0 in units of it would be no number
             return too_low
@@ -222,7 +224,7 @@ class _Recursion:
         for k, step in enumerate(self.steps):
             fixed = step.target / relative - step.energy
             fixed[: 2 * n, : 2 * n] -= present
-            status, unknowns = self._problem(k, present if k == 0 else None).solve(fixed)
+            status, unknowns = self._find_problem(k, present if k == 0 else None).solve(fixed)
             if unknowns is None or not _inequality_holds(step, unknowns, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
@@ -232,7 +234,7 @@ class _Recursion:
             design.multipliers[k] = all_multipliers(system, relative * c.multipliers(unknowns, k), self.separate)
         return design._replace(feasible=True, status="optimal")
 
-    def _problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
+    def _find_problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         """Return the step's problem, the one compiled before where its matrices and sizes are the same."""
         step, sizes = self.steps[k], self.coordinates.ratio(k + 1)
         coupling = _coupled_initial_weight(start, self.system.states)
@@ -275,7 +277,7 @@ def _next_weight(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
     return np.block([[unknowns.state, zero], [zero, unknowns.error]])
 
 
-def _unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
+def _make_unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
     """Design without gains, with the solver's status."""
     n, steps = system.states, system.steps
     shapes = (steps, n, system.received), (steps + 1, 2 * n, 2 * n), (steps, 4 if separate else 2)

@@ -100,9 +100,10 @@ class GrowthFinding(NamedTuple):
             )
             verdict = f"not refuted {where} (largest slope {self.slope:.6g})"
             return f"{self.name}: constant {self.constant:g} is assumed: {verdict}; {why}"
-        return f"{self.name}: constant {self.constant:g} is false {where}: {self._evidence()}"
+        return f"{self.name}: constant {self.constant:g} is false {where}: {self._describe_evidence()}"
 
-    def _evidence(self) -> str:
+    def _describe_evidence(self) -> str:
+        """Return in words what refutes the constant: f(0), the slope at a point, or the ratio of a pair."""
         if not self.starts_at_zero:
             return f"f(0) has the norm {self.at_zero:.6g}, not 0"
         if self.ratio <= self.limit:

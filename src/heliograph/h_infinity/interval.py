@@ -89,7 +89,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
     # sums, comparisons and choices, which need their parameters
     match name:
         case "integer_pow":
-            return _power(x[0], params["y"])
+            return _bound_power(x[0], params["y"])
         case "convert_element_type":
             kind = np.dtype(params["new_dtype"])
             if kind.kind not in "fb" and not np.array_equal(x[0].low, x[0].high):
@@ -98,7 +98,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
         case "reduce_sum":
             return _sum(x[0], tuple(params["axes"]))
         case "dot_general":
-            return _dot(x[0], x[1], params["dimension_numbers"])
+            return _bound_contraction(x[0], x[1], params["dimension_numbers"])
         case "iota":
             return point_interval(equation.primitive.bind(**params))
         # what may be true in a part of the interval alone is not decided
@@ -171,7 +171,8 @@ def _product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
     return np.minimum.reduce(ends), np.maximum.reduce(ends)
 
 
-def _quotient(a: Interval, b: Interval) -> Interval:
+def _bound_quotient(a: Interval, b: Interval) -> Interval:
+    """Return an interval of x / y; all numbers where y may be 0."""
     through = (b.low <= 0) & (b.high >= 0)
     safe = Interval(np.where(through, 1.0, b.low), np.where(through, 1.0, b.high))
     ends = [x / y for x in a for y in safe]
@@ -185,9 +186,10 @@ def _square(a: Interval) -> Interval:
     return Interval(np.maximum(square.low, 0.0), square.high)
 
 
-def _power(a: Interval, exponent: int) -> Interval:
+def _bound_power(a: Interval, exponent: int) -> Interval:
+    """Return an interval of x^k for a whole number k."""
     if exponent < 0:
-        return _quotient(point_interval(np.ones_like(a.low)), _power(a, -exponent))
+        return _bound_quotient(point_interval(np.ones_like(a.low)), _bound_power(a, -exponent))
     if exponent % 2 == 0:
         inner = _absolute(a)
         return round_outward(inner.low**exponent, inner.high**exponent, ULPS)
@@ -199,7 +201,7 @@ def _absolute(a: Interval) -> Interval:
     return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, ends[0]), ends[1])
 
 
-def _rising(
+def _extend_monotone(
     function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
     """Return the interval version of a function that never falls, whose values stay between `low` and `high`."""
@@ -211,7 +213,7 @@ def _rising(
     return call
 
 
-def _cosine(a: Interval) -> Interval:
+def _bound_cosine(a: Interval) -> Interval:
     """Return the interval of cos: 1 if an even multiple of pi is inside or a hair outside, -1 if an odd one is."""
     ends = np.cos(a.low), np.cos(a.high)
     cosine = round_outward(np.minimum(*ends), np.maximum(*ends), ULPS)
@@ -230,7 +232,7 @@ def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
     return round_outward(np.sum(a.low, axis=axes) - room, np.sum(a.high, axis=axes) + room)
 
 
-def _dot(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
+def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
     """Return the interval of a contraction: products first, then their sum."""
     (left, right), (left_batch, right_batch) = dimensions
 
@@ -254,22 +256,22 @@ ARITHMETIC: dict[str, Callable[..., Interval]] = {
     "add_any": lambda a, b: round_outward(a.low + b.low, a.high + b.high),
     "sub": lambda a, b: round_outward(a.low - b.high, a.high - b.low),
     "mul": lambda a, b: round_outward(*_product(a, b)),
-    "div": _quotient,
+    "div": _bound_quotient,
     "neg": lambda a: Interval(-a.high, -a.low),
     "max": lambda a, b: Interval(np.maximum(a.low, b.low), np.maximum(a.high, b.high)),
     "min": lambda a, b: Interval(np.minimum(a.low, b.low), np.minimum(a.high, b.high)),
     "abs": _absolute,
     "square": _square,
     "one_minus_square": lambda a: ARITHMETIC["sub"](point_interval(np.ones_like(a.low)), _square(a)),  # a slope of tanh
-    "exp": _rising(np.exp, 0.0),
-    "log": _rising(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
-    "log1p": _rising(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),
-    "expm1": _rising(np.expm1, -1.0),
-    "sqrt": _rising(lambda x: np.where(x >= 0, np.sqrt(np.maximum(x, 0.0)), np.nan)),
-    "rsqrt": lambda a: _quotient(point_interval(np.ones_like(a.low)), ARITHMETIC["sqrt"](a)),
-    "tanh": _rising(np.tanh, -1.0, 1.0),
-    "logistic": _rising(lambda x: 1 / (1 + np.exp(-x)), 0.0, 1.0),
-    "atan": _rising(np.arctan),
-    "sin": lambda a: _cosine(round_outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS)),
-    "cos": _cosine,
+    "exp": _extend_monotone(np.exp, 0.0),
+    "log": _extend_monotone(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
+    "log1p": _extend_monotone(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),
+    "expm1": _extend_monotone(np.expm1, -1.0),
+    "sqrt": _extend_monotone(lambda x: np.where(x >= 0, np.sqrt(np.maximum(x, 0.0)), np.nan)),
+    "rsqrt": lambda a: _bound_quotient(point_interval(np.ones_like(a.low)), ARITHMETIC["sqrt"](a)),
+    "tanh": _extend_monotone(np.tanh, -1.0, 1.0),
+    "logistic": _extend_monotone(lambda x: 1 / (1 + np.exp(-x)), 0.0, 1.0),
+    "atan": _extend_monotone(np.arctan),
+    "sin": lambda a: _bound_cosine(round_outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS)),
+    "cos": _bound_cosine,
 }

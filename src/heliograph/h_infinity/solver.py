@@ -109,7 +109,7 @@ class StepProblem:
         # objectives on L, one problem after another
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
-        goals = _goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
+        goals = _list_goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
         self.problems = [cp.Problem(goal, constraints + more) for goal, more in goals]
 
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
@@ -130,7 +130,7 @@ class StepProblem:
         return status, self.layout.unpack(values)
 
 
-def _goals(
+def _list_goals(
     cp: ModuleType,
     objective: Objective,
     weights: list["Expression"],

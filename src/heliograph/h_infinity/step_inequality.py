@@ -52,7 +52,7 @@ def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
     spreads = [link.spreads() for link in system.channel]
     count = max(len(s) for s in spreads)
     padded = [np.concatenate([s, np.zeros((count - len(s), *s.shape[1:]))]) for s in spreads]
-    return [_matrices_of_step(system, k, padded[k], separate) for k in range(system.steps)]
+    return [_make_step_matrices(system, k, padded[k], separate) for k in range(system.steps)]
 
 
 def all_multipliers(
@@ -66,7 +66,7 @@ def all_multipliers(
     return full
 
 
-def _matrices_of_step(
+def _make_step_matrices(
     system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool
 ) -> StepMatrices:
     """Return the matrices of step k."""
@@ -95,11 +95,11 @@ def _matrices_of_step(
     parts = [[(f, x, system.growth.state[k]), (df, e, system.growth.error[k])]] if w else []
     parts += [[(g, x, system.output_growth.state[k]), (dg, e, system.output_growth.error[k])]] if h else []
     groups = [[term] for pair in parts for term in pair] if separate else parts
-    growth = np.array([_growth_form(q, group) for group in groups]).reshape(-1, q)
+    growth = np.array([_make_growth_form(q, group) for group in groups]).reshape(-1, q)
     return StepMatrices(state, error, received, varied, target, energy, growth, np.zeros((n, system.received)))
 
 
-def _growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
+def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
     """Return sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta."""
     diagonal = np.zeros(q)
     for value, argument, constant in parts:
@@ -142,16 +142,19 @@ class UnknownsLayout(NamedTuple):
         """Unpack the vector into matrices."""
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
-        p1, p2 = _from_lower_triangle(vector[:triangle], n), _from_lower_triangle(vector[triangle : 2 * triangle], n)
+        p1, p2 = (
+            _mirror_lower_triangle(vector[:triangle], n),
+            _mirror_lower_triangle(vector[triangle : 2 * triangle], n),
+        )
         if self.gain is not None:
             product = p2 @ self.gain
             return Unknowns(p1, p2, product, self.gain.T @ product, vector[2 * triangle :])
         rest = vector[2 * triangle :]
         product, spread = rest[: n * m].reshape(n, m), rest[n * m : n * m + m * (m + 1) // 2]
-        return Unknowns(p1, p2, product, _from_lower_triangle(spread, m), vector[self.size - self.multipliers :])
+        return Unknowns(p1, p2, product, _mirror_lower_triangle(spread, m), vector[self.size - self.multipliers :])
 
 
-def _from_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
+def _mirror_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
     """Return the symmetric matrix (n, n) of the entries of its lower triangle."""
     matrix = np.zeros((n, n))
     rows, columns = _triangle_places(n)
@@ -264,17 +267,17 @@ def scale_steps(
     initial = np.diag(1 / np.diagonal(system.initial_weight))
     # covariances of x_0 and e_0 from the initial weight
     x, e = initial[:n, :n], initial[n:, n:]
-    sizes, received, forms, scaled, target = [_scales_of_errors(x, e, plain)], [], [], [], 0.0
+    sizes, received, forms, scaled, target = [_choose_error_scales(x, e, plain)], [], [], [], 0.0
     nominal = steps[0].nominal
     # covariances of (x, e) propagated with the nominal gain, and sizes from these
     for k, step in enumerate(steps):
-        spread = _signal_covariance(system, k, step, x, e)
+        spread = _compute_signal_covariance(system, k, step, x, e)
         target = max(target, float(np.trace(step.target @ spread)))
         x, e, measured, best = _propagate(step, spread, None if gains is None else gains[k])
         nominal = best if gains is not None or k == 0 else _steady_gain(nominal, best, measured, e)
-        sizes.append(_scales_of_errors(x, e, plain))
+        sizes.append(_choose_error_scales(x, e, plain))
         received.append(_powers_of_four_near(np.sqrt(np.diagonal(measured))))
-        unit = _eta_scales(system, k, step, sizes[k])
+        unit = _choose_eta_scales(system, k, step, sizes[k])
         form = np.max(np.abs(step.growth) * np.diagonal(unit) ** 2, axis=1, initial=0.0)  # with growth, T is diagonal
         forms.append(np.where(form > 0, form, 1.0))
         scaled.append(_rescale_step(step, unit, sizes[k + 1], received[k], forms[k], nominal))
@@ -291,7 +294,7 @@ def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.nd
     return np.asarray(4.0 ** np.round(np.log(size) / np.log(4.0)))
 
 
-def _scales_of_errors(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
+def _choose_error_scales(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
     """Return scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
     if plain:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
@@ -314,7 +317,9 @@ def _powers_of_four_near(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]
     return _nearest_power_of_four(np.where(size > 0, size, positive.min() if positive.size else 1.0))
 
 
-def _signal_covariance(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray) -> np.ndarray:
+def _compute_signal_covariance(
+    system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray
+) -> np.ndarray:
     """Return the covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
     n, y, q = system.states, system.output.shape[1], len(step.energy)
     total, at = np.zeros((q, q)), 2 * n
@@ -351,7 +356,7 @@ def _steady_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after
     return last if np.all(np.diagonal(more) <= CONVERGED * np.diagonal(after)) else best
 
 
-def _eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
+def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
     """Scale T of eta = T times what is of order one."""
     n, y = system.states, system.output.shape[1]
     parts = [sizes]

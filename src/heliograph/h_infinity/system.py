@@ -121,7 +121,7 @@ def growth_system(
     n, v = B.shape[1:]
     D = _repeat_over(steps, "feedthrough matrix", feedthrough, (None, v))
     y = D.shape[1]
-    links = _moments_of_links(steps, channel)
+    links = _compute_link_moments(steps, channel)
     if links[0].inputs != y:
         raise fail("channel", f"one that takes the sensor's {y} outputs", f"{links[0].inputs} inputs")
     # every matrix once for each step
@@ -151,7 +151,7 @@ def _repeat_over(
     return matrices[:steps]
 
 
-def _moments_of_links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
+def _compute_link_moments(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
     """Return the joint moments of the channel's gain and noise sources at every step; refuse channels that remember."""
     check_maps("channel", [first(channel)])
     if first(channel).remembers:

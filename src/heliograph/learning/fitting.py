@@ -183,7 +183,7 @@ def fit(
     check_count("starts", starts)
     check_progress(progress, "a line of text")
     description = describe(network)
-    recording, delays = _rows_and_delays(recording)
+    recording, delays = _convert_tables(recording)
     if has_deciding_sender(description.start):
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
@@ -228,7 +228,7 @@ def _search_forms(
     return solutions, ends, False
 
 
-def _rows_and_delays(recording: Any) -> tuple[object, dict[str, Delays]]:
+def _convert_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
     """Return the rows of tables of events, and the laws of their delays by node; other recordings are rows."""
     several = recording if isinstance(recording, list) else [recording]
     tables = [table for table in several if hasattr(table, "lateness")]

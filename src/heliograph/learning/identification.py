@@ -85,7 +85,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
     u = np.zeros((check_count("horizon", horizon), 0)) if inputs is None else np.asarray(inputs, dtype=float)
-    points = _points_around(description.parameters.start, seed)
+    points = _choose_points(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):
         z = _draw_data(objective, x, u, check_seed("seed", seed) + i)
@@ -96,7 +96,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
 def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
     """Return the identifiability by a recording, at three points around a start."""
-    points = _points_around(start, seed)
+    points = _choose_points(start, seed)
     late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
     if not sound:
@@ -105,7 +105,7 @@ def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed
     return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 
 
-def _points_around(start: np.ndarray, seed: int) -> list[np.ndarray]:
+def _choose_points(start: np.ndarray, seed: int) -> list[np.ndarray]:
     """Three points at which to look: a start, and two drawn near it."""
     rng = np.random.default_rng([seed, 1])
     return [

@@ -216,11 +216,11 @@ class Solution:
             elif not self.identifies(slope):
                 rows.append(Row(entry.name, float(value), np.nan, np.nan, np.nan, self.form, False, False))
             else:
-                ends = self._interval_ends(entry, float(value), slope, error, freedom, method, level)
+                ends = self._compute_interval(entry, float(value), slope, error, freedom, method, level)
                 rows.append(self._make_row(entry, float(value), error, ends))
         return tuple(rows)
 
-    def _interval_ends(
+    def _compute_interval(
         self,
         entry: Entry,
         value: float,

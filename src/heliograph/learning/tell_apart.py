@@ -71,7 +71,7 @@ def samples_to_tell(
     level = float(scalar("error", error, 0.0, 0.5))
     if level in (0.0, 0.5):
         raise fail("error", "a number between 0 and 0.5", level)
-    name, node = _only_node(network)
+    name, node = _find_only_node(network)
     count = HORIZON if inputs is None else len(np.asarray(inputs))
     # mean and long-run deviation of the ratio under each law
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
@@ -87,7 +87,7 @@ def samples_to_tell(
     return SamplesToTell(float(needed), (gain_a, gain_b), (deviation_a, deviation_b))
 
 
-def _only_node(network: Network) -> tuple[str, Node]:
+def _find_only_node(network: Network) -> tuple[str, Node]:
     """Return the network's only node, which receives its sensor through a channel."""
     instance("network", network, Network, "a Network")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}

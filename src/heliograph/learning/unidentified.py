@@ -62,7 +62,7 @@ def find_confounded(
     if not count:
         return []
     used = [(x, rank) for x, rank in zip(points, ranks, strict=True) if rank.flat.shape[1] == count]
-    scales = [_derivatives_by_coordinate(parameters, x) for x, _ in used]
+    scales = [_differentiate_coordinates(parameters, x) for x, _ in used]
     logs = [
         _orthonormalise(log[:, None] * rank.unit[:, None] * rank.flat)
         for (_, rank), (_, log) in zip(used, scales, strict=True)
@@ -74,7 +74,7 @@ def find_confounded(
     return [_make_confounded(group, logs, plain) for group in _group_connected(logs)]
 
 
-def _derivatives_by_coordinate(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
+def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives dv/dx and d log|v|/dx of each coordinate that is a number itself; 1 for the others."""
     slopes, log = np.ones(len(x)), np.ones(len(x))
     for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):

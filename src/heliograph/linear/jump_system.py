@@ -120,25 +120,25 @@ class JumpSystem(NamedTuple):
 
 def make_entry_matrix(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
     """Return the matrix of a linear map of symmetric matrices (..., n, n) on the entries of their upper triangles."""
-    _, where, basis = _triangle_places(shape)
+    _, where, basis = _place_in_triangles(shape)
     matrix: Array = linear(basis)[:, *where].T
     return matrix
 
 
 def solve_fixed_point(linear: Maps, constant: Array) -> Any:
     """Solve X = L(X) + C for a linear map of symmetric matrices (..., n, n), and a constant of their shape."""
-    matrix, where = make_entry_matrix(linear, constant.shape), _triangle_places(constant.shape)[1]
+    matrix, where = make_entry_matrix(linear, constant.shape), _place_in_triangles(constant.shape)[1]
     solution = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[where])
     return unpack_entries(solution, constant.shape)
 
 
 def unpack_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
     """Return symmetric matrices with these entries in their upper triangles."""
-    return entries[_triangle_places(shape)[0]]
+    return entries[_place_in_triangles(shape)[0]]
 
 
 @lru_cache(8)
-def _triangle_places(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
+def _place_in_triangles(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
     """Place of each matrix entry among those of the upper triangles, these entries, and matrices of one entry each."""
     where = np.nonzero(np.triu(np.ones(shape)))
     places = np.empty(shape, dtype=int)

@@ -194,20 +194,20 @@ def fastest_unobserved_mode(
     results = [
         UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
         for value, space in eigenspaces(matrix)
-        for modes, vectors in _mode_sets_without_observation(space, outputs)
+        for modes, vectors in _find_unobserving_modes(space, outputs)
     ]
     nothing = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))
     return max(results, key=lambda items: items.growth, default=nothing)
 
 
-def _mode_sets_without_observation(
+def _find_unobserving_modes(
     space: np.ndarray, outputs: Sequence[np.ndarray]
 ) -> list[tuple[tuple[int, ...], np.ndarray]]:
     """List sets of modes that all miss a common eigenvector, largest for each subspace, with a basis of these."""
     subspaces = {frozenset(_modes_not_observing(space, outputs)): space}
     for output in outputs:
         for known in list(subspaces.values()):
-            smaller = _unobservable_part(output, known)
+            smaller = _find_unobservable_part(output, known)
             if smaller.shape[1] and len(subspaces) < SETS_LIMIT:
                 subspaces.setdefault(frozenset(_modes_not_observing(smaller, outputs)), smaller)
     return [(tuple(sorted(modes)), basis) for modes, basis in subspaces.items() if modes]
@@ -215,10 +215,10 @@ def _mode_sets_without_observation(
 
 def _modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) -> Iterable[int]:
     """Return the modes whose output matrix C_i maps the whole subspace to zero."""
-    return (i for i, c in enumerate(outputs) if _unobservable_part(c, space).shape[1] == space.shape[1])
+    return (i for i, c in enumerate(outputs) if _find_unobservable_part(c, space).shape[1] == space.shape[1])
 
 
-def _unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
+def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
     """Return the part of a subspace that the rows of an output do not observe, each row taken at its own size."""
     sizes = np.linalg.norm(output, axis=1)
     rows = output[sizes > 0] / sizes[sizes > 0][:, None]

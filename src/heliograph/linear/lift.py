@@ -110,7 +110,7 @@ def lift_modes(
         chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
         law = _keep_if_unchanged(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
-        noise, rounding_of_noise = _mean_noise(law, lifts, moments)
+        noise, rounding_of_noise = _average_noise(law, lifts, moments)
         output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
         zero = np.zeros(len(mean)), np.zeros(len(output))
         step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise))
@@ -121,7 +121,7 @@ def lift_modes(
     return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), *lost)
 
 
-def _mean_noise(
+def _average_noise(
     law: Float[np.ndarray, " modes"], lifts: "Sequence[LiftedMap]", moments: Moments
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
     """Measurement noise in the mean over the modes, sum_j p_j E[Cov(Z | y, j)], and the rounding of its diagonal."""
@@ -330,16 +330,16 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
 
 def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
     """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
-    plants = _maps_of_models(each_step(plant, horizon), order)
+    plants = _convert_models(each_step(plant, horizon), order)
     sensors, channels = each_step(sensor, horizon), each_step(channel, horizon)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
-        measurements = [_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
+        measurements = [_make_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
     else:
-        measurements = _measurement_maps(sensors, channels, order)
+        measurements = _make_measurement_maps(sensors, channels, order)
     return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
 
 
-def _measurement_maps(
+def _make_measurement_maps(
     sensors: Sequence[AnySensor], channels: Sequence[AbstractRandomAffine], order: int
 ) -> list[AbstractRandomAffine]:
     """Return the maps from the state to z; a sum of links whose sensors' noises are independent is one of x itself."""
@@ -350,10 +350,10 @@ def _measurement_maps(
         apart += [] if by_link is None else [by_link]
     if len(apart) == len(sensors):
         return apart
-    return [Series(pair) for pair in zip(_maps_of_models(sensors, order), channels, strict=True)]
+    return [Series(pair) for pair in zip(_convert_models(sensors, order), channels, strict=True)]
 
 
-def _maps_of_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
+def _convert_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     """Map A x + noise of each plant or sensor; `check_model` has seen that all are linear."""
     maps: list[GainAndNoise] = []
     before, noise = None, Tabulated(models[0].noise, order)

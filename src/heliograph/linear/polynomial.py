@@ -57,7 +57,7 @@ def quadratic_system_with_linear_estimate(
     mean, spread = mean_and_spread(before)
     received, parts, rounding, stored = _make_received_products(n, m), [], [], _MomentCache()
     for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
-        move, listen = stored.move(route.plant, m), _linear_filter_map(Gains(*(field[k] for field in linear.gains)))
+        move, listen = stored.move(route.plant, m), _make_filter_map(Gains(*(field[k] for field in linear.gains)))
         wide = stored.append_measurement(route.measurement, n)
         # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
         transition = symmetric_power(listen, 2) @ wide[0] @ move.moments(2).matrix
@@ -79,7 +79,7 @@ def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "
     return np.block([[matrix, offset[:, None]], [np.zeros((1, matrix.shape[1])), np.ones((1, 1))]])
 
 
-def _linear_filter_map(g: Gains) -> np.ndarray:
+def _make_filter_map(g: Gains) -> np.ndarray:
     """Map (x+, q, z+) to (x+, F q + K z+ + c, z+), one step of the linear filter."""
     n, m = g.gain.shape
     after = np.eye(2 * n + m)
@@ -202,7 +202,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
 
     k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), with a b a monomial of the square.
     """
-    x, z = _product_positions(states), _product_positions(outputs)
+    x, z = _place_products(states), _place_products(outputs)
     before = state_moments(square)
     worst = 0.0
     for k in range(square.horizon):
@@ -224,7 +224,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
     return worst
 
 
-def _product_positions(variables: int) -> dict[tuple[int, ...], int]:
+def _place_products(variables: int) -> dict[tuple[int, ...], int]:
     """Return the positions of y_i and of y_i y_j among the monomials of degree 2."""
     index = {powers: i for i, powers in enumerate(exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)

@@ -85,7 +85,7 @@ def read_bag(
         try:
             for batch in batches(raw_messages(path, reader, used)):
                 if not decoder.add(batch, events):
-                    _add(path, reader, sources, batch, done, events, strict)
+                    _append_messages(path, reader, sources, batch, done, events, strict)
                 done += len(batch)
                 if progress is not None:
                     progress(done, total)
@@ -186,7 +186,7 @@ def batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
         raise failure
 
 
-def _add(
+def _append_messages(
     path: Path,
     reader: "AnyReader",
     sources: Sources,
@@ -247,7 +247,7 @@ def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
             what = f"{path}, {connection.topic}"
             raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
         for path_ in needed:
-            if not _there(fields, path_):
+            if not _has_field(fields, path_):
                 raise fail(
                     f"{path}, {connection.topic}",
                     f"a field {path_!r} in {connection.msgtype}",
@@ -255,7 +255,7 @@ def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
                 )
 
 
-def _there(fields: dict[str, str], path: str) -> bool:
+def _has_field(fields: dict[str, str], path: str) -> bool:
     """Return whether a path is a field, a stamp or another message, or in a list."""
     lists = [name for name, kind in fields.items() if kind == "list"]
     return any(name == path or name.startswith(f"{path}.") for name in fields) or any(

@@ -52,7 +52,7 @@ class Layout:
     def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
-        self._length(0)
+        self._read_length(0)
         end = self._message(4, kind, "")
         if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
             raise LayoutError  # a message is filled up to four bytes at most
@@ -81,14 +81,14 @@ class Layout:
             return self._message(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":
             begin = _align(begin, 4)
-            return begin + 4 + self._length(begin)
+            return begin + 4 + self._read_length(begin)
         if node == "BASE":
             return self._place_numbers(begin, of[0], 1, path, [path])
         # Lists, of numbers or of anything else.
         (inner_node, inner), count = of
         if node == "SEQUENCE":
             begin = _align(begin, 4)
-            count, begin = self._length(begin), begin + 4
+            count, begin = self._read_length(begin), begin + 4
         if inner_node.name == "BASE" and inner[0] in NUMBERS:
             near = any(name.startswith(f"{path}.") for name in self._paths)
             return self._place_numbers(
@@ -109,7 +109,8 @@ class Layout:
                 self.fields[name] = begin + i * size, kind
         return begin + count * size
 
-    def _length(self, begin: int) -> int:
+    def _read_length(self, begin: int) -> int:
+        """Return the length that stands at this byte, of the messages that the layout describes."""
         length = int.from_bytes(self._data[begin : begin + 4], "little")
         self.lengths[begin] = length
         if len(self.lengths) > MOST_LENGTHS or (begin and begin + 4 + length > len(self._data)):
@@ -135,7 +136,7 @@ class Decoder:
         What `Sources.read` says of a message at a time is what it gives: the same numbers, in the same order.
         """
         try:
-            readings = self._readings(batch)
+            readings = self._yield_readings(batch)
         except LayoutError:
             return False
         for node, parts in readings.items():
@@ -149,7 +150,7 @@ class Decoder:
             table.add_many(node, logged, time, sequence, values, parts[-1].period)
         return True
 
-    def _readings(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
+    def _yield_readings(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
         """Return the readings of each node, from the messages of one topic and size after another."""
         if not self._little:
             raise LayoutError
@@ -177,7 +178,7 @@ class Decoder:
         left, index = np.arange(len(table)), 0
         while len(left):
             if index == len(known):
-                paths = {path for source, *_ in self._sources.of(connection.topic) for path in _paths(source)}
+                paths = {path for source, *_ in self._sources.of(connection.topic) for path in _list_paths(source)}
                 known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
             yield left[fits], known[index].columns(table[left[fits]])
@@ -197,7 +198,7 @@ class Readings(NamedTuple):
     period: int
 
 
-def _paths(source: Source) -> list[str]:
+def _list_paths(source: Source) -> list[str]:
     """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutError

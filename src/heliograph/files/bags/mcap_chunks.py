@@ -54,13 +54,15 @@ def _merge_chunks(
     least = [*accumulate(reversed(starts), min)][::-1]  # of a chunk and all after it
     waiting: list[RawMessage] = []
     for chunk, after in zip(chunks, [*least[1:], None], strict=True):
-        waiting = sorted([*waiting, *_messages(storage, chunk, channels)], key=attrgetter("logged"))
+        waiting = sorted([*waiting, *_read_chunk(storage, chunk, channels)], key=attrgetter("logged"))
         end = len(waiting) if after is None else bisect_left(waiting, after, key=attrgetter("logged"))
         yield from waiting[:end]
         waiting = waiting[end:]
 
 
-def _messages(storage: "McapReader", chunk: "ChunkInfo", channels: "Mapping[int, Connection]") -> Iterator[RawMessage]:
+def _read_chunk(
+    storage: "McapReader", chunk: "ChunkInfo", channels: "Mapping[int, Connection]"
+) -> Iterator[RawMessage]:
     """Yield the messages of one chunk, as they stand in it.
 
     Raises:

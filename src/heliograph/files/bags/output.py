@@ -107,7 +107,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     store = _types()
-    times = _nanoseconds(record.time, origin)
+    times = _convert_times(record.time, origin)
     # The writer makes a folder; the file in it is complete in itself.
     with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         bag = Path(folder) / "bag"
@@ -116,9 +116,9 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
                 topic: (writer.add_connection(topic, kind, typestore=store), kind)
                 for node, filters in record.estimates.items()
                 for name, estimate in filters.items()
-                for topic, kind in _topics(f"/{_word(node)}/{_word(name)}", record.states, estimate.claim, pose)
+                for topic, kind in _name_topics(f"/{_word(node)}/{_word(name)}", record.states, estimate.claim, pose)
             }
-            for stamp, topic, message in _messages(record, times, pose, store.types):
+            for stamp, topic, message in _yield_messages(record, times, pose, store.types):
                 connection, kind = topics[topic]
                 writer.write(connection, stamp, store.serialize_cdr(message, kind))
         shutil.move(bag / f"{bag.name}.mcap", partial)
@@ -130,7 +130,7 @@ def _types() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def _nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
+def _convert_times(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
     """Convert times to nanoseconds since 1970: dates, or seconds or steps from an origin."""
     if time.dtype.kind == "M":
         return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
@@ -143,7 +143,8 @@ def _word(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def _topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> Iterator[tuple[str, str]]:
+def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> Iterator[tuple[str, str]]:
+    """Yield topic and message type of each part of one filter's estimates."""
     if any(state is not None for places in pose.places(states) for state in places):
         yield f"{prefix}/odometry", ODOMETRY
     for state in states:
@@ -152,7 +153,7 @@ def _topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> I
             yield f"{prefix}/{_word(state)}/sd", NUMBER
 
 
-def _messages(record: Record, times: list[int], pose: Pose, types: Any) -> Iterator[tuple[int, str, object]]:
+def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) -> Iterator[tuple[int, str, object]]:
     """Yield time, topic and message of each estimate, in order of time."""
     # Estimates as arrays, once for all rows.
     number, places = types[NUMBER], pose.places(record.states)
@@ -169,7 +170,7 @@ def _messages(record: Record, times: list[int], pose: Pose, types: Any) -> Itera
                 continue
             if moves:
                 bound = None if claims[k] == "none" else covariance[k]
-                yield stamp, f"{prefix}/odometry", _odometry(stamp, mean[k], bound, places, pose, types)
+                yield stamp, f"{prefix}/odometry", _make_odometry(stamp, mean[k], bound, places, pose, types)
             for i, state in enumerate(record.states):
                 yield stamp, f"{prefix}/{_word(state)}", number(float(mean[k, i]))
                 if claims[k] != "none":
@@ -180,7 +181,7 @@ def _claims(estimate: Estimate) -> np.ndarray:
     return np.asarray(estimate.claims)
 
 
-def _odometry(
+def _make_odometry(
     stamp: int,
     mean: Float[np.ndarray, " n"],
     covariance: Float[np.ndarray, "n n"] | None,
@@ -191,8 +192,8 @@ def _odometry(
     """Return an odometry message; `covariance` is None where none is claimed."""
     geometry = "geometry_msgs/msg/"
     vector, header = types[f"{geometry}Vector3"], types["std_msgs/msg/Header"]
-    (position, bound), (velocity, twist_bound) = (_part(mean, covariance, states) for states in places)
-    rotation = types[f"{geometry}Quaternion"](*_quaternion(*position[3:]))
+    (position, bound), (velocity, twist_bound) = (_select_pose(mean, covariance, states) for states in places)
+    rotation = types[f"{geometry}Quaternion"](*_convert_angles(*position[3:]))
     there = types[f"{geometry}Pose"](types[f"{geometry}Point"](*position[:3]), rotation)
     moving = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))
     return types[ODOMETRY](
@@ -203,7 +204,7 @@ def _odometry(
     )
 
 
-def _part(
+def _select_pose(
     mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
     """Return the six numbers of pose or twist, and their covariance, row by row."""
@@ -218,7 +219,7 @@ def _part(
     return numbers, bound.ravel()
 
 
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+def _convert_angles(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """Return x, y, z, w of the rotation by yaw about z, then pitch about the new y, then roll about the new x."""
     (sr, sp, sy), (cr, cp, cy) = (f(np.array([roll, pitch, yaw]) / 2).tolist() for f in (np.sin, np.cos))
     return (

@@ -167,11 +167,11 @@ class FrozenWeights(_NeighbourRule):
         """
         rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
-            code = chosen(_weights_of_row, (self.rule, *rows), (False, True, True))
+            code = chosen(_weigh_row, (self.rule, *rows), (False, True, True))
             return None if code.code is None else jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), code.results())
 
 
-def _weights_of_row(
+def _weigh_row(
     rule: AbstractFusion, joint: Float[jax.Array, "degree n degree n"], arrived: Bool[jax.Array, "step degree"]
 ) -> tuple[jax.Array, jax.Array]:
     """Return the parts and covariances (step, ...) of one node's weights."""

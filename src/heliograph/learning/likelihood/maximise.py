@@ -193,7 +193,7 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     badly = going & ~(sound & ((gain > 0.25 * foretold) | (hidden & taken)))
     wider = np.where(well & far, WIDER * state.radius, state.radius)
     radius = np.where(badly, NARROWER * np.minimum(length, state.radius), wider)
-    model = _model_hessian(state, domains, step, gradient, information, gain, sound, taken)
+    model = _update_hessian(state, domains, step, gradient, information, gain, sound, taken)
     pick = taken[:, None]
     after = _State(
         np.where(pick, tried, state.x),
@@ -217,7 +217,7 @@ def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state:
     return values
 
 
-def _model_hessian(
+def _update_hessian(
     state: _State,
     domains: Domains,
     step: np.ndarray,
@@ -234,7 +234,7 @@ def _model_hessian(
     diagonal = np.diagonal(state.information, axis1=1, axis2=2)
     wrong = np.where(domains.free | (diagonal > INVISIBLE), wrong, 0.0)  # elsewhere y is but rounding
     along = np.sum(wrong * step, axis=1)
-    unit, _ = _units_and_flat(state.information, step != 0)
+    unit, _ = _find_flat_directions(state.information, step != 0)
     size = np.sqrt(np.sum((wrong * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
     clear = sound & (np.abs(along) > 1e-8 * size)
     secant = base + np.where(
@@ -264,7 +264,7 @@ def trust_region_step(
     D = max(1, radius u / LONGEST) where a logarithm moves, else 1: matrices scaled by a diagonal are solved as exactly
     as without. To B is added v v' for each direction v that is not identified, whose gradient is but rounding.
     """
-    unit, flat = _units_and_flat(information, moving)
+    unit, flat = _find_flat_directions(information, moving)
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
     g = np.nan_to_num(gradient) * unit
@@ -303,14 +303,14 @@ def expected_gain(
     gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
 ) -> Float[np.ndarray, " lanes"]:
     """Return g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
-    unit, _ = _units_and_flat(information, counting)
+    unit, _ = _find_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
     return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
 
 
-def _units_and_flat(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors of single coordinates, 0 of those that stay, and directions (lanes, p, p) without information."""
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     there = moving & (diagonal > LEAST) & np.isfinite(diagonal)

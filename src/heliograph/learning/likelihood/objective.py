@@ -43,16 +43,16 @@ def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     if network.relays is not None:
         raise fail("network to be learned", "nodes that receive sensors through channels", "relays that filter")
     if network.common is not None:
-        return network.plant, network.common.sensor, _joint_channel(network.common.channel)
+        return network.plant, network.common.sensor, _join_channels(network.common.channel)
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
-    channels = [_joint_channel(node.channel) for node in nodes]
+    channels = [_join_channels(node.channel) for node in nodes]
     if len(nodes) == 1:
         return network.plant, nodes[0].sensor, channels[0]
     sensors = {name: node.sensor for name, node in zip(network.names, nodes, strict=True)}
     return network.plant, *join_links(sensors, channels)
 
 
-def _joint_channel(channel: Channel) -> Channel:
+def _join_channels(channel: Channel) -> Channel:
     """Return the channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel

@@ -83,7 +83,7 @@ class Search:
         top = self._prove_maximum(climbed)
         self.best, ends = top._replace(converged=False, reason=""), climbed.total
         if len(starts) > 1:
-            climbed = self._climb(self._around(top, len(starts) - 1, seed), none)
+            climbed = self._climb(self._draw_around(top, len(starts) - 1, seed), none)
             ends = np.concatenate([ends, climbed.total])
             if climbed.total.max() > top.total + SAME:
                 top = self._prove_maximum(climbed)
@@ -100,13 +100,13 @@ class Search:
         top = _top(climbed, none)
         for _ in range(ROUNDS):
             top = self._move_to_limits(top)
-            again, reason = self._elsewhere(top) if top.converged else (None, self._why_not(top))
+            again, reason = self._choose_restarts(top) if top.converged else (None, self._explain_failure(top))
             if again is None:
                 return top._replace(converged=not reason, reason=reason)
             top = _top(self._climb(again, none), none)
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
-    def _around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "points p"]:
+    def _draw_around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "points p"]:
         """Points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away.
 
         Besides one for each number that has an end of its domain, which is near it there.
@@ -149,7 +149,7 @@ class Search:
             return top
         return _top(self._climb(x[None], ends), ends)
 
-    def _elsewhere(self, top: Top) -> tuple[np.ndarray | None, str]:
+    def _choose_restarts(self, top: Top) -> tuple[np.ndarray | None, str]:
         """Points from which to climb again where the end of a climb is no maximum, or why it is none and nothing helps.
 
         Along each number at the end of its domain the likelihood is looked at on the way back inside.
@@ -165,7 +165,7 @@ class Search:
             return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
         return None, ""
 
-    def _why_not(self, top: Top) -> str:
+    def _explain_failure(self, top: Top) -> str:
         """Why a climb did not arrive: of data that the network reproduces exactly the likelihood has no maximum."""
         z = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         size = np.log(np.nanmax(np.abs(z)))

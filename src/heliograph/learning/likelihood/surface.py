@@ -40,7 +40,7 @@ class Surface:
     def domains(self) -> Domains:
         """Which coordinates are logarithms and logits, and at which side their domains end."""
         every = self.objective.description.parameters.every
-        low, high = (np.concatenate(column) for column in zip(*map(_ends_at_infinity, every), strict=True))
+        low, high = (np.concatenate(column) for column in zip(*map(_find_ends_at_infinity, every), strict=True))
         single = np.concatenate([np.full(number.size, number.domain.kind == "interval") for number in every])
         return Domains(low, high, single & (low | high))
 
@@ -172,7 +172,7 @@ class Surface:
         return np.asarray(x[coordinate] + side * at)
 
 
-def _ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
+def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
     """Return the coordinates of a number that are at an end of its domain at minus infinity, and at infinity."""
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":

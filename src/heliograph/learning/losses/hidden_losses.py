@@ -110,10 +110,10 @@ class Runs:
         """Log-likelihood at logits of (loss when good, when bad, fail, recover), and its gradient by complex steps."""
         shifted = np.broadcast_to(x, (5, 4)).astype(complex)
         shifted[np.arange(4), np.arange(4)] += 1j * STEP
-        total = self._log_likelihoods(1 / (1 + np.exp(-shifted)))
+        total = self._compute_log_likelihoods(1 / (1 + np.exp(-shifted)))
         return float(total[4].real), np.asarray(total[:4].imag / STEP)
 
-    def _log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
+    def _compute_log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
         """Return the log-likelihoods for several sets of shares (sets, 4)."""
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)
@@ -130,7 +130,7 @@ class Runs:
                 parts[:, here] = start[:, None]
                 continue
             step = moved * np.stack(emitted[kind], axis=-1)[:, None, :]  # T' A
-            power, scale = _power_matrices(step, lengths)
+            power, scale = _raise_matrices(step, lengths)
             parts[:, here], scales[:, here] = power[:, position], scale[:, position]
         whole, scale = _multiply_runs(parts)
         ahead = whole.sum(axis=-2)[..., 0]  # all columns of what starts with p 1' agree
@@ -149,7 +149,7 @@ def _scale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return matrix / size[..., None, None], np.log(size)
 
 
-def _power_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scaled matrix^length for each length, and the logarithms of the scales: by the binary digits of the lengths."""
     shape = (len(matrix), len(lengths))
     power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))

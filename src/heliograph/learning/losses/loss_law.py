@@ -135,7 +135,7 @@ class MarkovLosses(AbstractLossLaw):
         counts = np.zeros((2**order, 2))
         parts = check_fates(fates)
         for stretch in parts:
-            past, length = _last_fates(fill_ends(stretch), order)
+            past, length = _number_last_fates(fill_ends(stretch), order)
             # where a chain is counted given its end, the step to the end counts as well
             full = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
             np.add.at(counts, (past[full], fill_ends(stretch)[full].astype(int)), 1.0)
@@ -162,7 +162,7 @@ class MarkovLosses(AbstractLossLaw):
 
     def predicted(self, fate: Packets) -> Packets:
         """Return the probability (k + 1/2) / (n + 1) of each loss after the past, as far as it is known."""
-        past, length = _last_fates(fate, self.order)
+        past, length = _number_last_fates(fate, self.order)
         probabilities = np.zeros(len(fate))
         for known in range(self.order + 1):
             counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)  # over fates further back
@@ -230,7 +230,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
     return MarkovLosses(np.asarray(alone), (fail, recover))
 
 
-def _last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
+def _number_last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the last fates as a number, the latest lowest, and how many are known without a gap, `order` at most."""
     past, length = np.zeros(len(fate), dtype=int), np.zeros(len(fate), dtype=int)
     for back in range(1, order + 1):

@@ -41,10 +41,10 @@ def shares_at(function: Slope, top: np.ndarray, value: float, intervals: bool) -
     """
     if not intervals:
         return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
-    return [_profile_interval(function, top, value, i) for i in range(len(top))]
+    return [_find_profile_interval(function, top, value, i) for i in range(len(top))]
 
 
-def _profile_interval(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
+def _find_profile_interval(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
     """The share at logit i of the maximum, with the interval where the profile of its likelihood falls by FALL."""
     ends = {side: top[i] * side > END - 4 for side in (-1, 1)}
     fall = FALL_AT_END if any(ends.values()) else FALL
