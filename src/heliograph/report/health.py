@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from heliograph.filters.base import AbstractFilter
 from heliograph.model.over_time import OverTime, first
+from heliograph.model.plant import TIME_STEP
 from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
+from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
@@ -29,7 +32,8 @@ LEAST_CORRELATION = 0.1  # below which memory is not worth a warning: it predict
 class FilterHealth:
     """Innovations of one filter in units of its claim (time, m), and the test of their whiteness.
 
-    Both are None for a filter without a claim, the test also if there are too few rows.
+    Both are None for a filter without a claim, the test also if there are too few rows. declared: the judgement of
+    variances that messages declare; None where they declare none. unit: of the plant's time.
     """
 
     node: str
@@ -38,6 +42,8 @@ class FilterHealth:
     white: np.ndarray | None
     test: MemoryTest | None
     trusted: bool = True  # whether the network relies on it
+    declared: DeclaredJudgement | None = None
+    unit: str = "steps"
 
 
 @dataclass(frozen=True)
@@ -100,9 +106,12 @@ class Health:
     def _describe_doubts(self, health: FilterHealth) -> Iterator[str]:
         """Say which claims innovations contradict: the size of each output's, of all together, and their memory."""
         yield from self._describe_left_out(health)
-        if health.test is None:
+        name = f"{health.node}/{health.filter}"
+        said = [] if health.declared is None else health.declared.sentences(health.unit)
+        yield from (f"{name}: {sentence}" for sentence in said)
+        if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
             return
-        test, name = health.test, f"{health.node}/{health.filter}"
+        test = health.test
         # Many filters are tested: each at a level at which all together are seldom wrong (Bonferroni).
         level = FALSE / sum(filter.test is not None for filter in self.filters)
         outputs = [e for e in self.outputs if (e.node, e.filter) == (health.node, health.filter)]
@@ -189,11 +198,27 @@ def examine(
             outputs += outputs_of(network, listener, record, inputs)
             test = _test_innovations(about_mean(white) if weighs(filter) else white)
         lost = np.any(record.estimates[node][name].claims == "none")
-        filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
+        claim = "none" if lost else filter.claim
+        declared = None if test is None else _judge_declared(filter, z, inputs)
+        unit = _time_unit(record) if TIME_STEP in network.inputs else "steps"
+        filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit))
     others = tuple(belief.words for belief in network.beliefs())
     return Health(
         record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
     )
+
+
+def _judge_declared(filter: AbstractFilter, z: np.ndarray, inputs: np.ndarray) -> DeclaredJudgement | None:
+    """Judge the variances that messages declare; None where they declare none, or are too few."""
+    try:
+        return judge_declared(filter, z, inputs)
+    except InputError:
+        return None
+
+
+def _time_unit(record: Record) -> str:
+    """Return the unit of the times of a record, in words."""
+    return record.units.get("time", "s" if record.time.dtype.kind == "M" else "of the unit of time")
 
 
 def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:

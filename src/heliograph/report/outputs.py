@@ -172,7 +172,13 @@ def outputs_of(network: Network, listener: Listener, record: Record, inputs: np.
         variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
         innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
     medians = law_medians(network, listener.node, _median_over_time(np.asarray(innovations.variance)))
-    judged = judge_outputs(listener.outputs, listener.measurements, innovations, medians, weighed and listener.blames)
+    # What is told, such as a gain or a flag, is known: its innovations are 0, of variance 0.
+    variance = np.asarray(innovations.variance)
+    judges = ~(np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0))
+    names = [name for name, is_judged in zip(listener.outputs, judges, strict=True) if is_judged]
+    uncertain = Weighed(*(np.asarray(column)[:, judges] for column in innovations))
+    received = listener.measurements[:, judges]
+    judged = judge_outputs(names, received, uncertain, medians[judges], weighed and listener.blames)
     return [OutputHealth(listener.node, listener.name, weighed, output) for output in judged]
 
 

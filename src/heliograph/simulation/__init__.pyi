@@ -22,6 +22,12 @@ from .boundedness import (
     Boundedness as Boundedness,
     certify_boundedness as certify_boundedness,
 )
+from .declared.judgement import (
+    DeclaredBias as DeclaredBias,
+    DeclaredClass as DeclaredClass,
+    DeclaredJudgement as DeclaredJudgement,
+    judge_declared as judge_declared,
+)
 from .description.wide_angles import (
     WideAngles as WideAngles,
 )

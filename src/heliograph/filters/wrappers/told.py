@@ -34,7 +34,10 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.random_affine.told import believe_told, give_law, made_certain, told_maps
+
+ROUNDING = 1e-12  # of squared gains
 
 F = TypeVar("F", bound=AbstractFilter)
 P = ParamSpec("P")
@@ -99,7 +102,10 @@ class ToldFilter(AbstractSizedFilter):
             flag_innovation, covariance = append_flag(covariance, number)
             value = jnp.append(value, flag_innovation)
         order = np.argsort((*self.values, *self.numbers))
-        return after, Innovation(value[order], covariance[order][:, order], innovation.log_likelihood)
+        weight = innovation.weight
+        if weight is not None:
+            weight = jnp.concatenate([weight, jnp.where(jnp.isnan(numbers), jnp.nan, 1.0)])[order]
+        return after, Innovation(value[order], covariance[order][:, order], innovation.log_likelihood, weight)
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
@@ -130,6 +136,31 @@ class ToldFilter(AbstractSizedFilter):
     def silence_tells(self) -> bool:
         """As the filter within."""
         return self.base.silence_tells
+
+    @property
+    def knows_gain(self) -> bool:
+        """True if no gain is random given what is told, so that innovations of a Gaussian world are independent."""
+        link = believe_typical(first(self.link))
+        if link.remembers:
+            return False
+        moments = second_order(link)
+        size = np.max(np.abs(np.asarray(moments.mean_gain)), initial=0.0)
+        return bool(np.all(np.abs(np.asarray(moments.gain_spread)) <= ROUNDING * size**2))
+
+    def with_models(self, plant: AnyPlant, sensor: AnySensor, link: Channel) -> "ToldFilter":
+        """Return the filter of another plant, sensor and link, told the same numbers; of the same claim."""
+        base = self.make(plant, sensor, at_each_step(believe_typical, link))
+        sizes = make_sizes(self.claim, base, self.received)
+        return ToldFilter(
+            base=base,
+            plant=plant,
+            sensor=sensor,
+            link=link,
+            make=self.make,
+            values=self.values,
+            numbers=self.numbers,
+            **sizes,
+        )
 
     def _claim(self, estimate: Estimate) -> Estimate:
         return Estimate(estimate.mean, estimate.covariance, self.claim)
@@ -178,7 +209,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state.
     """
     link = at_each_step(lambda channel: made_certain(take_apart(channel).link), channel)
-    base = make(plant, sensor, at_each_step(_believe_typical, link))
+    base = make(plant, sensor, at_each_step(believe_typical, link))
     exogenous = all(affine.exogenous for affine in told_maps(first(link)))
     claim: Claim = base.claim if exogenous or base.claim == "none" else "nominal"
     _, values, numbers = take_apart(first(channel))
@@ -197,7 +228,8 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
 
 
 @in_float64
-def _believe_typical(link: PyTree) -> PyTree:
+def believe_typical(link: PyTree) -> PyTree:
+    """Return a link as it is for typical numbers."""
     typical = [affine.typical for affine in told_maps(link)]
     return believe_told(link, library(typical).concatenate(typical))
 

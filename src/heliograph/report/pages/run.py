@@ -362,6 +362,8 @@ def run_summary(health: Health) -> dict[str, Json]:
                 "correlation": float(tested_filter.test.correlation[0]),
                 "p_value": tested_filter.test.p_value,
             }
+        if tested_filter.declared is not None:
+            results["declared"] = [dict(one._asdict()) for one in tested_filter.declared.classes]
         filters.setdefault(tested_filter.node, {})[tested_filter.filter] = results
     # What the innovations say of each output.
     outputs: dict[str, dict[str, dict[str, Json]]] = {}

@@ -59,7 +59,9 @@ class RunningNis:
         if self.ratio > high:
             return f"its squared innovations are {self.ratio:.1f} times what its covariance says (at most {high:.1f})"
         if self.ratio < low and self.claim != "upper":  # an upper bound may be larger than what happens
-            return f"its squared innovations are {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
+            # No sign of safety: noises may be stated too large, or an error change slowly, which the filter follows.
+            small = f"its squared innovations are {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
+            return f"{small}: noises are stated too large, or an error changes slowly; `heliograph run --report` tells"
         return None
 
 

@@ -11,6 +11,7 @@ from heliograph.disk.quoting import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.wrappers.told import ToldFilter
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
@@ -24,6 +25,7 @@ from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
+from heliograph.simulation.declared.refit import declares_noise
 from heliograph.simulation.description.diagram import list_rounded, list_shared
 from heliograph.simulation.description.fallbacks import list_fallbacks
 from heliograph.simulation.description.separable import separate_nodes
@@ -66,6 +68,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
+    lines += _told(network)
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
@@ -172,6 +175,17 @@ def _unheard(network: Network) -> Iterator[Doubt]:
         silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
         if silent:
             yield Doubt(False, f"unheard: {join_names(silent)} at {name!r}: of mean gain 0, which only adds noise")
+
+
+def _told(network: Network) -> Iterator[Doubt]:
+    """Yield the nodes whose messages declare their noise, which is true as far as a recording says."""
+    names = [name for name, node in network.nodes.items() if isinstance(node, Node) for filter in node.filters.values()
+             if isinstance(filter, ToldFilter) and declares_noise(filter)]  # fmt: skip
+    if names:
+        who = join_names([repr(name) for name in dict.fromkeys(names)])
+        yield Doubt(
+            False, f"declared: noise is taken as the messages of {who} say it; `heliograph run --report` judges it"
+        )
 
 
 def _other_worlds(network: Network) -> Iterator[Doubt]:

@@ -1,0 +1,329 @@
+"""Whether variances that messages declare are true: sizes and memory of innovations, and what a refit says of both."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+import scipy
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.filter_data import check_data
+from heliograph.filters.wrappers.told import ToldFilter
+from heliograph.model.over_time import first
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.module import readable
+from heliograph.numerics.shares import average_correlated
+from heliograph.numerics.types import Array, ArrayLike, Float, Int
+from heliograph.random_affine.told import AbstractTold, told_maps
+from heliograph.simulation.declared.refit import (
+    Declared,
+    Refit,
+    declared_noises,
+    declares_noise,
+    find_end,
+    refit_filter,
+    refit_scales,
+    refit_with_bias,
+)
+from heliograph.simulation.results.whiteness import whitened_innovations
+from heliograph.simulation.runs.over_runs import over_runs
+
+LEVEL = 0.01  # of each test
+LAGS = 10
+FEWEST = 20  # rows with values, below which nothing is judged
+MOST = 2000  # rows that decide
+CLASSES = 4  # of declared variances, at most
+EACH = 60  # numbers in a class at least, which show a factor of 2 of the innovations' variance in 9 of 10 recordings
+LEAST = 1.1  # ratio of variances from which one is worth a sentence
+
+
+@readable
+class DeclaredClass(NamedTuple):
+    """Messages of similar declared variances, and what the innovations say of these.
+
+    Args:
+        low: smallest declared variance, the geometric mean over the outputs.
+        high: largest one.
+        numbers: values that arrived.
+        nis: mean square of the innovations over their claimed variance; 1 where the claim holds.
+        nis_low: lower end of the interval in which it is for a true claim, in 99 of 100 recordings for all classes.
+        nis_high: upper end.
+        scale: factor of the declared variances that fits best, without a bias; 1 where nothing contradicts them.
+        scale_low: lower end of its 95 % interval.
+        scale_high: upper end.
+    """
+
+    low: float
+    high: float
+    numbers: int
+    nis: float
+    nis_low: float
+    nis_high: float
+    scale: float
+    scale_low: float
+    scale_high: float
+
+
+@readable
+class DeclaredBias(NamedTuple):
+    """A bias of each output that explains what no scale of the declared variances does.
+
+    Args:
+        deviation: its deviation, of each output (outputs,).
+        time: its memory, in the time of the plant.
+        time_low: lower end of the 95 % interval of the memory.
+        time_high: upper end; infinite where the recording does not bound it.
+        times_white: declared deviation over that of the white part, of all classes the smallest.
+        times_white_low: lower end of its interval.
+        gain: nats by which the likelihood is higher with it.
+    """
+
+    deviation: Float[np.ndarray, " outputs"]
+    time: float
+    time_low: float
+    time_high: float
+    times_white: float
+    times_white_low: float
+    gain: float
+
+
+@readable
+@dataclass(frozen=True)
+class DeclaredJudgement:
+    """Judgement of declared variances by a recording.
+
+    Args:
+        classes: messages by declared variance, in its order.
+        correlation: of innovations one message apart, as declared.
+        p_value: of correlations over up to ten messages, if there were none.
+        refit_correlation: the same after the variances are scaled.
+        refit_p_value: p-value of these.
+        bias: what explains the innovations where no scale does; None where one does, or nothing is wrong.
+    """
+
+    classes: tuple[DeclaredClass, ...]
+    correlation: float
+    p_value: float
+    refit_correlation: float
+    refit_p_value: float
+    bias: DeclaredBias | None
+
+    @property
+    def contradicted(self) -> bool:
+        """True if sizes or memory of the innovations contradict what was declared, at 1 % each."""
+        sizes = any(not c.nis_low <= c.nis <= c.nis_high for c in self.classes)
+        return sizes or self.p_value < LEVEL
+
+    def sentences(self, unit: str = "steps") -> list[str]:
+        """Return what is to be said, a line each; nothing where the declared variances may be true.
+
+        Args:
+            unit: of the plant's time; steps by default.
+        """
+        if not self.contradicted:
+            return []
+        if self.bias is not None:
+            return _say_bias(self.bias, unit)
+        if self.refit_p_value < LEVEL:
+            return [
+                "neither a scale of the declared variances nor a bias explains the innovations: correlated over one "
+                f"message ({self.refit_correlation:.2f}) after a refit, by something that the model forgets"
+            ]
+        return [line for one in self.classes for line in _say_scale(one, len(self.classes) > 1)]
+
+
+def judge_declared(
+    filter: AbstractFilter,
+    data: "Float[ArrayLike, 'steps received']",
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+) -> DeclaredJudgement:
+    """Judge the variances that messages declare by a recording, with the plant as it is.
+
+    Innovations in claimed deviations u are tested twice at 1 %: the mean square of each class of declared variances,
+    and the correlation over up to ten messages, r_l = sum u_k u_(k-l) / sum u^2, which is in units of what was seen,
+    not of what was claimed. Small innovations alone mean nothing: variances that are too large, and an error that
+    changes slowly, look alike. So variances are scaled to fit best, R = s a for each class, and the tests repeated: if
+    they pass, a scale was wrong; if not, a Gauss-Markov bias of each output is fitted beside the scales, and taken if
+    the likelihood says so.
+
+    Args:
+        filter: a filter behind a link whose Gaussian noise is told (`hg.model.told`).
+        data: values and what was declared of them (steps, received), NaN where a component did not arrive; the first
+            2,000 rows count.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+
+    Raises:
+        ValueError: a filter that is told no noise, data or inputs of the wrong shape, fewer than 20 rows with values.
+    Source: Ljung and Box (1978) for the correlations; Newey and West (1987) for errors where gains are random.
+    """
+    if not (isinstance(filter, ToldFilter) and declares_noise(filter)):
+        got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
+        raise fail("filter", "one whose link tells the variance of its Gaussian noise (hg.model.told)", got)
+    z, u = (np.asarray(rows)[:MOST] for rows in check_data(filter, data, inputs))
+    declared, classes = _classify(filter, z, u)
+    if np.sum(classes >= 0) < FEWEST:
+        raise fail(
+            "data", f"at least {FEWEST} rows with values and what is declared of them", int(np.sum(classes >= 0))
+        )
+    before = _test(declared, filter, classes)
+    if not before.contradicts:
+        plain = np.ones(declared.classes)
+        return _judgement(declared, classes, (before, before), (plain, plain, plain), None)
+    refit = refit_scales(declared)
+    again = _test(declared, refit_filter(declared, refit.logs), classes)
+    bias = _find_bias(declared, refit) if again.p_value < LEVEL else None
+    ends = [[find_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1)]
+    scales = np.exp(refit.logs), np.exp(ends[0]), np.exp(ends[1])
+    return _judgement(declared, classes, (before, again), scales, bias)
+
+
+class _Tested(NamedTuple):
+    """Mean squares of each class with their interval, and the correlation over one message with the p-value of all."""
+
+    nis: list[tuple[float, float, float]]
+    correlation: float
+    p_value: float
+
+    @property
+    def contradicts(self) -> bool:
+        return self.p_value < LEVEL or any(not low <= nis <= high for nis, low, high in self.nis)
+
+
+class _Noises(eqx.Module):
+    """Variances of the noises that a told link declares."""
+
+    told: AbstractTold
+
+    def __call__(self, numbers: Array) -> Array:
+        return declared_noises(self.told.believed(numbers))
+
+
+def _classify(
+    filter: ToldFilter, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
+) -> tuple[Declared, Int[np.ndarray, " steps"]]:
+    """Return the recording with its classes of declared variances, and that of each row: -1 of one that is not used."""
+    (told,) = told_maps(first(filter.link))
+    numbers = z[:, list(filter.numbers)]
+    complete = ~np.isnan(numbers).any(axis=1)
+    variances = np.asarray(over_runs(_Noises(told), np.where(complete[:, None], numbers, np.asarray(told.typical))))
+    heard = complete & ~np.isnan(z[:, list(filter.values)]).all(axis=1) & (variances > 0).all(axis=1)
+    with np.errstate(all="ignore"):
+        size = np.mean(np.log(variances), axis=1)
+    z = np.where(heard[:, None], z, np.nan)  # what gives no law would spoil the state
+    count = int(np.sum(~np.isnan(z[:, list(filter.values)])))
+    most = min(CLASSES, len(np.unique(size[heard])), max(count // EACH, 1))
+    inner = np.quantile(size[heard], np.arange(1, most) / most, method="lower") if heard.any() else []
+    edges = np.array([edge for edge in np.unique(inner) if edge < size[heard].max()])
+    outputs = len(filter.sensor.outputs) if isinstance(filter.sensor, AbstractSensor) else variances.shape[1]
+    usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
+    deviation = usual if len(usual) == outputs else np.full(outputs, np.exp(np.mean(np.log(usual))))
+    return Declared(filter, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, size), -1)
+
+
+def _test(declared: Declared, filter: ToldFilter, classes: Int[np.ndarray, " steps"]) -> _Tested:
+    """Test the innovations of a filter: their mean squares by class, and their correlation over messages."""
+    white = whitened_innovations(declared.z, filter, declared.u)[:, list(filter.values)]
+    tail, nis = LEVEL / declared.classes / 2, list[tuple[float, float, float]]()
+    for number in range(declared.classes):
+        squares = white[classes == number] ** 2
+        count = int(np.sum(~np.isnan(squares)))
+        mean = float(np.nansum(squares) / count)
+        if filter.knows_gain:
+            low, high = (
+                (2 * scipy.special.gammaincinv(count / 2, p) / count for p in (tail, 1 - tail)) if count else (0, 1)
+            )
+        else:
+            error = average_correlated(np.nanmean(squares, axis=1))[1]
+            low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
+        nis.append((mean, float(low), float(high)))
+    return _Tested(nis, *_correlate(white[classes >= 0], filter.knows_gain))
+
+
+def _correlate(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
+    """Correlation over one message, and the p-value of those over up to ten; `exact`: innovations are independent."""
+    rows, count = len(white), int(np.sum(~np.isnan(white)))
+    lags = min(LAGS, rows // 10)
+    power = np.nansum(white**2)
+    products = [white[lag:] * white[:-lag] for lag in range(1, lags + 1)]
+    r = np.array([np.nansum(product) for product in products]) / power
+    if exact:
+        squared = count * (rows + 2) * r**2 / (rows - np.arange(1, lags + 1))
+    else:
+        sums = [average_correlated(np.nansum(product, axis=1)) for product in products]
+        squared = np.array([(mean / error) ** 2 if error > 0 else 0.0 for mean, error in sums])
+    return float(r[0]), float(scipy.special.gammaincc(lags / 2, np.sum(squared) / 2))
+
+
+def _find_bias(declared: Declared, scales: Refit) -> DeclaredBias | None:
+    """Fit a bias of each output beside the scales; None where the likelihood does not take it, at 1 %."""
+    filter = declared.filter
+    if not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor)):
+        return None  # which vary over time
+    best = refit_with_bias(declared, scales)
+    gain = best.likelihood - scales.likelihood
+    if gain < scipy.special.gammainccinv(1, LEVEL):  # half of a chi-squared number with two degrees of freedom
+        return None
+    count = declared.classes
+    rate, time = np.exp(best.logs[count:])
+    low, high = (float(np.exp(find_end(declared, best, count + 1, sign))) for sign in (-1, 1))
+    highest = max(find_end(declared, best, number, 1) for number in range(count))
+    white, most = (float(np.exp(-log / 2)) for log in (np.max(best.logs[:count]), highest))
+    return DeclaredBias(rate * np.sqrt(time) * declared.deviation, float(time), low, high, white, most, gain)
+
+
+def _judgement(
+    declared: Declared,
+    classes: Int[np.ndarray, " steps"],
+    tested: tuple[_Tested, _Tested],
+    scales: tuple[np.ndarray, np.ndarray, np.ndarray],
+    bias: DeclaredBias | None,
+) -> DeclaredJudgement:
+    """Put together what was found, class by class."""
+    before, again = tested
+    filter, results = declared.filter, []
+    (told,) = told_maps(first(filter.link))
+    for number, (nis, low, high) in enumerate(before.nis):
+        rows = declared.z[classes == number]
+        variances = np.asarray(over_runs(_Noises(told), rows[:, list(filter.numbers)]))
+        size = np.exp(np.mean(np.log(variances), axis=1))
+        count = int(np.sum(~np.isnan(rows[:, list(filter.values)])))
+        ends = (float(values[number]) for values in scales)
+        results.append(DeclaredClass(float(size.min()), float(size.max()), count, nis, low, high, *ends))
+    return DeclaredJudgement(tuple(results), before.correlation, before.p_value, again.correlation, again.p_value, bias)
+
+
+def _say_bias(bias: DeclaredBias, unit: str) -> list[str]:
+    lines = []
+    if bias.times_white_low > np.sqrt(LEAST):
+        bounded = bias.times_white < 2 * bias.times_white_low
+        times = f"{_round(bias.times_white)}" if bounded else f"at least {_round(bias.times_white_low)}"
+        lines.append(f"the declared deviation is {times} times the white part of the error")
+    ends = f"{_round(bias.time_low)} to {_round(bias.time_high)}" if np.isfinite(bias.time_high) else (
+        f"at least {_round(bias.time_low)}")  # fmt: skip
+    lines.append(
+        f"the error has a memory of about {_round(bias.time)} {unit} ({ends}): give it a bias state (with_bias)"
+    )
+    return lines
+
+
+def _say_scale(one: DeclaredClass, several: bool) -> list[str]:
+    """Say that the variances of a class are too large or too small, where the interval of the scale does."""
+    if one.scale_low < LEAST and one.scale_high > 1 / LEAST:
+        return []
+    times, low, high = one.scale, one.scale_low, one.scale_high
+    kind = "small"
+    if one.scale < 1:
+        times, low, high, kind = 1 / one.scale, 1 / one.scale_high, 1 / one.scale_low, "large"
+    of = f" from {one.low:.3g} to {one.high:.3g}" if several else ""
+    return [
+        f"declared variances{of} are {_round(times)} times too {kind} ({_round(low)} to {_round(high)}); scaled so, "
+        "the innovations pass"
+    ]
+
+
+def _round(value: float) -> str:
+    """Return a number of two digits, as it is said."""
+    return f"{float(f'{value:.2g}'):,.15g}"

@@ -1,0 +1,227 @@
+"""Refit of declared noise to a recording: a scale for each class of messages, and a bias beside it, by likelihood."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+
+from heliograph.filters.wrappers.told import ToldFilter
+from heliograph.model.bias import with_bias
+from heliograph.model.plant import TIME_STEP, AbstractPlant
+from heliograph.model.sensor import AbstractSensor
+from heliograph.model.told import LinkGivenNumbers
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.told import GainTold, Told, told_maps
+from heliograph.simulation.likelihood import log_likelihood
+from heliograph.simulation.runs.over_runs import over_runs
+
+ALMOST = 2**-20  # by which typical numbers are moved, to see whether a noise depends on them
+REACH = 1.92  # nats below the maximum at the ends of a 95 % interval of one number
+FARTHEST = 40.0  # nats of a logarithm beyond which a scale has no end
+FAST, SLOW = 0.5, 1e4  # of a bias's memory: shortest in steps, longest in lengths of the recording
+TIMES = (5.0, 50.0)  # steps: memories from which the search begins
+DIFFERENCE = 1e-4  # of logarithms, for slopes
+SLOPE = 3e-3  # nats for a factor of e in a number, at which it is at its best
+CLOSE = 0.05  # of a logarithm: as near as the end of an interval is found
+LOST = 1e12  # nats that numbers lose which give no likelihood
+
+
+class Declared(NamedTuple):
+    """A filter of messages that declare noise, with what they declared in the rows of a recording.
+
+    Args:
+        filter: the filter.
+        edges: logarithms of declared variances at which one class of messages ends and the next begins (classes - 1,).
+        deviation: usual declared deviation of each output (outputs,).
+        z: measurements (steps, received).
+        u: inputs (steps, inputs).
+    """
+
+    filter: ToldFilter
+    edges: Float[np.ndarray, " edges"]
+    deviation: Float[np.ndarray, " outputs"]
+    z: Float[np.ndarray, "steps received"]
+    u: Float[np.ndarray, "steps inputs"]
+
+    @property
+    def classes(self) -> int:
+        """Number of classes of messages."""
+        return len(self.edges) + 1
+
+
+class ScaledNoise(eqx.Module):
+    """The link that declared numbers give, its noise times the scale of their class."""
+
+    make: LinkGivenNumbers
+    edges: Array
+    scales: Array
+
+    def __call__(self, numbers: Array) -> AbstractRandomAffine:
+        """Return the link of these numbers."""
+        link = self.make(numbers)
+        size = jnp.mean(jnp.log(declared_noises(link)))
+        scale = jnp.asarray(self.scales)[jnp.sum(size > jnp.asarray(self.edges))]
+
+        def rescale(leaf: object) -> object:
+            return Gaussian(scale * leaf.covariance, leaf.mean) if isinstance(leaf, AbstractNoise) else leaf
+
+        scaled: AbstractRandomAffine = jax.tree.map(rescale, link, is_leaf=_is_noise)
+        return scaled
+
+
+def declared_noises(link: AbstractRandomAffine) -> jax.Array:
+    """Return the variances of a link's noises, one after another."""
+    return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _noises(link)])
+
+
+def declares_noise(filter: ToldFilter) -> bool:
+    """Return whether messages tell the variances of one Gaussian noise, which a scale may correct."""
+    maps = told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
+    return len(maps) == 1 and isinstance(maps[0], Told) and _declares(maps[0])
+
+
+@in_float64
+def _declares(affine: Told) -> bool:
+    if isinstance(affine.make, GainTold):
+        return False
+    typical = np.asarray(affine.typical)
+    noises, moved = (_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
+    changes = any(not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, moved, strict=True))
+    return changes and all(isinstance(noise, Gaussian) for noise in noises)
+
+
+def _noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
+    return [leaf for leaf in jax.tree.leaves(link, is_leaf=_is_noise) if _is_noise(leaf)]
+
+
+def _is_noise(leaf: object) -> bool:
+    return isinstance(leaf, AbstractNoise)
+
+
+def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
+    """Return the filter with the noise scaled, and with a bias of each output where there are two numbers more.
+
+    Args:
+        declared: the filter and the recording.
+        logs: logarithms of the scale of each class, and of a bias its deviation, in units of that declared, over the
+            root of its memory, which data tell better than the deviation, and its memory, in the time of the plant
+            (classes,) or (classes + 2,).
+    """
+    filter, numbers = declared.filter, jnp.exp(jnp.asarray(logs))
+
+    def rescale(leaf: object) -> object:
+        scaled = ScaledNoise(leaf.make, declared.edges, numbers[: declared.classes]) if isinstance(leaf, Told) else None
+        return leaf if scaled is None else eqx.tree_at(lambda affine: affine.make, leaf, scaled)
+
+    link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, Told))
+    plant, sensor = filter.plant, filter.sensor
+    if len(logs) > declared.classes:
+        assert isinstance(plant, AbstractPlant) and isinstance(sensor, AbstractSensor)
+        rate, time = numbers[declared.classes :]
+        dt = TIME_STEP if TIME_STEP in plant.inputs else 1.0
+        plant, sensor = with_bias(plant, sensor, rate * jnp.sqrt(time) * declared.deviation, time, dt)
+    return filter.with_models(plant, sensor, link)
+
+
+class Likelihood(eqx.Module):
+    """The log-likelihood of a recording as a function of the numbers that `refit_filter` takes."""
+
+    declared: Declared
+
+    def __call__(self, logs: Array) -> Array:
+        """Return the log-likelihood, in nats."""
+        refit = refit_filter(self.declared, logs)
+        return jnp.asarray(log_likelihood(refit, self.declared.z, self.declared.u))
+
+
+class Refit(NamedTuple):
+    """Numbers by which declared noise fits a recording best.
+
+    Args:
+        logs: their logarithms, as `refit_filter` takes them.
+        likelihood: log-likelihood there, in nats.
+    """
+
+    logs: Float[np.ndarray, " numbers"]
+    likelihood: float
+
+
+def refit_scales(declared: Declared) -> Refit:
+    """Fit the scale of each class, with everything else as the filter has it."""
+    return _search(declared, np.zeros(declared.classes))
+
+
+def refit_with_bias(declared: Declared, scales: Refit) -> Refit:
+    """Fit the scales, and deviation and memory of a bias of each output, from scales without one."""
+    step = usual_step(declared)
+    white = scales.logs - np.log(4)
+    starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
+    return max((_search(declared, start) for start in starts), key=lambda refit: refit.likelihood)
+
+
+def usual_step(declared: Declared) -> float:
+    """Return the usual time of a step: 1 where the plant counts steps."""
+    inputs = declared.filter.inputs
+    return float(np.median(declared.u[:, inputs.index(TIME_STEP)])) if TIME_STEP in inputs else 1.0
+
+
+def find_end(declared: Declared, best: Refit, number: int, sign: int) -> float:
+    """Return the end of the 95 % interval of the logarithm of a number; infinite where the likelihood never falls.
+
+    There the likelihood, the other numbers at their best, is 1.92 nats below its maximum.
+
+    Args:
+        declared: the filter and the recording.
+        best: the maximum.
+        number: which of the numbers.
+        sign: 1 for the upper end, -1 for the lower one.
+    """
+    others = best
+
+    def fall(distance: float) -> float:
+        nonlocal others
+        start = others.logs.copy()
+        start[number] = best.logs[number] + sign * distance
+        others = _search(declared, start, fixed=number)
+        return best.likelihood - others.likelihood - REACH
+
+    near, far = 0.0, 0.25
+    while fall(far) < 0:
+        near, far = far, 2 * far
+        if far > FARTHEST:
+            return sign * np.inf
+    while far - near > CLOSE:
+        middle = (near + far) / 2
+        near, far = (middle, far) if fall(middle) < 0 else (near, middle)
+    return float(best.logs[number] + sign * far)
+
+
+def _search(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: int | None = None) -> Refit:
+    """Climb the likelihood from a start, all numbers free but one that is fixed."""
+    free = np.arange(len(start)) != fixed
+    low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
+    if len(start) > declared.classes:
+        step = usual_step(declared)
+        low[-1], high[-1] = np.log(FAST * step), np.log(SLOW * len(declared.z) * step)
+    likelihood, steps = Likelihood(declared), DIFFERENCE * np.eye(len(start))[free]
+
+    def lost(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
+        every = start.copy()
+        every[free] = logs
+        points = np.clip(np.stack([every, *(every + steps), *(every - steps)]), low, high)  # flat beyond
+        values = -np.nan_to_num(over_runs(likelihood, points), nan=-LOST)
+        above, below = np.split(values[1:], 2)
+        return float(values[0]), (above - below) / (2 * DIFFERENCE)
+
+    if not free.any():
+        return Refit(start, -lost(start[free])[0])
+    found = scipy.optimize.minimize(lost, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})
+    logs = start.copy()
+    logs[free] = found.x
+    return Refit(np.clip(logs, low, high), -float(found.fun))
