@@ -147,7 +147,7 @@ class Begun:
 
     def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Return the sums (..., batch) of several sums, of each summed result."""
-        return [folded(_total(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
+        return [folded(_add_in_order(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
 
     def _outputs(self) -> list[tuple[Any, bool]]:
         return list(zip(self.program.code.outputs, self.program.summed.outputs, strict=True))
@@ -198,7 +198,7 @@ def accumulate(
     return Accumulated(program, Summed(summed, batches, len(leaves)))
 
 
-def _total(sums: Sequence[np.ndarray]) -> np.ndarray:
+def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
     """Add arrays in order, all in the memory of one: to allocate more would take longer than to add."""
     first, *others = sums
     total = first.copy()

@@ -94,13 +94,13 @@ def to_c(
     """
     _check_name(name)
     program, tree = traced(function, *examples)
-    equations = list(_equations(program.jaxpr))
+    equations = list(_yield_equations(program.jaxpr))
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
             raise Unsupported(equation.primitive.name, code_line(equation))
     graph, buffers, outputs = lowered_for_c(program, finite, symmetric)
     real: Real = "float" if single else "double"
-    read, written = _names(function, examples, tree, names)
+    read, written = _name_arrays(function, examples, tree, names)
     # Arguments without axes are passed by value.
     flat = [scalars(x) for x in outputs]
     arguments = [CArray(n, _stored(b.type, real), b.size, bool(b.shape)) for n, b in zip(read, buffers, strict=True)]
@@ -171,7 +171,7 @@ def _is_symmetric(value: np.ndarray) -> bool:
     return all(value[i, j] is value[j, i] for i in range(len(value)) for j in range(i))
 
 
-def _names(
+def _name_arrays(
     function: Callable[..., PyTree], examples: Sequence[PyTree], tree: Any, names: tuple[Sequence[str], Sequence[str]]
 ) -> tuple[list[str], list[str]]:
     """Return the names of the arguments' and of the results' arrays."""
@@ -179,9 +179,9 @@ def _names(
     if not read:
         parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind != p.VAR_POSITIONAL]
         labels = [parameters[n] if n < len(parameters) else f"argument_{n}" for n in range(len(examples))]
-        read = [n for label, x in zip(labels, examples, strict=True) for n in _named(label, x)]
+        read = [n for label, x in zip(labels, examples, strict=True) for n in _name_leaves(label, x)]
     if not written:
-        written = _named("result", jax.tree.unflatten(tree, range(tree.num_leaves)))
+        written = _name_leaves("result", jax.tree.unflatten(tree, range(tree.num_leaves)))
     taken = set[str]()
     for some in (read, written):
         for n in range(len(some)):
@@ -191,7 +191,7 @@ def _names(
     return read, written
 
 
-def _named(label: str, tree: PyTree) -> list[str]:
+def _name_leaves(label: str, tree: PyTree) -> list[str]:
     """Return a name in C for each array of a tree, from its place in it."""
     results = []
     for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]:
@@ -207,14 +207,14 @@ def _line_of(operation: str, equations: Sequence[Any]) -> str:
     return next((code_line(e) for e in same), "an unknown line")
 
 
-def _equations(jaxpr: Any) -> Iterator[Any]:
+def _yield_equations(jaxpr: Any) -> Iterator[Any]:
     """Yield all operations, also those of inner programs."""
     for equation in jaxpr.eqns:
         yield equation
         for param in equation.params.values():
             for inner in param if isinstance(param, tuple | list) else (param,):
                 if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
-                    yield from _equations(getattr(inner, "jaxpr", inner))
+                    yield from _yield_equations(getattr(inner, "jaxpr", inner))
 
 
 _HEADER = """#ifndef {guard}

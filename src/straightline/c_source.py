@@ -99,7 +99,7 @@ def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     if op == "select":
         return f"({arguments[0]} ? {arguments[1]} : {arguments[2]})"
     if op in ("convert", "bitcast"):
-        return (_converted if op == "convert" else _as_other)(source, node.type, arguments[0], real)
+        return (_write_conversion if op == "convert" else _as_other)(source, node.type, arguments[0], real)
     if op == "not":
         return f"!{arguments[0]}" if source == "bool" else f"({c_type(source, real)})~{arguments[0]}"
     if source in REAL and op in QUIET:
@@ -132,7 +132,7 @@ def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
     return WHOLE[op](*arguments, t=kind, u=f"uint{bits}_t", s=f"int{bits}_t", b=bits, by=by)
 
 
-def _converted(source: Type, target: Type, name: str, real: Real) -> str:
+def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
     """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
     if target == "bool":
         return f"({name} != 0)"
@@ -179,7 +179,7 @@ class CSource:
         """Return the variable or literal of a number."""
         return literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
-    def _end(self, node: Node) -> str:
+    def _clip_to_range(self, node: Node) -> str:
         """Return a number as the end of a range: the largest of the precision in place of one beyond it."""
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
             return self.name(node)
@@ -198,11 +198,11 @@ class CSource:
             if isinstance(statement, Node):
                 lines += self._write_node(statement, indent)
             elif isinstance(statement, Loop):
-                lines += self._loop(statement, indent)
+                lines += self._write_loop(statement, indent)
             elif isinstance(statement, Guard):
                 lines += self._guard(statement, indent)
             elif isinstance(statement, Store):
-                entry = self._entry(statement.buffer, statement.offset, statement.strides, statement.indices)
+                entry = self._write_entry(statement.buffer, statement.offset, statement.strides, statement.indices)
                 lines.append(f"{indent}{entry} = {self.name(statement.node)};")
             else:
                 condition = statement.loop.condition
@@ -230,7 +230,7 @@ class CSource:
         if node.op == "load":
             text = self._load(node)
         else:
-            named = self._end if node.op in ("min", "max") else self.name
+            named = self._clip_to_range if node.op in ("min", "max") else self.name
             text = expression(node, [named(a) for a in node.args], self.real)
             self.operations[node.op] = self.operations.get(node.op, 0) + 1
         self.names[node] = self._new()
@@ -238,9 +238,9 @@ class CSource:
 
     def _load(self, node: Node) -> str:
         buffer, offset, strides = node.value
-        return self._entry(buffer, offset, strides, node.args)
+        return self._write_entry(buffer, offset, strides, node.args)
 
-    def _entry(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
+    def _write_entry(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
         """Return the expression of a number in memory, which may be part of another array."""
         whole, start = buffer.owner
         index = self._at(start + offset, strides, indices)
@@ -266,7 +266,7 @@ class CSource:
             self.tables[key] = name, "\n".join([head, *_wrap_numbers(numbers), "};"])
         return self.tables[key][0]
 
-    def _loop(self, loop: Loop, indent: str) -> list[str]:
+    def _write_loop(self, loop: Loop, indent: str) -> list[str]:
         """Write a loop, with variables that carry numbers from turn to turn."""
         deeper, lines = f"{indent}    ", []
         carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed.keys()]

@@ -68,7 +68,7 @@ class Compiled:
     def _runs(self, arrays: Sequence[Any]) -> int:
         return next((len(x) for x, d in zip(arrays, self.differs, strict=False) if d), 1)
 
-    def _arrays(self, arguments: PyTree) -> list[np.ndarray]:
+    def _convert_arguments(self, arguments: PyTree) -> list[np.ndarray]:
         """Return the arguments of a call, of the types and shapes that the code has."""
         leaves, given = jax.tree.leaves(arguments), len(self._first)
         if len(leaves) != len(self.types) - given:
@@ -88,7 +88,7 @@ class Compiled:
             arguments: trees like the examples; arrays of which each run has its own have a leading axis of runs.
             cores: threads that compute; those of the machine by default.
         """
-        arrays, given = self._arrays(arguments), len(self._first)
+        arrays, given = self._convert_arguments(arguments), len(self._first)
         runs = self._runs(arrays)
         code = self.code
         outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]

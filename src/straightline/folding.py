@@ -104,7 +104,7 @@ def _power(a: Any, b: Any) -> Any:
         return np.power(a, b)
 
 
-def _converted(a: Any, kind: Any) -> Any:
+def _convert_number(a: Any, kind: Any) -> Any:
     """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
     if not isinstance(a, np.floating) or kind in (np.float64, np.float32, np.bool_):
         return a.astype(kind)
@@ -151,7 +151,7 @@ def _evaluate(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node
         if op == "select":
             return args[1] if numbers[0] else args[2]
         if op == "convert":
-            value = _converted(numbers[0], DTYPES[type])
+            value = _convert_number(numbers[0], DTYPES[type])
         elif op == "bitcast":
             value = numbers[0].view(DTYPES[type])
         elif op in EVALUATED:

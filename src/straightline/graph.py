@@ -30,7 +30,7 @@ class Graph:
             return simpler
         if op in COMMUTATIVE and args[0].serial > args[1].serial:
             args = (args[1], args[0])
-        return self._once(op, type, args, value)
+        return self._find_or_make(op, type, args, value)
 
     def constant(self, value: Number, type: Type) -> Node:
         """Make a constant, rounded to single precision if it is of that type."""
@@ -69,7 +69,7 @@ class Graph:
             offset += buffer.first[offset % row] - offset % row
         indices = tuple(i for _, i in pairs)
         value = (buffer, offset, tuple(s for s, _ in pairs))
-        return self._once("load", buffer.type, indices, value, buffer.block.depth)
+        return self._find_or_make("load", buffer.type, indices, value, buffer.block.depth)
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
         """Store a number, in the open block."""
@@ -77,7 +77,7 @@ class Graph:
         buffer.stores.append(written)
         self.current.items.append(written)
 
-    def _once(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int = 0) -> Node:
+    def _find_or_make(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int = 0) -> Node:
         """Return the equal node of an open block, or make one: in the outermost block that may have it.
 
         That has all arguments and at least this depth, or is pinned: such a block holds what is made within it.

@@ -81,9 +81,9 @@ class _Evaluation:
                 owner = statement.buffer.owner[0]
                 self.memory[owner] = self.memory[owner].at[entry].set(self.value(statement.node))
             elif isinstance(statement, Loop):
-                self._loop(statement)
+                self._evaluate_loop(statement)
             elif isinstance(statement, Guard):
-                self._guard(statement)
+                self._evaluate_guard(statement)
             elif statement.op not in ("counter", "parameter", "result", "guarded"):
                 self.values[statement] = self._evaluate_node(statement)
 
@@ -112,7 +112,7 @@ class _Evaluation:
         stores = [x for x in self.needed if isinstance(x, Store) and block in x.block.inwards()]
         return list(dict.fromkeys(x.buffer.owner[0] for x in sorted(stores, key=lambda x: x.node.serial)))
 
-    def _loop(self, loop: Loop) -> None:
+    def _evaluate_loop(self, loop: Loop) -> None:
         """Evaluate a loop: the carry is that of the graph, and the memory that the body fills."""
         carried = [
             k for k, pair in enumerate(zip(loop.parameters, loop.results, strict=True)) if {*pair} & self.needed.keys()
@@ -146,7 +146,7 @@ class _Evaluation:
         self.values, self.memory = outer, memory | dict(zip(filled, end[1], strict=True))
         self.values |= zip((loop.results[k] for k in carried), end[0], strict=True)
 
-    def _guard(self, guard: Guard) -> None:
+    def _evaluate_guard(self, guard: Guard) -> None:
         """Evaluate a guarded block where its condition holds; its results are zeros elsewhere."""
         used = [k for k, r in enumerate(guard.results) if r in self.needed]
         filled, outer, memory = self._within(guard.body), self.values, self.memory

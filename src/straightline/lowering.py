@@ -70,7 +70,7 @@ class Lowering:
         """
         name = equation.primitive.name
         try:
-            results = self._by_rule(equation, name, inputs)
+            results = self._apply_rule(equation, name, inputs)
             for variable, value in zip(equation.outvars, results, strict=True):
                 aval: Any = variable.aval
                 if value.shape != aval.shape:
@@ -81,7 +81,7 @@ class Lowering:
         except Exception as error:
             raise failed(name, error, code_line(equation)) from error
 
-    def _by_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
+    def _apply_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
         if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
             return IN_MEMORY[name](self, equation, inputs)
         if name not in RULES:

@@ -83,7 +83,7 @@ def lower_traced(
         view = InMemory.whole(buffer)
         inputs.append(buffer)
         if number in known:
-            values.append(_partly_known(lowering, view, *known[number]))
+            values.append(_find_known_entries(lowering, view, *known[number]))
         else:
             values.append(keys_of(view.nodes(lowering.graph)) if is_key else view)
     with jax.enable_x64(not single):
@@ -91,7 +91,7 @@ def lower_traced(
     return Program(lowering.graph, inputs, outputs, tree)
 
 
-def _partly_known(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
+def _find_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
     """Return an array of which some entries are known: all, or a few of a short one, as constants."""
     if mask.all():
         return lowering.known(numbers.astype(DTYPES[view.type]))
@@ -219,7 +219,7 @@ def varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     while len(results) > count:
         count, before, left = len(results), left, []
         for x in before:
-            if results.isdisjoint(x.args if is_plain(x) else _sources(x, around)):
+            if results.isdisjoint(x.args if is_plain(x) else _list_sources(x, around)):
                 left.append(x)
                 continue
             results.add(x)
@@ -261,7 +261,7 @@ def crossing(items: Iterable[Any], spread: set[Any]) -> set[Any]:
     return results - {None}
 
 
-def _sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
+def _list_sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
     """Return all of which any makes a number or a statement differ: arguments, memory, what is around it."""
     if isinstance(node, Buffer):
         return [node.owner[0]]

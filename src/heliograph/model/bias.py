@@ -69,19 +69,19 @@ def with_bias(
             if alone
             else [f"bias{i}" for i in range(seen.shape[1])]
         )
-        bias = _gauss_markov(plant, named, bias, time, dt)
-    return driven_by(plant, bias, entering), _bias_sensor(sensor, seen, n)
+        bias = _make_gauss_markov(plant, named, bias, time, dt)
+    return driven_by(plant, bias, entering), _append_to_sensor(sensor, seen, n)
 
 
-def _gauss_markov(
+def _make_gauss_markov(
     plant: AbstractPlant, names: list[str], deviation: ArrayLike, time: ArrayLike, dt: ArrayLike | str
 ) -> LinearPlant:
     """Return the Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2."""
     count = len(names)
     sizes = [
-        scalar("deviation of a bias", x, 0.0) for x in _spread_over_biases("deviation of a bias", deviation, count)
+        scalar("deviation of a bias", x, 0.0) for x in _broadcast_to_biases("deviation of a bias", deviation, count)
     ]
-    rates = [_rate(x) for x in _spread_over_biases("time of a bias", time, count)]
+    rates = [_rate(x) for x in _broadcast_to_biases("time of a bias", time, count)]
     size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (sizes, rates))
     # With a step that is a number, or as functions of the input that says it.
     xp = library(size, rate)
@@ -140,11 +140,11 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
     if not isinstance(plant, LinearPlant):
         move = Driven(plant, bias, coupling, places)
         return Plant(move, noise, center, start, states, plant.inputs, circular)
-    matrix, driven = _blocks(plant, bias, coupling, np.eye(len(plant.inputs))[list(places)])
+    matrix, driven = _stack_blocks(plant, bias, coupling, np.eye(len(plant.inputs))[list(places)])
     return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs, circular)
 
 
-def _blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
+def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
     """Return [[A, E], [0, F]] and [B; B_b], functions of the inputs where some part is one; `pick` takes those of b."""
     below = np.zeros((len(bias.states), len(plant.states)))
     if not any(isinstance(value, OfInputs) for model in (plant, bias) for value in vars(model).values()):
@@ -174,7 +174,7 @@ class Biased(Module):
         return self.sensor.measure(x[: self.states]) + jnp.asarray(self.loading) @ x[self.states :]
 
 
-def _bias_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
+def _append_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
     """Return the sensor of [x; b]."""
     if not isinstance(sensor, LinearSensor):
         return Sensor(Biased(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
@@ -182,7 +182,7 @@ def _bias_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> Li
     return LinearSensor(stacked, sensor.noise, sensor.outputs, sensor.circular)
 
 
-def _spread_over_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
+def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
     """Return the values of the biases, from one or from as many."""
     given: Any = value
     values = list(given) if rank(name, value) else [given] * count

@@ -40,11 +40,11 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
         ValueError: a reference of another length than what is sent; a channel that is late or erases: put
             `centred` inside, as in `delayed(centred(link, r), d)` and `erasure(centred(link, r), p)`.
     """
-    less_reference: Channel = at_each_step(_centre, channel, reference)
+    less_reference: Channel = at_each_step(_subtract_reference, channel, reference)
     return less_reference
 
 
-def _centre(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
+def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
     """Return z = G (y - r) + n + E[G] r: the reference r is taken off before the channel, its mean put back after."""
     (channel,) = check_maps("channel less a reference", [channel])
     if channel.past or channel.erases:

@@ -151,7 +151,7 @@ def with_clocks(
         check_sensor(instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary"), n)
     moving = function("motion", motion, "x") if callable(motion) else array("motion", motion, (n, n))
     places = {name: n + 2 * i for i, name in enumerate(clocks)}
-    larger = driven_by(plant, _drifts(clocks, step), np.zeros((n, 2 * len(clocks))))
+    larger = driven_by(plant, _make_clocks(clocks, step), np.zeros((n, 2 * len(clocks))))
     return larger, {
         name: _enlarge_sensor(sensor, moving, n, n + 2 * len(clocks), places.get(name))
         for name, sensor in sensors.items()
@@ -167,7 +167,7 @@ def _step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
     return plant.inputs[plant.inputs.index(dt)]
 
 
-def _drifts(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
+def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     """Return offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start."""
     spread, wander, start_at, states = [], [], [], []
     for name, clock in clocks.items():

@@ -102,7 +102,7 @@ def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
     yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
 
 
-def _functions(plant: AbstractPlant) -> dict[str, MatrixOfInputs]:
+def _list_functions(plant: AbstractPlant) -> dict[str, MatrixOfInputs]:
     """Return the functions of the inputs alone, by name: matrices, and the covariance of the noise."""
     every: dict[str, MatrixOfInputs] = {}
     if isinstance(plant, LinearPlant):
@@ -125,7 +125,7 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
 
 def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
     """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
-    for name, function in _functions(first(plant)).items():
+    for name, function in _list_functions(first(plant)).items():
         values = np.concatenate(list(_evaluate_in_parts(plant, function, u, step)))
         wrong = covariances_wrong(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
@@ -184,7 +184,7 @@ def inputs_spoil(
         plant = at(varying, k)
         if not names or plant.inputs != tuple(names):
             continue
-        for name, function in _functions(plant).items():
+        for name, function in _list_functions(plant).items():
             value = function(plant, u)
             spoilt |= ~(_is_covariance(value, precision) if name == NOISE else jnp.all(jnp.isfinite(value)))
     return spoilt

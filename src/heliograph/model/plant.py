@@ -194,7 +194,7 @@ class Plant(AbstractPlant):
         circular: Sequence[str] = (),
     ):
         self.function = function("transition of a plant", transition, "(x, u)")
-        self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
+        self.initial_mean, self.initial_covariance, self.deviation = _read_initial(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, len(name_list("input names", inputs)), "u")
@@ -247,7 +247,7 @@ class LinearPlant(AbstractPlant):
         inputs: "Names | None" = None,
         circular: "Sequence[str]" = (),
     ):
-        self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
+        self.initial_mean, self.initial_covariance, self.deviation = _read_initial(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         # Inputs: as many as B has columns, or as have names where something depends on them.
@@ -327,7 +327,7 @@ def _values_at(function: Callable[..., jax.Array], points: jax.Array, rest: tupl
 _values_by_xla = quickly_compiled(_values_at)
 
 
-def _initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, AbstractNoise | None]:
+def _read_initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, AbstractNoise | None]:
     """Return the mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]

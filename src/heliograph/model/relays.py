@@ -108,23 +108,23 @@ class RelayNetwork(Module):
         # Moments of each slot, computed once where links do not vary over time.
         varies = steps_covered(self.slots) is not None
         period = horizon if varies else min(len(self.slots), horizon)
-        tables = [_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
+        tables = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
         gain, offset, spread, live, talks = (
             np.stack(parts)[np.arange(horizon) % period] for parts in zip(*tables, strict=True)
         )
-        transition = _tile(self.plant, horizon, lambda p: p.matrix, 2)
-        drift = _tile(self.plant, horizon, lambda p: p.noise.mean, 1)
+        transition = _repeat_over_steps(self.plant, horizon, lambda p: p.matrix, 2)
+        drift = _repeat_over_steps(self.plant, horizon, lambda p: p.noise.mean, 1)
         # E x+ = A E x + E w.
         means = [self.initial()[0]]
         for a, b in zip(transition[:-1], drift[:-1], strict=True):
             means.append(a @ means[-1] + b)
         return RelaySteps(
             transition=transition,
-            process=_tile(self.plant, horizon, lambda p: p.noise.covariance, 2),
+            process=_repeat_over_steps(self.plant, horizon, lambda p: p.noise.covariance, 2),
             drift=drift,
-            sensing=_tile(self.sensor, horizon, lambda s: s.matrix, 2),
-            sensor_noise=_tile(self.sensor, horizon, lambda s: s.noise.covariance, 2),
-            sensor_offset=_tile(self.sensor, horizon, lambda s: s.noise.mean, 1),
+            sensing=_repeat_over_steps(self.sensor, horizon, lambda s: s.matrix, 2),
+            sensor_noise=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.covariance, 2),
+            sensor_offset=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.mean, 1),
             state_mean=np.array(means),
             gain=gain,
             offset=offset,
@@ -178,7 +178,7 @@ class RelaySteps(Module):
         )
 
 
-def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
+def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
     """Return gain, offset, spread, live rows and active senders of one slot, with the shapes of `RelaySteps`."""
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
     rows, columns = sum(network.received), len(senders) * m
@@ -201,7 +201,7 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     return gain, offset, spread, live, talks
 
 
-def _tile(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
+def _repeat_over_steps(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
     """One array of a plant or sensor for each step."""
     value = np.asarray(read(stacked(model)), dtype=np.float64)
     if value.ndim == dimensions + 1:

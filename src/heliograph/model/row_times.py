@@ -44,7 +44,7 @@ def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> No
         clock: times of the rows, numbers or dates; None where they are not known.
     """
     if clock is not None and TIME_STEP not in inputs and (said := unequal_steps(clock)):
-        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=_depth_of_caller())
+        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=_find_caller())
 
 
 def judge_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:
@@ -62,7 +62,7 @@ def judge_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarr
     return clock
 
 
-def _depth_of_caller() -> int:
+def _find_caller() -> int:
     """Return how many frames above the function that calls it the user's are: the first outside this package."""
     package, depth, frame = __name__.split(".")[0], 0, inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:

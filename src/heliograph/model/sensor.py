@@ -93,7 +93,7 @@ class Sensor(AbstractSensor):
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
         # A variance alone says nothing of the number of outputs, so the function is asked.
-        shape = (1,) if outputs is not None or count_components(noise) is not None else _shape_of(measure)
+        shape = (1,) if outputs is not None or count_components(noise) is not None else _find_shape(measure)
         if shape != (1,):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
@@ -163,7 +163,7 @@ def _refuse_function(name: str, value: object) -> None:
         raise fail(name, "a constant, as sensors do not depend on inputs", "a function")
 
 
-def _shape_of(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
+def _find_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
     """Return the shape of h(x) where it is that of every state it takes; (1,) where that depends on the state.
 
     What slices x gives another shape at each of two lengths; what unpacks x takes a state of one length alone.

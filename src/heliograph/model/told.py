@@ -81,7 +81,7 @@ def told(
     memory = law if isinstance(law, AbstractMemory) else FreshNumbers(_check_law(law), len(names))
     if memory.announced != len(names):
         raise fail("numbers told", f"{memory.announced} names", list(names))
-    example = array("typical numbers", _mean_of(law, memory) if typical is None else typical, (len(names),))
+    example = array("typical numbers", _average_law(law, memory) if typical is None else typical, (len(names),))
     return deliver_told(Told(memory, link, example, names, flag("exogenous", exogenous)))
 
 
@@ -91,7 +91,7 @@ def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
     raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))
 
 
-def _mean_of(law: object, memory: AbstractMemory) -> ArrayLike:
+def _average_law(law: object, memory: AbstractMemory) -> ArrayLike:
     """Return the mean of a law of numbers; zeros, the first mode, of a memory."""
     if law is None:
         raise fail("typical numbers", "numbers as they may come, where there is no law", "none")

@@ -110,7 +110,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
         for projection, have in zip(shape, numbers.shape, strict=True)
     )
     if not matches:
-        raise fail(name, _shape_words(shape, numbers.ndim), f"shape {numbers.shape}")
+        raise fail(name, _describe_shape(shape, numbers.ndim), f"shape {numbers.shape}")
     if not isinstance(numbers, np.ndarray):  # traced
         return numbers
     wrong = np.isinf(numbers) if missing else ~np.isfinite(numbers)
@@ -120,7 +120,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     return numbers
 
 
-def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
+def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str:
     """Return a shape in words, with an example of a table where something else came."""
     if shape == (None,):
         return "a list of numbers, such as [1, 0]"
@@ -154,11 +154,11 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
     report_domain(name, value, Domain(low=low, high=high))
     number = array(name, value, ())
     if not is_traced(number) and not low <= number <= high:
-        raise fail(name, _range_words(low, high), f"{float(number):g}")
+        raise fail(name, _describe_range(low, high), f"{float(number):g}")
     return number
 
 
-def _range_words(low: float, high: float) -> str:
+def _describe_range(low: float, high: float) -> str:
     if 0 < low <= TINY:
         return "a positive number" + (f" up to {high:g}" if high < np.inf else "")
     if high == np.inf:

@@ -90,18 +90,18 @@ def readable(kind: T) -> T:
     """
     if not hasattr(kind, "__getattr__"):
         kind.__getattr__ = refuse_attribute  # type: ignore[attr-defined]
-    for name, method in (("__repr__", _repr), ("_repr_html_", _html), ("__eq__", _equal)):
+    for name, method in (("__repr__", _write_repr), ("_repr_html_", _html), ("__eq__", _equal)):
         setattr(kind, name, method)
     return kind
 
 
-def _repr(self: object) -> str:
+def _write_repr(self: object) -> str:
     """One line, or a line for each part."""
     whole = line(self, DEPTH)
     if len(whole) <= WIDTH:
         return whole
-    parts = [f"  {name}={line(value, DEPTH - 1)}" for name, value in islice(_parts(self), LINES - 2)]
-    left = sum(1 for _ in _parts(self)) - len(parts)
+    parts = [f"  {name}={line(value, DEPTH - 1)}" for name, value in islice(_list_parts(self), LINES - 2)]
+    left = sum(1 for _ in _list_parts(self)) - len(parts)
     more = [f"  … {left} more"] if left else []
     return "\n".join([f"{type(self).__name__}(", *(cut(text) for text in (*parts, *more)), ")"])
 
@@ -132,7 +132,7 @@ def line(value: object, depth: int) -> str:
         return _join_some(marks[0], value, len(value), depth, lambda entry: line(entry, depth - 1), marks[1])
     # Objects with fields.
     if _ours(value) or is_dataclass(value):
-        name, parts = type(value).__name__, list(islice(_parts(value), LARGE))
+        name, parts = type(value).__name__, list(islice(_list_parts(value), LARGE))
         return _join_some(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
     if isinstance(value, partial):
         return line(value.func, depth)
@@ -142,10 +142,10 @@ def line(value: object, depth: int) -> str:
 
 
 def _ours(value: object) -> bool:
-    return getattr(type(value), "__repr__", None) is _repr
+    return getattr(type(value), "__repr__", None) is _write_repr
 
 
-def _parts(value: object) -> Iterable[tuple[str, object]]:
+def _list_parts(value: object) -> Iterable[tuple[str, object]]:
     """Return the names and values of what an object holds and anybody may use."""
     if isinstance(value, Mapping):
         return ((repr(key), entry) for key, entry in value.items())
@@ -182,12 +182,14 @@ def cut(text: str) -> str:
 
 
 def _table(value: object, depth: int) -> str:
-    rows = [f"<tr><th>{escape(name)}</th><td>{_cell(entry, depth - 1)}</td></tr>" for name, entry in _entries(value)]
+    rows = [
+        f"<tr><th>{escape(name)}</th><td>{_cell(entry, depth - 1)}</td></tr>" for name, entry in _list_entries(value)
+    ]
     return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
 
 
-def _entries(value: object) -> Iterable[tuple[str, object]]:
-    entries = _parts(value)
+def _list_entries(value: object) -> Iterable[tuple[str, object]]:
+    entries = _list_parts(value)
     yield from islice(entries, LARGE)
     left = sum(1 for _ in entries)
     if left:

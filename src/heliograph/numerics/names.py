@@ -28,7 +28,7 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
         if name in names or name.startswith("_"):
             with no_collector():
                 return load(name)
-        raise AttributeError(f"{package} has no attribute {name!r}{suggest_names(name, _public(package, names))}")
+        raise AttributeError(f"{package} has no attribute {name!r}{suggest_names(name, _list_public(package, names))}")
 
     return attribute, listed, names
 
@@ -71,7 +71,7 @@ def _plain(name: str) -> str:
     return name.lower().replace("_", "")
 
 
-def _public(package: str, names: list[str]) -> dict[str, str]:
+def _list_public(package: str, names: list[str]) -> dict[str, str]:
     """Return the package's names as they are written after it; of heliograph itself also those of its rooms."""
     known = {name: name for name in names}
     if "." in package:

@@ -160,14 +160,14 @@ def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: 
     network = instance("network of the design", best.problem.network, Network, "a Network")
     problem = replace(best.problem, starts=min(best.problem.starts, CHANGE_STARTS))
     worths = []
-    for name, changed in _changes(problem, network, exponent).items():
+    for name, changed in _list_changes(problem, network, exponent).items():
         advance(name)
         value = design(changed).certificate.value
         worths.append(ChangeWorth(name, value, best.certificate.value - value))
     return sorted(worths, key=lambda change: -change.saved)
 
 
-def _changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
+def _list_changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
     """Return the problems of the changed networks, by the change."""
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     bare = {name: Node(node.sensor, node.channel, {}) for name, node in nodes.items()}
@@ -188,7 +188,7 @@ def _changes(problem: DesignProblem, network: Network, exponent: float | None) -
             # Hops are counted anew behind a relay that is put between: nodes are free as a whole.
             whole = None if free is None else tuple(dict.fromkeys(_node(free_name) for free_name in free))
             for hop in transmitter_names(node.channel):
-                nearer = Node(node.sensor, _halfway(node.channel, hop, exponent), {})
+                nearer = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
                 changed[f"a relay halfway of {name}.{hop}"] = with_nodes({**bare, name: nearer}, whole)
     return changed
 
@@ -197,7 +197,7 @@ def _node(transmitter: str) -> str:
     return transmitter.partition(".")[0]
 
 
-def _halfway(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
+def _insert_relay(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
     """Return the channel in which a relay stands halfway of one hop."""
 
     def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractRandomAffine:

@@ -145,7 +145,7 @@ class Programme:
     def polish(self, z: Vector) -> Vector:
         """Newton's method on the active limits, as long as the Lagrangian's exact penalty does not rise."""
         for _ in range(ROUNDS):
-            newton = self._newton(z)
+            newton = self._solve_newton_step(z)
             if newton is None:
                 break
             step, multipliers, active = newton
@@ -165,7 +165,7 @@ class Programme:
         excess = np.maximum(-self.room(z), 0.0)
         return float(self.value(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
 
-    def _newton(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
+    def _solve_newton_step(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
         """Step d and multipliers m of H d - A' m = -g, A d = -room over what is at no bound, H of the Lagrangian."""
         index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))
         room = self.room(z)

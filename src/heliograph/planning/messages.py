@@ -123,7 +123,7 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
         ValueError: a plant or sensor of more than one state and output; a loss of 1 or more.
     Source: Lipsa and Martins, Remote state estimation with communication costs for first-order LTI systems (2011).
     """
-    a, q, c, r = system = _scalar(plant, sensor)
+    a, q, c, r = system = _check_scalar(plant, sensor)
     delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
     if not loss < 1:
         raise fail("loss", "a number below 1", loss)
@@ -137,7 +137,7 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
         raise fail(
             "delta and loss", f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}", f"{far:.3g}"
         )
-    nodes, weights = _rule(edges, s)
+    nodes, weights = _make_quadrature(edges, s)
     kappa = np.where(np.abs(nodes) <= delta, 1.0, loss)
     kernel = kappa[:, None] * _normal(nodes[:, None] - a * nodes, s * s) * weights
     visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal(nodes, s * s)) * weights
@@ -163,7 +163,9 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
     Raises:
         ValueError: as `prediction_error_rate`; a rate that is not between 0 and 1.
     """
-    delta = _threshold(rate, lambda d: prediction_error_rate(plant, sensor, d, loss).rate, _scalar(plant, sensor))
+    delta = _find_threshold(
+        rate, lambda d: prediction_error_rate(plant, sensor, d, loss).rate, _check_scalar(plant, sensor)
+    )
     return float(prediction_error_rate(plant, sensor, delta, loss).error[0])
 
 
@@ -183,7 +185,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
             that less than one message in a million steps is sent; a grid that is too fine, or a rate that converges
             too slowly to be computed.
     """
-    rate = _send_on_delta_rate(_scalar(plant, sensor), float(scalar("delta", delta, TINY)))
+    rate = _send_on_delta_rate(_check_scalar(plant, sensor), float(scalar("delta", delta, TINY)))
     if rate < RAREST:
         raise fail("delta", f"one at which more than {RAREST:g} messages are sent a step", f"{delta:g}")
     return rate
@@ -195,12 +197,14 @@ def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
     if not abs(a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
     # The rectangle rule next to the cut at delta is wrong by a multiple of h^2: of two grids that is taken off.
-    (coarse, h), (fine, half) = (_rate_on_grid(system._replace(c=1.0, r=r), delta, share) for share in (0.8, 0.5))
+    (coarse, h), (fine, half) = (
+        _compute_rate_on_grid(system._replace(c=1.0, r=r), delta, share) for share in (0.8, 0.5)
+    )
     # Where nothing is ever sent both grids are one, and say 0.
     return fine if fine == coarse else float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
 
 
-def _rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
+def _compute_rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
     """Return the rate by a grid of cells of at most a share of the lesser noise's deviation, and the cells' length."""
     a, q, _, r = system
     deviation = np.sqrt(q / (1 - a * a))
@@ -259,11 +263,11 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
     Raises:
         ValueError: as `send_on_delta_rate`; a rate that is not between 0 and 1.
     """
-    system = _scalar(plant, sensor)
-    return _threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, 1e-3)
+    system = _check_scalar(plant, sensor)
+    return _find_threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, 1e-3)
 
 
-def _threshold(rate: float, of: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:
+def _find_threshold(rate: float, of: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:
     """Find the threshold at which a rate that falls with delta has a value."""
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
@@ -276,7 +280,7 @@ def _threshold(rate: float, of: Callable[[float], float], system: _Scalar, accur
     return float(brentq(lambda delta: of(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
 
 
-def _scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
+def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
     """Return a linear plant and sensor of one state and one output."""
     linear = isinstance(plant, LinearPlant) and isinstance(sensor, LinearSensor)
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor) or len(plant.states) != 1:
@@ -294,7 +298,7 @@ def _scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
     return _Scalar(*map(float, numbers))
 
 
-def _rule(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
+def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre nodes and weights of parts of a line, each cut to lengths of at most 8 units."""
     x, w = np.polynomial.legendre.leggauss(NODES)
     parts = []

@@ -109,7 +109,7 @@ def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
     maps, added = [], []
     for k in range(horizon):
         now = at(plant, k)
-        noise_mean, noise = _noise(now, u[k])
+        noise_mean, noise = _read_noise(now, u[k])
         maps.append(_extend(now.matrix, now.input_matrix @ u[k] + noise_mean))
         added.append(library(noise).pad(noise, ((0, 1), (0, 1))))
     xp = library(maps, added)
@@ -117,7 +117,7 @@ def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
     return [one for (one,) in system.after(_second_moment(start.initial_mean, start.initial_covariance)[None])]
 
 
-def _noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
+def _read_noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
     """Return the mean and covariance of w; the noise may be a function of the inputs in operations of JAX."""
     if isinstance(plant.noise, AbstractNoise):
         return plant.noise.mean, plant.noise.covariance

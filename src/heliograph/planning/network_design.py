@@ -121,7 +121,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         if problem.free is not None:
             raise fail("free powers of paths", "all of them", show_value(problem.free))
     # What is free, and its limits.
-    chosen = _free(paths, problem.free)
+    chosen = _mask_free(paths, problem.free)
     if problem.budget is None:
         limits = make_unlimited(error.steps, int(chosen.sum()))
     else:
@@ -132,7 +132,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     return design_paths(problem, task, target, present)
 
 
-def _free(paths: Paths, free: Sequence[str] | None) -> Bool[np.ndarray, "hop"]:
+def _mask_free(paths: Paths, free: Sequence[str] | None) -> Bool[np.ndarray, "hop"]:
     """Return the mask of the free transmitters."""
     if free is None:
         names: Sequence[str] = paths.names
@@ -186,11 +186,11 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
         sensitivity={name: float("nan") for name in sends},
         price=float("nan"),
         numbers=dict(gains),
-        realised=_running(relays, gains),
+        realised=_run_relays(relays, gains),
     )
 
 
-def _running(relays: RelayNetwork, gains: Gains) -> Network:
+def _run_relays(relays: RelayNetwork, gains: Gains) -> Network:
     """Return the relays with their gains over COVERED steps and more, and the best receiver behind them."""
     slots, n = len(relays.slots), len(relays.states)
     times = -(-COVERED // slots)

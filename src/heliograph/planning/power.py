@@ -116,7 +116,7 @@ def power(
     else:
         y = _draw_moments(network.plant, sources, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
     for name, filter in _feedback_filters(network).items():
-        y[name], rate = _innovation_moments(filter, u, horizon), float("nan")
+        y[name], rate = _compute_innovation_moments(filter, u, horizon), float("nan")
     # What the hops make of it.
     power, error = {}, {}
     for name, (_, channel) in sources.items():
@@ -146,7 +146,9 @@ def _feedback_filters(network: Network) -> dict[str, AbstractFilter]:
     return {name: node.filters[node.informed_by] for name, node in nodes.items() if node.informed_by is not None}
 
 
-def _innovation_moments(filter: AbstractFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> Moments:
+def _compute_innovation_moments(
+    filter: AbstractFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None
+) -> Moments:
     """Return C P C' + R of the filter's prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"

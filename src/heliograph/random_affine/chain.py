@@ -274,13 +274,8 @@ class Autoregression(AbstractMemory):
         n = check_count("modes of a fading", modes, 2) - 1
         xp = library(self.correlation)
         stays = (1 + xp.asarray(self.correlation)) / 2
-        rows = [
-            xp.convolve(_binomial_probabilities(i, stays), _binomial_probabilities(n - i, 1 - stays))
-            for i in range(n + 1)
-        ]
-        return Nodes(
-            np.sqrt(n) * np.linspace(-1, 1, n + 1), _binomial_probabilities(n, np.asarray(0.5)), xp.stack(rows)
-        )
+        rows = [xp.convolve(_compute_binomial(i, stays), _compute_binomial(n - i, 1 - stays)) for i in range(n + 1)]
+        return Nodes(np.sqrt(n) * np.linspace(-1, 1, n + 1), _compute_binomial(n, np.asarray(0.5)), xp.stack(rows))
 
 
 def stationary(transition: Rows) -> Law:
@@ -302,7 +297,7 @@ def identify_memory(name: str | None) -> str:
     return uuid4().hex if name is None else f"named {name}"
 
 
-def _binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+def _compute_binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     """Return the probabilities of 0, ..., n successes."""
     k = np.arange(n + 1)
     ways = np.array([comb(n, i) for i in k], dtype=float)

@@ -109,10 +109,10 @@ class Delayed(AbstractDelayLine):
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
         self.times, self.timestamped = (
-            _delay_weights(delay),
+            _list_delays(delay),
             instance("timestamped", timestamped, bool, "True or False"),
         )
-        items = [_selection_matrix(d, self.past, link.inputs, timestamped) for d in self.times]
+        items = [_make_selection(d, self.past, link.inputs, timestamped) for d in self.times]
         match delay:
             case Discrete():
                 self.delay = Mixture(items, delay.probabilities, delay.radius)
@@ -160,10 +160,10 @@ class Delayed(AbstractDelayLine):
 
     def given(self, d: int) -> AbstractRandomAffine:
         """Return the map of the line for one delay d, without the time stamp."""
-        return Series([_selection_matrix(d, self.past, self.link.inputs, False), self.link])
+        return Series([_make_selection(d, self.past, self.link.inputs, False), self.link])
 
 
-def _delay_weights(delay: Delay) -> tuple[int, ...]:
+def _list_delays(delay: Delay) -> tuple[int, ...]:
     """List the possible delays in steps."""
     match delay:
         case Discrete():
@@ -177,7 +177,7 @@ def _delay_weights(delay: Delay) -> tuple[int, ...]:
     return tuple(check_count("delay", d, 0) for d in values)
 
 
-def _selection_matrix(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
+def _make_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
     """S_d, which selects the signal of d steps ago from the line, and below it the number d if time stamped."""
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:

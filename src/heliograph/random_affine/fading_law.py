@@ -59,7 +59,7 @@ class Rician(AbstractLaw):
 
     def moment(self, order: int) -> float | jax.Array:
         """Return scale^k 2^(k/2) Gamma(1 + k/2) L_(k/2)(-sight^2 / (2 scale^2)), L the Laguerre function."""
-        shape = _laguerre(order, ((self.sight / self.scale) ** 2) / 2)
+        shape = _evaluate_laguerre(order, ((self.sight / self.scale) ** 2) / 2)
         return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2) * shape)
 
     def quantile(self, probability: Vector) -> np.ndarray:
@@ -79,7 +79,7 @@ class Rician(AbstractLaw):
         return library(self.sight, self.scale).maximum(self.sight - 9 * self.scale, 0.0), self.sight + 9 * self.scale
 
 
-def _laguerre(order: int, x: Scalar) -> Scalar:
+def _evaluate_laguerre(order: int, x: Scalar) -> Scalar:
     """L_(order/2)(-x) = 1F1(-order/2; 1; -x) for x >= 0, by (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1).
 
     Even orders are polynomials, from L_0 = 1; odd ones start from exponentially scaled Bessel functions,

@@ -116,7 +116,7 @@ class Gaussian(AbstractNoise):
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
             self.factor, self.weights = eliminate(jnp.asarray(self.covariance))
             return
-        self.factor = _eigenvector_root(self.covariance)
+        self.factor = _factor_by_eigenvectors(self.covariance)
         self.weights = np.ones(n)
 
     @property
@@ -165,7 +165,7 @@ class Gaussian(AbstractNoise):
         return expectation(tuple(powers))
 
 
-def _eigenvector_root(covariance: Square) -> np.ndarray:
+def _factor_by_eigenvectors(covariance: Square) -> np.ndarray:
     """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
 
     Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
@@ -330,12 +330,12 @@ class Shaped(AbstractNoise):
         polynomial: dict[Exponents, Number] = {(0,) * self.source.dimension: 1.0}
         for i, power in enumerate(powers):
             for _ in range(power):
-                polynomial = _times_linear(polynomial, self.matrix[i])
+                polynomial = _multiply_by_linear(polynomial, self.matrix[i])
         moment = self.source.moment
         return sum(c * (moment(a) if any(a) else 1.0) for a, c in polynomial.items())
 
 
-def _times_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
+def _multiply_by_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
     """Return the coefficients of p(u) sum_j row_j u_j."""
     raised_polynomial: dict[Exponents, Number] = {}
     for a, c in polynomial.items():

@@ -75,7 +75,7 @@ class StudentT(AbstractNoise):
         """One for each of the PRECISIONS."""
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
-        shares = xp.broadcast_to(_log_or_minus_infinity(precision_shares(self.degrees)), shape)
+        shares = xp.broadcast_to(_take_log(precision_shares(self.degrees)), shape)
         return Branches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
@@ -162,7 +162,7 @@ class Contaminated(AbstractNoise):
         inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
         n = inlier.shape[-1]
         factor = array("mean of the exponential bias", mean, (n,) if rank("mean", mean) else ())
-        center, variance = _exponential_slices(count)
+        center, variance = _slice_exponential(count)
         xp = library(factor, inlier, share)
         units = xp.broadcast_to(factor, (n,))
         slice_share = scalar("share of outliers", share, 0.0, 1.0) / count
@@ -200,7 +200,7 @@ class Contaminated(AbstractNoise):
     def branches(self) -> Branches:
         """Return the branches of the law."""
         xp, n = library(self.shares), self.dimension
-        shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
+        shares = xp.broadcast_to(_take_log(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
         return Branches(shares, (self.means - self.mean).T, variances)
 
@@ -270,7 +270,7 @@ def _check_matrices(name: str, value: ArrayLike, count: int, several: bool) -> l
     return parts
 
 
-def _exponential_slices(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean and variance of the exponential law of mean 1 between its quantiles k / count.
 
     With the survival S from 1 down to 0 and t = -log S: int t dS and int t^2 dS by parts.
@@ -282,7 +282,7 @@ def _exponential_slices(count: int) -> tuple[np.ndarray, np.ndarray]:
     return first, second - first**2
 
 
-def _log_or_minus_infinity(value: Vector) -> Vector:
+def _take_log(value: Vector) -> Vector:
     """Return the logarithms, -inf of zero without a warning."""
     if is_traced(value):
         return jnp.log(value)

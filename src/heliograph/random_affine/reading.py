@@ -70,12 +70,12 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
     if isinstance(law, Discrete):
         nats = jnp.log(law.probabilities) - jnp.square(a - law.values) / (2 * variance)
         return Discrete(law.values, jnp.where(known, jax.nn.softmax(nats), law.probabilities))
-    mean, spread = _posterior_moments(law, a, jnp.asarray(variance))
+    mean, spread = _integrate_posterior(law, a, jnp.asarray(variance))
     own = law.moment(1), law.moment(2)
     return GivenReading(jnp.where(known, mean, own[0]), jnp.where(known, spread, own[1] - own[0] ** 2))
 
 
-def _posterior_moments(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the mean and variance of the posterior of a positive gain, by quadrature over all within NATS of its mode.
 
     In t = g^(1/4), or log g of a law that is wide on a logarithmic scale, the density is smooth to its ends.

@@ -180,12 +180,12 @@ class Superposed(AbstractCombination):
         columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(count_monomials(self.outputs + 1, order), columns, f"moments of order {order}")
         terms = [
-            _polynomials_of_map(matrix, m.outputs, chosen, order)
+            _expand_map(matrix, m.outputs, chosen, order)
             for matrix, m, chosen in zip(parts, self.maps, self.places, strict=True)
         ]
         law = noise_vector(self.noise, order)[None, :, None]
         whole = _add_powers(
-            _sum_by_halves(terms, self.outputs), _polynomials_of_map(law, self.outputs, (), order), self.outputs
+            _sum_by_halves(terms, self.outputs), _expand_map(law, self.outputs, (), order), self.outputs
         )
         return _assemble_moments(whole, self.outputs, self.inputs, order)
 
@@ -200,7 +200,7 @@ class _Powers(NamedTuple):
     by_degree: list[Corners]
 
 
-def _polynomials_of_map(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers:
+def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _Powers:
     """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner."""
     ordered = tuple(sorted(places))
     ones = library(matrix).ones((len(matrix), 1, 1))
@@ -236,7 +236,7 @@ def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
     by_degree = [library(a.by_degree[0], b.by_degree[0]).ones((corners, 1, 1))]
     for degree in range(1, len(a.by_degree)):
         total: Corners = np.zeros((count_monomials(size, degree), count_monomials(outputs, degree), corners))
-        for first, (row, mine, other, ways) in enumerate(_binomial_terms(outputs, degree)):
+        for first, (row, mine, other, ways) in enumerate(_list_binomial_terms(outputs, degree)):
             left = a.by_degree[first][:, None, mine, :, None] * ways[:, None, None]
             right = b.by_degree[degree - first][None, :, other, None, :]
             products = (left * right).reshape(corners, len(row), -1)
@@ -248,7 +248,7 @@ def _add_powers(a: _Powers, b: _Powers, outputs: int) -> _Powers:
 
 
 @cache_arrays
-def _binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
+def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
     """Return terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
     names = exponents(outputs + 1, degree)
     ways: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]

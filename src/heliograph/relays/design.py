@@ -241,7 +241,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
-    known, received, white = _relay_sides(steps, start_moments(network), joined)
+    known, received, white = _list_relay_sides(steps, start_moments(network), joined)
     d, r = known.shape[-1], received.shape[1]
     none = np.zeros((len(known), d + r, r))
     # Means: x+ has drift a, z the constant b.
@@ -313,8 +313,8 @@ def relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array
 
 
 @compile_in_float64
-def _relay_sides(steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
-    """`relay_side` at each step."""
+def _list_relay_sides(steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
+    """Return the system of (x, e_relays) that `relay_side` describes, at each step."""
 
     def single(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, RelaySide]:
         p, gain = row

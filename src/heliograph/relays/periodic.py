@@ -80,7 +80,7 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined = join_gains(network, gains)
-    return as_design(network, _steady(_converging_steps(network, joined), joined))
+    return as_design(network, _steady(_check_converging(network, joined), joined))
 
 
 def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
@@ -95,10 +95,10 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined, n = relay_gains(network, gains), len(network.states)
-    return np.asarray(_steady_behind(_converging_steps(network, joined), joined))[:, :n, :n]
+    return np.asarray(_steady_behind(_check_converging(network, joined), joined))[:, :n, :n]
 
 
-def _converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
+def _check_converging(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
     """Return the steps of one period, checked for gains under which the second moments converge."""
     check_slots(network, gains)
     steps = periodic_steps(network)
@@ -281,7 +281,7 @@ def _minimise_over_gains(
     if cost is _behind_cost:
         used[:, :, -network.received[-1] :] = False
     where = np.nonzero(used)
-    unit = _largest_entries(network, start)[where]
+    unit = _find_largest_entries(network, start)[where]
     # Scaled gains x, and a multiplier for the power of each slot.
     slots = len(network.slots)
     limit = np.full(slots, np.inf) if power_limit is None else repeat_per_step("power limit", power_limit, slots)
@@ -316,7 +316,9 @@ def _within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.nda
     return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
 
 
-def _largest_entries(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Float[np.ndarray, "slots Fn R"]:
+def _find_largest_entries(
+    network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]
+) -> Float[np.ndarray, "slots Fn R"]:
     """Return the largest entry of each filter's gain in each slot, at every entry of that gain."""
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())

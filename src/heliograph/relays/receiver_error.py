@@ -97,16 +97,16 @@ def minimise_within_limit(
     steps at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that
     happens to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
     """
-    whole = float(_cost_and_slack(problem, local_gains)[0])
+    whole = float(_compute_cost_and_slack(problem, local_gains)[0])
     problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))
     results = [local_gains, _scale_into_limit(problem, local_gains)]
     for barrier in BARRIERS / len(local_gains):
         gains = results[-1]
-        units = np.asarray(_curvature_units(problem, gains, barrier))
+        units = np.asarray(_choose_units(problem, gains, barrier))
         function = partial(_evaluate_barrier, problem, gains, units, barrier)
         x = bfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION, MEMORY)
         results.append(np.asarray(_change_gains(gains, units, x.reshape(units.shape[:2]), problem.steps)))
-    judged = [_cost_and_slack(problem, gains) for gains in results]
+    judged = [_compute_cost_and_slack(problem, gains) for gains in results]
     costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
@@ -124,7 +124,7 @@ def _scale_into_limit(problem: Limited, local_gains: Float[np.ndarray, "time Fn 
     low, high = 0.0, 2.0  # the first half is 1, the gains as they are
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if np.min(_cost_and_slack(problem, smaller(middle))[1]) < ROOM:
+        if np.min(_compute_cost_and_slack(problem, smaller(middle))[1]) < ROOM:
             high = middle
         elif middle == 1.0:
             return local_gains
@@ -134,7 +134,7 @@ def _scale_into_limit(problem: Limited, local_gains: Float[np.ndarray, "time Fn 
 
 
 @compile_in_float64
-def _cost_and_slack(
+def _compute_cost_and_slack(
     problem: Limited, gains: Float[Array, "time Fn R"]
 ) -> tuple[Float[Array, ""], Float[Array, "time"]]:
     """Return the cost of given gains, and the share of each limit that they leave free."""
@@ -153,13 +153,13 @@ def _change_gains(
 
 
 @compile_in_float64
-def _cost_with_barrier(
+def _compute_cost_with_barrier(
     problem: Limited, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
     """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
 
     def value(x: jax.Array) -> jax.Array:
-        cost, slack = _cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
+        cost, slack = _compute_cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
         inside = jnp.all(slack > 0)
         logarithms = jnp.log(jnp.where(inside, slack, 1.0))
         return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
@@ -171,13 +171,13 @@ def _cost_with_barrier(
 def _evaluate_barrier(
     problem: Limited, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
-    """`_cost_with_barrier` of all variables in one vector."""
-    value, gradient = _cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
+    """`_compute_cost_with_barrier` of all variables in one vector."""
+    value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
 
 
 @compile_in_float64
-def _curvature_units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
+def _choose_units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
     """L'^-1 for each step, L L' the Hessian of its gains: in these units the cost curves alike in all directions.
 
     The gradient with respect to moments, cost and barrier, is pulled back step by step.
@@ -249,7 +249,7 @@ def receiver_error_design(
     return given_design(network, split_gains(network, np.asarray(gains)))
 
 
-def _backward_sweep(
+def _sweep_backward(
     steps: RelaySteps, start: Array, cost: Float[Array, "time d d"], gains: jax.Array
 ) -> Float[jax.Array, "time d d"]:
     """Return the gradient of the cost with respect to the moments after each step, gains improved."""
@@ -269,7 +269,7 @@ def _backward_sweep(
     return jax.lax.scan(back, jnp.zeros_like(start), items, reverse=True)[1]
 
 
-def _forward_sweep(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the best gains step by step and the moments after each step."""
 
     def single(
@@ -303,7 +303,7 @@ def _alternate_sweeps(
     """Alternate backward and forward sweeps from the local gains, and keep the best gains."""
 
     def sweep(search: SweepSearch, _: jax.Array) -> tuple[SweepSearch, None]:
-        gains, moments = _forward_sweep(steps, start, search.gains, _backward_sweep(steps, start, cost, search.gains))
+        gains, moments = _sweep_forward(steps, start, search.gains, _sweep_backward(steps, start, cost, search.gains))
         value = jnp.sum(cost * moments)
         better = value < search.cost
         best = jnp.where(better, gains, search.best)

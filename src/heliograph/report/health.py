@@ -241,7 +241,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     for node, z in received.items():
         receiver = network.nodes[node]
         declared, may_be_lost = None, not receiver.complete
-        shares = _arrival_shares(receiver) if isinstance(receiver, Node) else None
+        shares = _find_arrival_probabilities(receiver) if isinstance(receiver, Node) else None
         if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
             declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
         for i, name in enumerate(receiver.received_names):
@@ -271,7 +271,7 @@ def _test_innovations(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     return MemoryTest.of(came, lags, claimed=True)
 
 
-def _arrival_shares(receiver: Node) -> Float[np.ndarray, " received"] | None:
+def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
     """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):

@@ -66,7 +66,7 @@ def _name_components(health: Health) -> dict[str, list[str]]:
 
 def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Section:
     """Return the tests of each filter's innovations, their pictures, and what they say of each output."""
-    table = _tests_table(health)
+    table = _make_tests_table(health)
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."
     # The innovations themselves, if any filter has some.
     tested = tested_by_figure(health)
@@ -88,11 +88,11 @@ def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Sectio
             "fuses are tested here, and itself on the live page of `heliograph serve`."
         )
     missing = say_not_drawn(left, "Their numbers are in the table.")
-    return Section("Innovations", [Text([text]), table, *choose_picture(pictures), *missing, *_outputs_table(health),
-                                   *_declared_table(health)])  # fmt: skip
+    return Section("Innovations", [Text([text]), table, *choose_picture(pictures), *missing, *_make_outputs_table(health),
+                                   *_make_declared_table(health)])  # fmt: skip
 
 
-def _tests_table(health: Health) -> Table:
+def _make_tests_table(health: Health) -> Table:
     """Return size, correlation and p-value of each filter's innovations, a row each, the fused ones first."""
     # One row for each filter.
     rows = []
@@ -119,7 +119,7 @@ def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
     return sorted(filters, key=lambda judged: judged.node != Network.FUSED)
 
 
-def _outputs_table(health: Health) -> list[Table]:
+def _make_outputs_table(health: Health) -> list[Table]:
     """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
     rows = []
     for output in health.outputs:
@@ -142,7 +142,7 @@ def _outputs_table(health: Health) -> list[Table]:
     return [Table(["filter: output", "received", "down-weighted", "bias", "size", ""], rows, caption)] if rows else []
 
 
-def _declared_table(health: Health) -> list[Table]:
+def _make_declared_table(health: Health) -> list[Table]:
     """Return what the innovations say of variances that messages declare, by class; nothing where none do."""
     rows = []
     for judged in health.filters:

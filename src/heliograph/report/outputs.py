@@ -52,11 +52,13 @@ def errors_of(record: Record) -> list[Errors]:
             rmse = record.rmse(node, name)
             per_state = values / np.where(known > 0, known, np.nan)
             error = average_correlated(per_state)[1] if judged.any() else np.nan
-            results.append(Errors(node, name, claim, rmse, _rmse_errors(record, node, name, rmse), size, error))
+            results.append(
+                Errors(node, name, claim, rmse, _estimate_rmse_errors(record, node, name, rmse), size, error)
+            )
     return results
 
 
-def _rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]) -> dict[str, float]:
+def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]) -> dict[str, float]:
     """Return the standard error of each RMSE, that of the mean square over twice the RMSE; NaN where there is none."""
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2

@@ -27,7 +27,7 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
     may be lost: what arrives in the due rows is looked at again, so that the pattern is the finest that can be told.
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
-    while (places := _least_probable_rows(arrived[rows])) is not None:
+    while (places := _find_least_probable_rows(arrived[rows])) is not None:
         # A pattern among `due` of each `length` rows: both as far as the whole returns.
         turns = len(places) // np.gcd(due, len(places))
         due, length = int(places.sum()) * due * turns // len(places), length * turns
@@ -35,7 +35,7 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
     return None if length == 1 else Pattern(due, length, rows)
 
 
-def _least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
+def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
     """Return which of the first rows are due, of the pattern that chance makes least; None of what chance may make."""
     came = np.flatnonzero(arrived)
     intervals = np.diff(came)
@@ -49,7 +49,7 @@ def _least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray,
         tried = log(comb(length, int(places.sum()))) + log(length * (length - 1))
         if length > SHORT and len(came) * log(length / places.sum()) < tried - least:  # independent losses make it
             continue
-        chance = _log_chance(places, law, len(intervals)) + tried
+        chance = _bound_log_chance(places, law, len(intervals)) + tried
         if chance < least:
             least, found = chance, places
     return found
@@ -100,7 +100,7 @@ class LossLaw(NamedTuple):
         return logarithm + (log(now) if now > 0 else -np.inf) - count * log_z
 
 
-def _log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: int) -> float:
+def _bound_log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: int) -> float:
     """Bound the probability, by its logarithm, that losses in bursts let nothing arrive outside of these places.
 
     A place moves as a Markov chain on the rows of one pattern, and the probability that it has left none after N
@@ -114,10 +114,10 @@ def _log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: int) -
     step[interval % length] = (1 - law.follows) * law.ends * (1 - law.ends) ** (interval - 2) / turns
     step[1 % length] += law.follows
     at = np.flatnonzero(places)
-    return _log_sum_of_power(step[(at[None, :] - at[:, None]) % length], count)
+    return _compute_log_row_sum(step[(at[None, :] - at[:, None]) % length], count)
 
 
-def _log_sum_of_power(matrix: Float[np.ndarray, "n n"], exponent: int) -> float:
+def _compute_log_row_sum(matrix: Float[np.ndarray, "n n"], exponent: int) -> float:
     """Return the logarithm of the largest row sum of M^exponent, by squares that are scaled to a sum of 1."""
     sums, logarithm, scale = np.ones(len(matrix)), 0.0, 0.0
     while exponent:

@@ -61,7 +61,7 @@ def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
         return None
     law, found = LossLaw.of_intervals(np.diff(rows)), None
     decides = rows[0] + np.arange(min(1 + int(np.ptp(rows)), ENOUGH))  # a sender may begin late, and fall silent
-    for frequency in _peaks(arrived):
+    for frequency in _find_peaks(arrived):
         if _find_gap(frequency, rows)[1] < 1 - frequency - OFF:
             continue
         line = _narrow(frequency, rows)
@@ -76,7 +76,7 @@ def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
     return found
 
 
-def _peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
+def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
     """Return frequencies, in periods a row: those of a usual interval, and those of the largest peaks of the spectrum.
 
     A spectrum does not tell a frequency from its mirror, 1 - f, nor a comb from its harmonics.

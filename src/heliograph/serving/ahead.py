@@ -41,11 +41,11 @@ class ForecastPublisher:
                 raise fail("--forecast", "spans of time, such as 5s,1min, as no step is usual", horizons)
             self.horizons: list[float] = list(range(1, horizons + 1))
         else:
-            self.horizons = [self._distance(horizon) for horizon in horizons]
+            self.horizons = [self._measure_distance(horizon) for horizon in horizons]
         if not self.horizons or min(self.horizons) <= 0 or sorted(set(self.horizons)) != self.horizons:
             raise fail("--forecast", "horizons ahead, each later than the one before", show_value(horizons))
 
-    def _distance(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
+    def _measure_distance(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
         """Return how far ahead a horizon is, in the unit of dt or in steps."""
         if isinstance(horizon, np.datetime64):
             raise fail("--forecast", "spans of time or steps ahead of each message", str(horizon))

@@ -110,7 +110,7 @@ async def _serve(service: Takes, transport: Transport, ending: Ending, patience:
     stop = ending.stop
     while not stop.is_set():
         # The next messages, or after a while that there are none.
-        waiting = asyncio.ensure_future(_unless(stop, transport.receive()))
+        waiting = asyncio.ensure_future(_await_unless_stopped(stop, transport.receive()))
         try:
             while not (await asyncio.wait({waiting}, timeout=patience))[0]:
                 await _publish(service, transport, await ending.call(service.take, []), ending)
@@ -135,7 +135,7 @@ async def _publish(service: Takes, transport: Transport, outputs: Sequence[Outpu
     service.published(outputs)
 
 
-async def _unless(stop: asyncio.Event, waiting: Coroutine[object, object, T]) -> T | None:
+async def _await_unless_stopped(stop: asyncio.Event, waiting: Coroutine[object, object, T]) -> T | None:
     """Await a coroutine; cancel it and return None if `stop` is set first."""
     task, stopped = asyncio.ensure_future(waiting), asyncio.ensure_future(stop.wait())
     await asyncio.wait({task, stopped}, return_when=asyncio.FIRST_COMPLETED)

@@ -135,7 +135,7 @@ async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None
 async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     _log_to_stderr()
-    async with _watched(settings) as look:
+    async with _watch_services(settings) as look:
         program = await _compile_steps(settings.network)
         if program is None:
             return
@@ -143,9 +143,9 @@ async def run(settings: ServiceSettings) -> None:
             what = f"predictions depend on when others are asked for: {program.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
         if settings.parts is None:
-            await _alone(settings, program, look)
+            await _serve_alone(settings, program, look)
         else:
-            await _shared(settings, program, look, settings.parts)
+            await _serve_shared(settings, program, look, settings.parts)
 
 
 async def _compile_steps(network: Network) -> NetworkProgram | None:
@@ -172,7 +172,7 @@ Look = Callable[[Service], Takes]
 
 
 @asynccontextmanager
-async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
+async def _watch_services(settings: ServiceSettings) -> AsyncIterator[Look]:
     """Wrap services for the page, if there is one."""
     if settings.page is None:
         yield lambda service: service
@@ -188,7 +188,7 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
         yield watch.wrap
 
 
-async def _alone(settings: ServiceSettings, program: NetworkProgram, look: Look) -> None:
+async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look: Look) -> None:
     """Serve all messages in one process."""
     stop = asyncio.Event()
     reads = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
@@ -246,8 +246,8 @@ def _say(what: str) -> None:
     print(f"heliograph: {what}", file=sys.stderr)
 
 
-async def _shared(settings: ServiceSettings, program: NetworkProgram, look: Look, parts: int) -> None:
-    """One process of several: the parts that it leases."""
+async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, look: Look, parts: int) -> None:
+    """Serve the parts that this process leases, as one of several."""
     from heliograph.serving.storage.database import engine_at
     from heliograph.serving.storage.leases import Leases
     from heliograph.serving.storage.owner import name_of_process

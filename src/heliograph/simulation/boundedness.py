@@ -90,7 +90,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     """
     instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
-    links = _links(network, len(a))
+    links = _join_links(network, len(a))
     # Rows of known gain on all of x, or on the modes that do not decay.
     growing = _unstable(a)
     for space in (np.eye(len(a)), growing):
@@ -106,7 +106,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
 
 
-def _links(network: Network, states: int) -> JointLinks:
+def _join_links(network: Network, states: int) -> JointLinks:
     """Join all nodes: sensors stacked, channels in parallel."""
     if network.relays is not None:
         raise fail("boundedness", "nodes that receive the sensors over channels", "relays that filter")
@@ -177,7 +177,7 @@ def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[
     cases = [
         (i, o, kinds.index(tuple(o.arrived.tolist()))) for i, outcome in enumerate(links.outcomes) for o in outcome
     ]
-    parts = [_certain([o for _, o, s in cases if s == kind], links, space) for kind in range(len(kinds))]
+    parts = [_find_certain([o for _, o, s in cases if s == kind], links, space) for kind in range(len(kinds))]
     # Chain of (mode, outcome), with its long-run law.
     kind_of_case = np.array([s for _, _, s in cases])
     mode = np.array([i for i, _, _ in cases])
@@ -199,7 +199,7 @@ class Certain(NamedTuple):
     random: bool
 
     def noise(self, outcome: Outcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
-        """Return the covariance of these sums at x = 0, about the mean of their kind."""
+        """Return Cov(D z) of the sums D z of known gain, at x = 0 and about the mean over outcomes of a kind."""
         mean, second = second_moments(outcome.map)
         v = np.append(links.sensor_mean, 1.0)
         signal = np.outer(v, v)
@@ -210,7 +210,7 @@ class Certain(NamedTuple):
         return np.asarray(self.combine @ (total + np.outer(about, about)) @ self.combine.T)
 
 
-def _certain(alike: Sequence[Outcome], links: JointLinks, space: Float[np.ndarray, "n d"]) -> Certain:
+def _find_certain(alike: Sequence[Outcome], links: JointLinks, space: Float[np.ndarray, "n d"]) -> Certain:
     """Find the sums of known gain: the null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same.
 
     Y is a basis of the subspace `space`.

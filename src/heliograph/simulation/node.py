@@ -42,7 +42,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
     """
     rows = [part for channel in channels for part in channel.in_parallel for _ in range(part.outputs)]
     # Flags stand after the measurement; each comes from one row of the channels.
-    for reader in _readers(filter):
+    for reader in _find_flag_filters(filter):
         if isinstance(reader, ModeObservedFilter):
             sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
             wrong = [row for row in rows[sent : reader.received] if not _reveals(row, reader.late)]
@@ -55,7 +55,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
             raise fail(f"{name}, flags", f"those of {expected}", "one of the step before" if late else plain)
 
 
-def _readers(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
+def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
     """Return the filters that use flags, after the measurement in the received vector; also inside of others."""
     kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))

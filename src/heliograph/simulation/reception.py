@@ -210,7 +210,7 @@ class Slots(AbstractMedium):
         mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
         hops = {
             name: start(hop, key, checksum(f"{sender} to {listener}"), self.memories[name])
-            for name, (_, listener, sender, hop) in _remembering(self.relays).items()
+            for name, (_, listener, sender, hop) in _find_hops_with_memory(self.relays).items()
         }
         return Relayed(jnp.tile(mean, (len(self.estimates_at), 1)), hops)
 
@@ -224,9 +224,9 @@ class Slots(AbstractMedium):
         signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
         sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
         # Hops without memory by a branch for the slot, then those with memory.
-        received = self._forgetful(k, sent, key)
+        received = self._sum_without_memory(k, sent, key)
         hops, slot = {}, k % len(self.relays.slots)
-        for name, (number, listener, sender, hop) in _remembering(self.relays).items():
+        for name, (number, listener, sender, hop) in _find_hops_with_memory(self.relays).items():
             source = checksum(f"{sender} to {listener}")
             hops[name], z = deliver(hop, state.hops[name], sent[sender], key, k, source, self.memories[name])
             received[listener] = received[listener] + jnp.where(slot == number, z, 0.0)
@@ -238,7 +238,7 @@ class Slots(AbstractMedium):
         means = [estimates[kind].mean[f, i] for kind, f, i in self.estimates_at]
         return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
 
-    def _forgetful(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
+    def _sum_without_memory(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
         """Sum at each listener through hops without memory; NaN where nobody transmits to it."""
         # Slots of one structure share a branch; numbers of each slot within it.
         kinds: dict[object, list[int]] = {}
@@ -270,7 +270,7 @@ class Slots(AbstractMedium):
         return branch
 
 
-def _remembering(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
+def _find_hops_with_memory(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
     """Return the slot, listener, sender and hop of the hops with memory, by name."""
     return {
         f"{number} {listener} {sender}": (number, listener, sender, hop)
@@ -304,7 +304,7 @@ def medium_of(network: Network) -> AbstractMedium:
             network.relays,
             tuple(places[name, LOCAL] for name in network.relays.relays),
             tuple(tuple(listeners[name] for name in names) for names in network.groups),
-            memory_places({name: hop for name, (_, _, _, hop) in _remembering(network.relays).items()}),
+            memory_places({name: hop for name, (_, _, _, hop) in _find_hops_with_memory(network.relays).items()}),
         )
     # One channel for all nodes.
     if network.common is not None:

@@ -98,7 +98,7 @@ def run(
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
-    clock = _clock_of(measured, {"inputs": inputs, "truth": truth}, time, steps)
+    clock = _find_clock(measured, {"inputs": inputs, "truth": truth}, time, steps)
     warn_of_unequal_steps(network.inputs, clock)
     for name, node in network.nodes.items():
         z[name] = _drop_beyond_limits(name, node, z[name])
@@ -109,7 +109,7 @@ def run(
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, smoothing and smoothing.kinds, judges=True)
     with jax.enable_x64(True):
-        arrivals = _reports_of(
+        arrivals = _name_reports(
             filters, {} if reports is None else table("reports", reports, "reports by fusion"), steps
         )
         outputs = _filter_plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
@@ -120,11 +120,11 @@ def run(
     warn_of_no_numbers(record)
     for line in (*wide_in_rows(network, record), *_describe_left_out(network, record)):
         warnings.warn(line, stacklevel=2)
-    origin = _origin(network, record, state, u)
+    origin = _make_origin(network, record, state, u)
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
 
 
-def _origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> Origin:
+def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> Origin:
     """Where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
     last = {
         node: {name: Estimate(np.asarray(e.mean)[-1], np.asarray(e.covariance)[-1], e.claim) for name, e in of.items()}
@@ -136,7 +136,7 @@ def _origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> O
     return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last)
 
 
-def _clock_of(
+def _find_clock(
     measured: Mapping[str, ArrayLike], others: Mapping[str, object], time: ArrayLike | None, steps: int
 ) -> np.ndarray:
     """Return the times of the rows: those given, else the dates by which the tables know them, else 0, 1, ..."""
@@ -179,7 +179,7 @@ def _warn_of_forbidden(name: str, node: Node | ReceivingNode, z: Float[np.ndarra
         )
 
 
-def _reports_of(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
+def _name_reports(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
     """Return what arrived of reports and between neighbours, by fusion."""
     centre_arrivals: dict[str, PyTree] = {
         name: centre.uplinks.recorded(name, centre.nodes, reports.get(name), steps)
@@ -230,7 +230,7 @@ def _find_refused(
     """Find the rows that all filters of a node refuse, and central ones' by the node to blame; new ones alone."""
     (filters, _, u, arrivals), (refused, shared) = rest, find_refused_rows(network, outputs)
     if shared:
-        states = compute_once(_central_states, _central_states_by_xla, (filters, u, arrivals, grouped))
+        states = compute_once(_collect_central_states, _central_states_by_xla, (filters, u, arrivals, grouped))
         in_order = {name: z[name] for name in network.names}
         nodes = Judges(network).without_own
         refused |= refuse_centrally(filters.central, states, in_order, u, shared, nodes)
@@ -238,7 +238,7 @@ def _find_refused(
     return {name: rows for name, rows in new.items() if rows}
 
 
-def _central_states(
+def _collect_central_states(
     filters: AllFilters, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...]
 ) -> PyTree:
     """Return the states of the central filters before each row."""
@@ -311,4 +311,4 @@ def _results(later: Smoother | None, z: tuple[np.ndarray, ...], state: PyTree, r
 
 
 _by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan)
-_central_states_by_xla = quickly_compiled(_central_states)
+_central_states_by_xla = quickly_compiled(_collect_central_states)

@@ -181,20 +181,20 @@ def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Prog
 @quickly_compiled
 def _initial(job: _Job) -> PyTree:
     """Return the sums of zero before the first block; compiled, so that shapes are worked out once a network."""
-    shapes = eqx.filter_eval_shape(_block, job, np.arange(BLOCK))[0]
+    shapes = eqx.filter_eval_shape(_simulate_block, job, np.arange(BLOCK))[0]
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
 
 
 @partial(quickly_compiled, donate="all-except-first")
 def _lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
-    return _blocks(*todo, carry)
+    return _simulate_blocks(*todo, carry)
 
 
-def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
+def _simulate_blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
     """Sum over blocks one after another, of fixed width and order of sums: so chunks do not change a bit."""
 
     def body(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
-        sums, collected = _block(job, runs)
+        sums, collected = _simulate_block(job, runs)
         return added(carry, sums), collected
 
     return jax.lax.scan(body, carry, jnp.asarray(blocks))
@@ -203,13 +203,13 @@ def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
 @quickly_compiled
 def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Sum over every lane's blocks, with a leading axis for the lanes."""
-    sums: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
+    sums: tuple[PyTree, PyTree] = jax.vmap(partial(_simulate_blocks, job))(blocks, carries)
     return sums
 
 
-def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
+def _simulate_block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
     """Sums by batch of one block of runs and flags likewise, and what is collected, (run, time, ...)."""
-    recorded = _reduced(job.reducer, job.later, _outputs(job, runs))
+    recorded = _reduced(job.reducer, job.later, _simulate_outputs(job, runs))
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
     # What all runs share stands as of one; of the others the axis of runs becomes one of batches, without padding.
@@ -223,7 +223,7 @@ def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
     return (sums, ever), collected
 
 
-def _outputs(job: _Job, runs: jax.Array) -> PyTree:
+def _simulate_outputs(job: _Job, runs: jax.Array) -> PyTree:
     """Trajectories of one block of runs, (run, time, ...), in double precision whatever they were simulated in."""
     if job.precision == "float64":
         return _trajectories(job.world, job.inputs, job.key, runs)
@@ -241,8 +241,8 @@ def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
     """
     with jax.enable_x64(True):
         block = np.arange(BLOCK)
-        sums, collected = eqx.filter_eval_shape(_block, job, block)
-        outputs = eqx.filter_eval_shape(_outputs, job, block)
+        sums, collected = eqx.filter_eval_shape(_simulate_block, job, block)
+        outputs = eqx.filter_eval_shape(_simulate_outputs, job, block)
         read = read_by(partial(_reduced, job.reducer, job.later), outputs)
     blocks, at_once = -(-runs // BLOCK), -(-min(runs, chunk) // BLOCK)
     in_flight = 1 if job.world.filters.meshes else min(LANES, at_once, os.cpu_count() or 1)

@@ -67,14 +67,19 @@ class Smoother(Module):
         }
         if "truth" in outputs:
             truth = self.smoothing.select_reference(outputs["truth"])
-            smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_by_kind])}
+            smoothed |= {
+                "truth": truth,
+                **self._turn_to_truth(truth, smoothed, [steps.angles for steps in steps_by_kind]),
+            }
         # Sums of the NIS, for the test of consistency.
         surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
         nis = tuple(surprised(steps) for steps in steps_by_kind)
         centrally = {name: nis_sums(steps) for name, steps in outputs["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
-    def _near(self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
+    def _turn_to_truth(
+        self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]
+    ) -> dict[str, PyTree]:
         """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
 
         def near(estimate: Estimate, which: Angles) -> Estimate:
@@ -139,7 +144,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
         raise fail("smoothing", "a filter at a node or the centre", "a network without filters")
     # Claims of smoothed estimates and of their fusions.
     claims: Claims = {
-        name: {f: _claim_of_smoother(filter) for f, filter in node.filters.items()}
+        name: {f: _find_claim_of_smoother(filter) for f, filter in node.filters.items()}
         for name, node in smoothed.nodes.items()
     }
     if smoothed.fused:
@@ -151,7 +156,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
     return SmoothedPart(smoothed, smoothing, kinds, groups, claims)
 
 
-def _claim_of_smoother(filter: AbstractFilter) -> Claim:
+def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
@@ -163,7 +168,7 @@ def _claim_of_smoother(filter: AbstractFilter) -> Claim:
 def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
     """Return what a fusion of smoothed estimates can claim; raise where it has no smoothed form."""
     if isinstance(fusion, AbstractFilter):
-        return _claim_of_smoother(fusion)
+        return _find_claim_of_smoother(fusion)
     if isinstance(fusion.rule, AbstractInformedFusion):
         got = f"{type(fusion.rule).__name__}, which knows errors as they are before later data"
         raise fail(f"smoothing of {FUSED}/{name}", "a rule that needs no joint covariance", got)

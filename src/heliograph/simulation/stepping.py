@@ -89,7 +89,7 @@ class AllFilters(Module):
         # Central filters, fusions, informed centres, centres with reports.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
-        self.reporting, self.meshes = _reporting(network), meshes_of(network)
+        self.reporting, self.meshes = _make_reporting(network), meshes_of(network)
         self.tests = make_fused_innovations(network, self.alike) if tests else {}
         # Permutation of the groups' measurements into the order of the nodes.
         grouped = [name for names in network.groups for name in names]
@@ -305,7 +305,7 @@ def plans(filters: AllFilters) -> bool:
     )
 
 
-def _reporting(network: Network) -> dict[str, Reporting]:
+def _make_reporting(network: Network) -> dict[str, Reporting]:
     """Return the fusions by reports, each with its uplinks and its centre."""
     results = {}
     for name, fusion in network.fused.items():

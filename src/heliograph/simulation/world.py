@@ -41,11 +41,16 @@ class World(Module):
         drawn |= {name: arrived for name, (_, arrived) in across.items()}
         states, outputs = self.filters.step(states, z, u, k, drawn)
         after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges
-        seen = {"truth": x, "measurements": z, "transmissions": self.medium.reasons(medium), **_near(plant, x, outputs)}
+        seen = {
+            "truth": x,
+            "measurements": z,
+            "transmissions": self.medium.reasons(medium),
+            **_turn_to_truth(plant, x, outputs),
+        }
         return after, seen
 
 
-def _near(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
+def _turn_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
     """Return the estimates with angles within half a turn of the truth, so that x - xhat is the error."""
     if not plant.circular:
         return outputs

@@ -54,7 +54,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         z = first[:, :-1] @ np.append(y, 1.0)
         for order in range(1, highest + 1):
             expected = channel.moments(order).expect(monomials(y, order))
-            worst = max(worst, _compare(f"order {order}", expected, _monomials(z, order)))
+            worst = max(worst, _compare(f"order {order}", expected, _raise_rows(z, order)))
     return worst
 
 
@@ -75,11 +75,11 @@ def _compare_modes(
         order: [modes.moments(order) @ monomials(y, order) for y in points] for order in range(1, highest + 1)
     }  # E[mono(z) | mode], (mode, monomials)
     for order, (at_first, at_second) in given.items():
-        worst = max(worst, _compare(f"order {order}, first draw", begin @ at_first, _monomials(now, order)))
-        worst = max(worst, _compare(f"order {order}, second draw", begin @ rows @ at_second, _monomials(later, order)))
+        worst = max(worst, _compare(f"order {order}, first draw", begin @ at_first, _raise_rows(now, order)))
+        worst = max(worst, _compare(f"order {order}, second draw", begin @ rows @ at_second, _raise_rows(later, order)))
     for i, j in product(range(1, highest // 2 + 1), repeat=2):
         expected = np.einsum("a,ab,am,bl->ml", begin, rows, given[i][0], given[j][1]).reshape(-1)
-        seen = np.einsum("sm,sl->sml", _monomials(now, i), _monomials(later, j)).reshape(len(now), -1)
+        seen = np.einsum("sm,sl->sml", _raise_rows(now, i), _raise_rows(later, j)).reshape(len(now), -1)
         worst = max(worst, _compare(f"orders {i} and {j} of two draws in a row", expected, seen))
     return worst
 
@@ -112,7 +112,7 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
     return drawn, np.asarray(later)
 
 
-def _monomials(z: np.ndarray, order: int) -> np.ndarray:
+def _raise_rows(z: np.ndarray, order: int) -> np.ndarray:
     """Return the monomials of each row of z."""
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])

@@ -49,7 +49,7 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
         if rule.claim(["upper"] * count) == "upper":
             claimed = np.asarray(together.covariance[0])
             excess = gains @ joint.reshape(count * n, count * n) @ gains.T - claimed
-            worst = max(np.linalg.eigvalsh(excess)[-1], _worst_excess(gains, bounds, claimed, generator))
+            worst = max(np.linalg.eigvalsh(excess)[-1], _find_worst_excess(gains, bounds, claimed, generator))
             limit = ROUNDING * np.trace(claimed)
             assert worst <= limit, f"bound: expected an upper one, exceeded by {worst:g}"
 
@@ -57,7 +57,9 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
 STARTS, ASCENTS = 8, 50
 
 
-def _worst_excess(gains: np.ndarray, bounds: np.ndarray, claimed: np.ndarray, generator: np.random.Generator) -> float:
+def _find_worst_excess(
+    gains: np.ndarray, bounds: np.ndarray, claimed: np.ndarray, generator: np.random.Generator
+) -> float:
     """Largest v' (E - B) v found over unit directions v and the joint covariances of errors with these bounds P_i.
 
     With the fused error sum_i W_i e_i the worst is sup v' E v = (sum_i |P_i^(1/2) W_i' v|)^2, where all errors move

@@ -73,7 +73,7 @@ def check_scaling(
     return worst
 
 
-def _nodes(network: Network) -> dict[str, Node]:
+def _list_nodes(network: Network) -> dict[str, Node]:
     """Return the nodes, all of which must measure the plant themselves."""
     results = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(results) < len(network.nodes):
@@ -83,8 +83,10 @@ def _nodes(network: Network) -> dict[str, Node]:
 
 def _drop_filters(network: Network) -> Network:
     """Return the network without its filters, except where a filter feeds back to its sensor."""
-    published = {name: node.informed_by is not None for name, node in _nodes(network).items()}
-    nodes = {n: node if published[n] else Node(node.sensor, node.channel, {}) for n, node in _nodes(network).items()}
+    published = {name: node.informed_by is not None for name, node in _list_nodes(network).items()}
+    nodes = {
+        n: node if published[n] else Node(node.sensor, node.channel, {}) for n, node in _list_nodes(network).items()
+    }
     return Network(network.plant, nodes)
 
 
@@ -113,7 +115,7 @@ def _compare_runs(
     common: bool,
 ) -> float:
     """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed."""
-    nodes = {name: _rescale_node(name, node, units[name]) for name, node in _nodes(network).items()}
+    nodes = {name: _rescale_node(name, node, units[name]) for name, node in _list_nodes(network).items()}
     fused = {name: _rescale_fusion(name, fusion, units[Network.FUSED]) for name, fusion in network.fused.items()}
     scaled = Network(rescaled_plant(network.plant, units[Network.FUSED]), nodes, fused)
     shared = units[Network.FUSED].inputs
@@ -121,9 +123,9 @@ def _compare_runs(
     worst = 0.0
     for node, filters in plain.items():
         for name, estimate in filters.items():
-            searches = _searches(network, node, name)
+            searches = _has_search_in_estimate(network, node, name)
             if common or not searches:
-                difference = _difference(estimate, estimates[node][name], units[node].states) / DIGITS
+                difference = _find_difference(estimate, estimates[node][name], units[node].states) / DIGITS
                 worst = max(
                     worst, _report_largest(f"{node}/{name}", difference * (DIGITS / SEARCHED if searches else 1.0))
                 )
@@ -136,7 +138,7 @@ def _report_largest(name: str, differences: np.ndarray) -> float:
     return largest
 
 
-def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
+def _find_difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
     """Return the largest difference at each step, relative to a component's scale: its mean and greatest deviation."""
     mean, other = np.asarray(a.mean), np.asarray(b.mean) / s
     covariance, their = np.asarray(a.covariance), np.asarray(b.covariance) / np.outer(s, s)
@@ -195,7 +197,7 @@ def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) ->
     return fusion
 
 
-def _searches(network: Network, node: str, name: str) -> bool:
+def _has_search_in_estimate(network: Network, node: str, name: str) -> bool:
     """Return whether a trace is minimised on the way to this estimate."""
     if node != Network.FUSED:
         return _has_search(network.nodes[node].filters[name])

@@ -98,12 +98,12 @@ def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]
     results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
         nodes_only = number in last or not isinstance(value, InMemory)
-        stored = _filled(lowering, value) if nodes_only else _stored(lowering, value, results)
+        stored = _store_in_memory(lowering, value) if nodes_only else _find_or_copy(lowering, value, results)
         results.append(stored.buffer)
     return results
 
 
-def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
+def _find_or_copy(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
     """Return an array's buffer if it is all of one that the program filled; else copy the array."""
     buffer = value.buffer
     whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
@@ -111,10 +111,10 @@ def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemor
     if whole and alone and value.size == buffer.size:
         buffer.shape = value.shape
         return value
-    return _filled(lowering, value) if value.size <= TABLE else copied(lowering, value)
+    return _store_in_memory(lowering, value) if value.size <= TABLE else copied(lowering, value)
 
 
-def _filled(lowering: Lowering, value: Value) -> InMemory:
+def _store_in_memory(lowering: Lowering, value: Value) -> InMemory:
     """Store an array in new memory, constants too."""
     flat: list[Node] = lowering.nodes(value).ravel().tolist()
     type: Type = value.type if isinstance(value, InMemory) else flat[0].type
@@ -161,7 +161,7 @@ def written(
     owners = dict.fromkeys(x.owner[0] for x in items if isinstance(x, Buffer))
     added = set() if summed is None else {b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in spread}
     _check_sums(items, added)
-    scratch, in_scratch = _places(
+    scratch, in_scratch = _place_buffers(
         [
             b
             for b in owners
@@ -174,14 +174,14 @@ def written(
     # What blocks read of memory that is filled anew in each turn of a loop has a place for each turn.
     turning = {b for b in owners if b not in spread and b.kind in FILLED and loops_of(b.block)}
     turning &= _read(mine) if turning else turning
-    shared, in_shared = _places([b for b in owners if b not in spread and b.kind in FILLED], 1, 0, turning)
+    shared, in_shared = _place_buffers([b for b in owners if b not in spread and b.kind in FILLED], 1, 0, turning)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = Slots(shared)
     pointers = [*program.inputs, *tables, *outputs]
     blocks = Writer(alone, mine, products, spread, slots)
     blocks.turning = turning
     blocks.flushes = flushes = _is_single(items)
-    text, movers = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, width, summed)
+    text, movers = _write_blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, width, summed)
     # The other function fills these slots, once for all runs.
     roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind in FILLED)]
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
@@ -189,10 +189,10 @@ def written(
     if roots:
         writer = Writer(True, needed(roots), products, set(), slots)
         writer.turning, writer.flushes = turning, flushes
-        once = _source(_once(writer, program, pointers, in_shared), writer, [])
+        once = _finish_source(_write_shared(writer, program, pointers, in_shared), writer, [])
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
-    source, results = _source(text, blocks, movers), [Output(b.type, b.shape) for b in outputs]
+    source, results = _finish_source(text, blocks, movers), [Output(b.type, b.shape) for b in outputs]
     divisions = counts["div"] + counts["sqrt"]
     program.graph.top.let_go()
     return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions, width)
@@ -223,7 +223,7 @@ def _read(items: Iterable[Any]) -> set[Buffer]:
     return {node.value[0].owner[0] for node in nodes if node.op == "load"}
 
 
-def _source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -> Source:
+def _finish_source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -> Source:
     """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
     counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
     turns = {block: turns_of(block) for block in counts}
@@ -239,7 +239,7 @@ def _source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -
     return Source(zlib.compress(text.encode(), 1), helpers, counts.total(), work)
 
 
-def _places(
+def _place_buffers(
     buffers: Iterable[Buffer], width: int, start: int, turning: Collection[Buffer] = ()
 ) -> tuple[int, dict[Buffer, int]]:
     """Place buffers one after another; return the end and each one's offset, in bytes; of some one for each turn."""
@@ -254,7 +254,7 @@ def _places(
 HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 
 
-def _blocks(
+def _write_blocks(
     writer: Writer,
     program: Program,
     pointers: list[Buffer],
@@ -270,7 +270,7 @@ def _blocks(
 
     Return it with what writes the functions that move inputs and outputs.
     """
-    names = _pointers(writer, pointers, in_shared)
+    names = _write_pointers(writer, pointers, in_shared)
     for buffer, offset in in_scratch.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
     # Loop over blocks; the block `number` has runs from `first` on.
@@ -294,7 +294,7 @@ def _blocks(
         move("take", buffer)
     writer.asking = longest(x for x in program.graph.top.items if x in writer.mine)
     if writer.asking is not None:
-        writer.asked = _rows(writer, names, taken, given, width, writer.asking)
+        writer.asked = _locate_rows(writer, names, taken, given, width, writer.asking)
     helpers: list[Callable[[int], str]] = []
     if summed is not None:
         helpers.append(lane_numbers)
@@ -316,7 +316,7 @@ def _blocks(
     return _run(body, writer), helpers
 
 
-def _rows(
+def _locate_rows(
     writer: Writer, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
 ) -> list[Rows]:
     """Locate the rows that a loop asks for: the next block's inputs, and this block's outputs."""
@@ -349,9 +349,9 @@ def _add(
         writer.sums[buffer] = row_length(width, summed.batches)
 
 
-def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:
+def _write_shared(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:
     """Write the function that computes what all runs share."""
-    _pointers(writer, pointers, in_shared)
+    _write_pointers(writer, pointers, in_shared)
     writer.block(program.graph.top)
     body = "\n".join(writer.lines)
     return _run(body, writer)
@@ -365,7 +365,7 @@ def _run(body: str, writer: Writer) -> str:
     return f"define void @run{HEAD} {{\nentry:\n{before}{body}\n{after}  ret void\n}}\n"
 
 
-def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
+def _write_pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
     """Load the addresses of inputs, tables and outputs, the bases of their buffers; return the names of all."""
     names: dict[Buffer, str] = {}
     for number, buffer in enumerate([*pointers, None]):

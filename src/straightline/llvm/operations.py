@@ -59,7 +59,7 @@ def operation(node: Node, names: list[str], emit: Emit) -> str:
         return emit(f"select {operand_type} {names[0]}, {result_type} {names[1]}, {result_type} {names[2]}")
     # Comparisons and conversions depend on the type of the arguments.
     if op in ORDER:
-        return emit(f"{_comparison(op, source)} {operand_type} {names[0]}, {names[1]}")
+        return emit(f"{_write_comparison(op, source)} {operand_type} {names[0]}, {names[1]}")
     if op == "convert":
         return _write_conversion(source, node.type, names[0], emit)
     if op == "bitcast":
@@ -78,7 +78,7 @@ def called(node: Node) -> str:
     return f"{node.op}f" if node.type == "f32" else node.op
 
 
-def _comparison(op: str, type: Type) -> str:
+def _write_comparison(op: str, type: Type) -> str:
     if type in REAL:
         return "fcmp une" if op == "ne" else f"fcmp o{op}"
     if op in ("eq", "ne"):
@@ -127,13 +127,13 @@ def _write_integer(node: Node, names: list[str], text: str, emit: Emit) -> str:
         limited = emit(f"call {text} @llvm.{'s' if signed else 'u'}min({first}, {text} {splat(1, type)})")
         return emit(f"call {text} @llvm.smax({text} {limited}, {text} {splat(-1, type)})") if signed else limited
     if op in ("div", "rem"):
-        return _divided(node, names, text, emit)
+        return _write_division(node, names, text, emit)
     if op in ("shift_left", "shift_right", "shift_right_signed"):
-        return _shifted(node, names, text, emit)
+        return _write_shift(node, names, text, emit)
     raise Unsupported(f"{op} of {type}")
 
 
-def _divided(node: Node, names: list[str], text: str, emit: Emit) -> str:
+def _write_division(node: Node, names: list[str], text: str, emit: Emit) -> str:
     """Emit a division of integers, or its rest: by 0 all bits set, or a; the least number by -1 is itself, or 0."""
     op, type, (a, b) = node.op, node.args[0].type, names
     how = f"{'s' if type[0] == 'i' else 'u'}{op}"
@@ -151,7 +151,7 @@ def _divided(node: Node, names: list[str], text: str, emit: Emit) -> str:
     return emit(f"select {truth} {zero}, {text} {splat(-1, type) if op == 'div' else a}, {text} {divided}")
 
 
-def _shifted(node: Node, names: list[str], text: str, emit: Emit) -> str:
+def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
     """Emit a shift; by all bits or more, 0 is left, or the sign."""
     op, type, (a, b), by = node.op, node.args[0].type, names, node.args[1]
     how = {"shift_left": "shl", "shift_right": "lshr"}.get(op, "ashr")

@@ -114,7 +114,7 @@ class Writer:
             elif isinstance(statement, Store):
                 self._write_store(statement)
             elif isinstance(statement, Loop):
-                self._loop(statement)
+                self._write_loop(statement)
             elif isinstance(statement, Guard):
                 self._write_guard(statement)
 
@@ -180,7 +180,7 @@ class Writer:
     def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
         """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
         owner, start = buffer.owner
-        base = self._base(owner)
+        base = self._write_base(owner)
         if indices:
             key = ("row", owner, tuple(strides), tuple(indices))
             row = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
@@ -193,7 +193,7 @@ class Writer:
             base = row
         return self.add(f"getelementptr {entry}, ptr {base}, i64 {offset + start}")
 
-    def _base(self, owner: Buffer) -> str:
+    def _write_base(self, owner: Buffer) -> str:
         """Return the address of a buffer's memory, in this turn of the loops around it."""
         if owner not in self.turning:
             return self.bases[owner]
@@ -218,7 +218,7 @@ class Writer:
         """Write the read of a number from a buffer: one for all lanes, one for each, or by indices that lanes have."""
         buffer, offset, strides = node.value
         if not all(self._is_scalar(i) for i in node.args):
-            return self._gather(node)
+            return self._write_gather(node)
         if buffer.owner[0] not in self.spread:
             return self.everywhere(self._scalar_load(node), node.type)
         address = self._address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
@@ -234,7 +234,7 @@ class Writer:
             return self.add(f"icmp ne i8 {self.add(f'load i8, ptr {address}, align 1')}, 0")
         return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
 
-    def _gather(self, node: Node) -> str:
+    def _write_gather(self, node: Node) -> str:
         """Load a number at a different place in each lane."""
         buffer, offset, strides = node.value
         owner, start = buffer.owner
@@ -248,7 +248,9 @@ class Writer:
             positions = self.add(f"add %i64 {step}, {positions}")
         # One load for each lane; booleans are stored as bytes.
         self.gathered.add((bits, spread))
-        loaded = self.add(f"call %i{bits} @{gather_name(bits, spread)}(ptr {self._base(owner)}, %i64 {positions})")
+        loaded = self.add(
+            f"call %i{bits} @{gather_name(bits, spread)}(ptr {self._write_base(owner)}, %i64 {positions})"
+        )
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {loaded}, zeroinitializer")
         return self.add(f"bitcast %i{bits} {loaded} to {vector(node.type)}") if node.type in REAL else loaded
@@ -268,7 +270,7 @@ class Writer:
             name, kind = self.add(f"zext {kind} {name} to %i8"), "%i8"
         self.line(f"store {kind} {name}, ptr {address}, align {bits // 8}")
 
-    def _loop(self, loop: Loop) -> None:
+    def _write_loop(self, loop: Loop) -> None:
         """Write a loop: parameters are phi nodes of the carry; a counted loop has at least one turn."""
         self.count += 1
         name, before = f"loop{self.count}", self.label
@@ -300,7 +302,7 @@ class Writer:
             self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
             finals = following
         else:
-            following, finals = self._turns(loop, name, moving)
+            following, finals = self._write_conditional_loop(loop, name, moving)
         # The phi nodes come first, but their arguments are known only now.
         phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
         for k, start, after in zip(moving, starts, following, strict=True):
@@ -312,7 +314,7 @@ class Writer:
         for k, final in zip(moving, finals, strict=True):
             self._keep(loop.results[k], final)
 
-    def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
+    def _write_conditional_loop(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
         """Write a loop that ends when no lane's condition holds."""
         # The body up to the loop's check, and what follows it in a turn.
         checks = (i for i, s in enumerate(loop.body.items) if isinstance(s, Check) and s.loop is loop)

@@ -57,15 +57,17 @@ def mover(bits: int, inwards: bool, squared: bool, width: int) -> str:
         # Squares, then the remaining entries.
         start = "0"
         if squared:
-            text.loop(f"g{group}", "0", "%size", side, _square(text, rows, width, group, bits, inwards))
+            text.loop(f"g{group}", "0", "%size", side, _write_square(text, rows, width, group, bits, inwards))
             start = text.add(f"and i64 %size, {-side}")
-        text.loop(f"h{group}", start, "%size", 1, _single(text, rows, width, group, bits, inwards))
+        text.loop(f"h{group}", start, "%size", 1, _write_single(text, rows, width, group, bits, inwards))
     body = "\n".join(text.lines)
     arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
     return f"define internal void @{name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}} ; {bytes_}\n"
 
 
-def _square(text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool) -> Callable[[str], None]:
+def _write_square(
+    text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool
+) -> Callable[[str], None]:
     """Move as many entries as there are lanes."""
 
     def body(i: str) -> None:
@@ -79,14 +81,14 @@ def _square(text: Lines, rows: list[str], width: int, group: int, bits: int, inw
         moved = [text.add(f"load {vector}, ptr {p}, align {bits // 8}") for p in sources]
         half = len(rows) // 2
         while half:
-            moved, half = _exchanged(text, moved, half, bits), half // 2
+            moved, half = _exchange_squares(text, moved, half, bits), half // 2
         for p, x in zip(targets, moved, strict=True):
             text.lines.append(f"  store {vector} {x}, ptr {p}, align {bits // 8}")
 
     return body
 
 
-def _exchanged(text: Lines, rows: list[str], half: int, bits: int) -> list[str]:
+def _exchange_squares(text: Lines, rows: list[str], half: int, bits: int) -> list[str]:
     """Do one step of a transposition: exchange off-diagonal squares of this size."""
     exchanged, side = rows[:], len(rows)
     for i in range(side):
@@ -102,7 +104,9 @@ def _exchanged(text: Lines, rows: list[str], half: int, bits: int) -> list[str]:
     return exchanged
 
 
-def _single(text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool) -> Callable[[str], None]:
+def _write_single(
+    text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool
+) -> Callable[[str], None]:
     """Move one entry of each lane."""
 
     def body(i: str) -> None:

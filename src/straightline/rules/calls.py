@@ -32,7 +32,7 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
     return lowering.inline(equation.params["call"], inputs)
 
 
-def _expanded(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Inline a composed operation, such as frexp in JAX from 0.12 on, by its definition in others."""
     primitive = equation.params["_prim"]
 
@@ -53,7 +53,7 @@ def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value])
 
 
 IN_MEMORY |= dict.fromkeys(CALLS, _call)
-IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "call_hi_primitive": _expanded}
+IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "call_hi_primitive": _expand_call}
 RULES |= {"platform_index": _platform_index}
 
 
@@ -67,11 +67,11 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     if len(branches) == 1:
         return lowering.inline(branches[0], inputs[1:])
     # Small branches are computed in any case, large ones in guarded blocks.
-    conditions = _conditions(lowering, which, len(branches))
+    conditions = _find_taken(lowering, which, len(branches))
     sizes = [size_of(lowering, branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}
     for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
-        results[k] = _branch(lowering, conditions[k], branches[k], inputs[1:])
+        results[k] = _lower_branch(lowering, conditions[k], branches[k], inputs[1:])
     # Select the results of the branch that is taken.
     chosen = results[len(branches) - 1]
     for k in reversed(range(len(branches) - 1)):
@@ -79,7 +79,7 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     return chosen
 
 
-def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
+def _find_taken(lowering: Lowering, which: Node, count: int) -> list[Node]:
     """Return for each branch whether it is taken; indices out of range select the first or last."""
     graph = lowering.graph
     if which.op == "convert" and which.args[0].type == "bool":
@@ -91,7 +91,7 @@ def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
     return [below[0], *between, graph.node("not", "bool", below[-1])]
 
 
-def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
+def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
     """Compute a branch in the open block if it has few nodes, else in a guarded one."""
     graph, outer = lowering.graph, lowering.graph.current
     graph.current = block = Block(outer, pinned=True)

@@ -51,7 +51,9 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     if n > 1:
         entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
 
-    values, columns = _sorted([entries[i, i] for i in range(n)], [[vectors[i, j] for i in range(n)] for j in range(n)])
+    values, columns = _sort_by_transposition(
+        [entries[i, i] for i in range(n)], [[vectors[i, j] for i in range(n)] for j in range(n)]
+    )
     rows = jnp.stack([jnp.stack(column) for column in columns], axis=1)
     return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values) * unit, jnp.nan)
 
@@ -96,7 +98,9 @@ def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
         vectors[k, p], vectors[k, q] = c * left - s * right, s * left + c * right
 
 
-def _sorted(values: list[jax.Array], columns: list[list[jax.Array]]) -> tuple[list[jax.Array], list[list[jax.Array]]]:
+def _sort_by_transposition(
+    values: list[jax.Array], columns: list[list[jax.Array]]
+) -> tuple[list[jax.Array], list[list[jax.Array]]]:
     """Sort by odd-even transposition, which needs no branches."""
     n = len(values)
 
@@ -124,10 +128,10 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     shape = avals[0].shape
     if shape[-1] > FEW or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    return _of_each(lowering, _program(shape[-1], avals[0].dtype), equation, inputs[0])
+    return _decompose_each(lowering, _program(shape[-1], avals[0].dtype), equation, inputs[0])
 
 
-def _of_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
+def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
     """Return the results of a program of one matrix for each of many, along leading axes, one after another."""
     (one,) = program.in_avals
     before = matrices.shape[: len(matrices.shape) - len(one.shape)]
@@ -192,7 +196,7 @@ def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Val
     shape = avals[0].shape
     if shape[-2] != shape[-1] or shape[-1] > FEW:
         raise Unsupported(f"factors of a matrix of shape {shape[-2:]}")
-    return _of_each(lowering, _lu_program(shape[-1], avals[0].dtype), equation, inputs[0])
+    return _decompose_each(lowering, _lu_program(shape[-1], avals[0].dtype), equation, inputs[0])
 
 
 @cache
@@ -203,7 +207,7 @@ def _lu_program(n: int, dtype: Any) -> ClosedJaxpr:
 
 def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     program = _permutation_program(inputs[0].shape[-1], equation.params["permutation_size"])
-    return _of_each(lowering, program, equation, inputs[0])
+    return _decompose_each(lowering, program, equation, inputs[0])
 
 
 @cache

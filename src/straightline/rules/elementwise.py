@@ -42,7 +42,7 @@ def _elementwise(op: str) -> Rule:
     return rule
 
 
-def _composed(function: Any) -> Rule:
+def _make_rule(function: Any) -> Rule:
     """Make a rule from one of entries: function(graph, type, parameters, *entries)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -195,14 +195,14 @@ def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: 
 
 RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
 RULES |= {
-    "select_n": _key_select, "integer_pow": _composed(_power), "square": _composed(_square),
-    "pow": _composed(_power_of_number),
-    "rsqrt": _composed(_root_reciprocal), "logistic": _composed(_logistic), "clamp": _composed(_clamp),
-    "convert_element_type": _composed(_convert), "bitcast_convert_type": _bitcast,
-    "one_minus_square": _composed(_one_minus_square), "log2": _composed(_log2), "polynomial": _composed(_polynomial),
-    "eq_to": _composed(_total_order("eq")), "le_to": _composed(_total_order("le")),
-    "lt_to": _composed(_total_order("lt")), "round": _composed(_round),
-    "nextafter": _composed(_next_after), "shift_right_arithmetic": _composed(_shift_right_arithmetic),
+    "select_n": _key_select, "integer_pow": _make_rule(_power), "square": _make_rule(_square),
+    "pow": _make_rule(_power_of_number),
+    "rsqrt": _make_rule(_root_reciprocal), "logistic": _make_rule(_logistic), "clamp": _make_rule(_clamp),
+    "convert_element_type": _make_rule(_convert), "bitcast_convert_type": _bitcast,
+    "one_minus_square": _make_rule(_one_minus_square), "log2": _make_rule(_log2), "polynomial": _make_rule(_polynomial),
+    "eq_to": _make_rule(_total_order("eq")), "le_to": _make_rule(_total_order("le")),
+    "lt_to": _make_rule(_total_order("lt")), "round": _make_rule(_round),
+    "nextafter": _make_rule(_next_after), "shift_right_arithmetic": _make_rule(_shift_right_arithmetic),
 }  # fmt: skip
 PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
 RULES |= dict.fromkeys(PASSED_ON, _as_it_is)

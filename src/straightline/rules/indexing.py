@@ -19,16 +19,16 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
     """Gather at clipped indices; where they fill, a window that is not inside is filled with a value."""
     x, indices = inputs
     if not fills(equation):
-        return [_clipped(equation, lowering, x, indices)]
+        return [_gather_clipped(equation, lowering, x, indices)]
     indices = narrowed(lowering, indices)
-    flags, missing = _inside(lowering, equation, x.shape, indices), fill_of(lowering, equation)
-    gathered, numbers = _clipped(equation, lowering, x, indices), equation.params["dimension_numbers"]
+    flags, missing = _is_inside(lowering, equation, x.shape, indices), fill_of(lowering, equation)
+    gathered, numbers = _gather_clipped(equation, lowering, x, indices), equation.params["dimension_numbers"]
     for entry in np.ndindex(*gathered.shape):
         gathered[entry] = select(lowering.graph, flags[_row(entry, numbers)], gathered[entry], missing)
     return [gathered]
 
 
-def _inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
+def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
     """Return for each row of indices whether its window is inside an array of this shape."""
     axes, sizes = equation.params["dimension_numbers"].start_index_map, equation.params["slice_sizes"]
     flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
@@ -40,11 +40,11 @@ def _inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indi
     return flags
 
 
-def _clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Gather at indices that are clipped to the array."""
     at = known_integers(indices)
     if at is None:
-        return _by_cases(lowering, equation, x, indices)
+        return _gather_by_cases(lowering, equation, x, indices)
     # Places in the flat array, with the axes of windows where the result has them.
     params, numbers = equation.params, equation.params["dimension_numbers"]
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
@@ -56,7 +56,7 @@ def _clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.
     return gathered
 
 
-def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Gather at indices (..., axis) that depend on data: one gather for each possible value, then a selection.
 
     Each entry is selected by the index of its own row alone, so that rows of many nodes need no more cases than one.
@@ -66,8 +66,8 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
     axis = numbers.start_index_map[column]
     last = x.shape[axis] - sizes[axis]
     if last >= FEW:
-        return _from_memory(lowering, equation, x, indices, column)
-    cases = [_clipped(equation, lowering, x, _with(lowering, indices, column, n)) for n in range(last + 1)]
+        return _gather_from_memory(lowering, equation, x, indices, column)
+    cases = [_gather_clipped(equation, lowering, x, _with(lowering, indices, column, n)) for n in range(last + 1)]
     selected = cases[-1].copy()
     for entry in np.ndindex(*selected.shape):
         which = indices[(*_row(entry, numbers), column)]
@@ -77,7 +77,9 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
     return selected
 
 
-def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, column: int) -> np.ndarray:
+def _gather_from_memory(
+    lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, column: int
+) -> np.ndarray:
     """Gather from memory if there are many places: each entry is loaded at an offset by its row's index."""
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axis = numbers.start_index_map[column]
@@ -85,7 +87,7 @@ def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices:
     begin = _with(lowering, indices, column, 0)
     if known_integers(begin) is None:
         raise Unsupported("gather at two places that data decide")
-    starts = _clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), begin)
+    starts = _gather_clipped(equation, lowering, np.arange(x.size, dtype=object).reshape(x.shape), begin)
     buffer, stride = in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
     loaded = np.empty(starts.shape, dtype=object)
     for entry in np.ndindex(*loaded.shape):

@@ -33,10 +33,10 @@ def repeated(
         following, stacked = turn(row, now)
         return following, [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
 
-    return _looped(lowering, length, carry, body)
+    return _lower_loop(lowering, length, carry, body)
 
 
-def _looped(
+def _lower_loop(
     lowering: Lowering, length: int | None, carry: Sequence[np.ndarray], body: Callable[[Loop, list[np.ndarray]], Any]
 ) -> tuple[list[np.ndarray], Any]:
     """Lower a loop; return the carry after it, and what body(loop, carry) returns beside the following carry.
@@ -52,7 +52,7 @@ def _looped(
         # In the body the carry is a parameter; the turn is traced once.
         loop.parameters = _stand_ins(graph, "parameter", loop, loop.body)
         graph.current = loop.body
-        following, rest = body(loop, _like(carry, loop.parameters, halves))
+        following, rest = body(loop, _restore_arrays(carry, loop.parameters, halves))
         graph.current = outer
         kept = [half and is_symmetric(x) for half, x in zip(halves, following, strict=True)]
         if kept == halves:
@@ -63,7 +63,7 @@ def _looped(
     outer.items.append(loop)
     # After the loop the carry is a result.
     loop.results = _stand_ins(graph, "result", loop, outer)
-    return _like(carry, loop.results, halves), rest
+    return _restore_arrays(carry, loop.results, halves), rest
 
 
 def _stand_ins(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
@@ -106,7 +106,7 @@ def _numbers(value: np.ndarray) -> list[Node]:
     return flat
 
 
-def _like(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves: Sequence[bool]) -> list[np.ndarray]:
+def _restore_arrays(arrays: Sequence[np.ndarray], nodes: Sequence[Node], halves: Sequence[bool]) -> list[np.ndarray]:
     """Restore arrays of the same shapes, and keys, from nodes as `_entries` returns them."""
     rest = iter(nodes)
     results = []
@@ -249,7 +249,7 @@ def copied(lowering: Lowering, x: InMemory) -> InMemory:
     return repeated(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
 
 
-def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower a loop that ends when no run's condition holds; a run whose condition is false keeps its carry.
 
     Under `vmap` the condition has axes, the leading ones of the carry, and each entry keeps its carry likewise.
@@ -266,7 +266,7 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
         moved = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
         return [_where_active(graph, active, new, old) for new, old in zip(moved, now, strict=True)], None
 
-    return _looped(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]
+    return _lower_loop(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]
 
 
 def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
@@ -295,4 +295,4 @@ def _programs(params: dict[str, Any]) -> list[Any]:
     return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
 
 
-IN_MEMORY |= {"scan": _lower_scan, "while": _while}
+IN_MEMORY |= {"scan": _lower_scan, "while": _lower_while}

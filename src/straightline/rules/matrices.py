@@ -28,7 +28,9 @@ def _reduce_by(op: str, empty: float) -> Rule:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         terms = math.prod(inputs[0].shape[axis] for axis in axes)  # none of a sum over nothing
         x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), terms)
-        return [array_of([total(lowering.graph, op, type, row, _within(type, empty)) for row in x.tolist()], shape)]
+        return [
+            array_of([total(lowering.graph, op, type, row, _clip_to_type(type, empty)) for row in x.tolist()], shape)
+        ]
 
     return rule
 
@@ -36,7 +38,7 @@ def _reduce_by(op: str, empty: float) -> Rule:
 ALL_BITS = np.nan  # of "and": true, -1, or the greatest unsigned integer
 
 
-def _within(type: Type, number: float) -> float:
+def _clip_to_type(type: Type, number: float) -> float:
     """Return the number of this type that is nearest to one: infinity is no integer. ALL_BITS: that of all bits."""
     if type in REAL or np.isfinite(number):
         return number
@@ -99,11 +101,11 @@ def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarra
     type = result_type(equation)
     x, y = (_of_type(lowering.graph, type, x) for x in inputs)
     a, b = _batched(x, left, left_batch), _batched(y, right, right_batch)
-    products = [_product(lowering, type, rows, columns) for rows, columns in zip(a, b, strict=True)]
+    products = [_multiply_matrices(lowering, type, rows, columns) for rows, columns in zip(a, b, strict=True)]
     return [array_of([n for product in products for n in product.ravel().tolist()], result_shape(equation))]
 
 
-def _product(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Compute A B' of A (n, k) and B (m, k). Of a congruence C P C' both triangles are the upper one.
 
     A = C P and B = C with a symmetric P, or A = C and B = C P. That A A' is symmetric needs no rule, since equal

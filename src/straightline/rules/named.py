@@ -87,7 +87,7 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
     return decorate
 
 
-def _by_plain(*leaves: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
+def _apply_plain(*leaves: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[int, ...]) -> list[Any]:
     """Compute the plain function under its levels of `vmap`, the innermost first."""
     function = jaxpr_as_fun(program.plain)
     for axes in levels:
@@ -99,7 +99,7 @@ def _shapes(*_: Any, program: _Program, levels: tuple[Axes, ...], sizes: tuple[i
     return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
 
 
-def _over_one_more(
+def _batch_operation(
     leaves: Sequence[Any], axes: Sequence[int | None], *, program: _Program, levels: tuple[Axes, ...],
     sizes: tuple[int, ...],
 ) -> tuple[list[Any], list[int]]:  # fmt: skip
@@ -117,14 +117,14 @@ def _with_tangents(primals: Sequence[Any], tangents: Sequence[Any], **params: An
 
     def of_moving(*moving: Any) -> list[Any]:
         rest = iter(moving)
-        return _by_plain(*(next(rest) if m else x for m, x in zip(moves, primals, strict=True)), **params)
+        return _apply_plain(*(next(rest) if m else x for m, x in zip(moves, primals, strict=True)), **params)
 
     at, along = ([x for m, x in zip(moves, values, strict=True) if m] for values in (primals, tangents))
     results, slopes = jax.jvp(of_moving, at, along)
     return results, slopes
 
 
-def _by_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Inline the native function; the plain one where native code does not take that, or it has too many operations.
 
     Known zeros of the arguments decide how many it has: so it is tried.
@@ -132,12 +132,12 @@ def _by_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> l
     program: _Program = equation.params["program"]
     try:
         with lowering.graph.at_most(MANY_TERMS):
-            return lowering.inline(_traced(lowering, equation, program.native), inputs)
+            return lowering.inline(_trace_in_loops(lowering, equation, program.native), inputs)
     except Unsupported:
-        return lowering.inline(_traced(lowering, equation, jaxpr_as_fun(program.plain)), inputs)
+        return lowering.inline(_trace_in_loops(lowering, equation, jaxpr_as_fun(program.plain)), inputs)
 
 
-def _traced(lowering: Lowering, equation: JaxprEqn, function: Callable[..., list[Any]]) -> ClosedJaxpr:
+def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[..., list[Any]]) -> ClosedJaxpr:
     """Trace a function of one item, once for equal shapes, in a loop over each level of `vmap`."""
     program, levels = equation.params["program"], equation.params["levels"]
     kinds = tuple((v.aval.shape, v.aval.dtype) for v in equation.invars)  # type: ignore[attr-defined]
@@ -159,9 +159,9 @@ def _one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) ->
     return results
 
 
-_primitive.def_impl(jax.jit(_by_plain, static_argnames=("program", "levels", "sizes")))
+_primitive.def_impl(jax.jit(_apply_plain, static_argnames=("program", "levels", "sizes")))
 _primitive.def_abstract_eval(_shapes)
-batching.primitive_batchers[_primitive] = _over_one_more
+batching.primitive_batchers[_primitive] = _batch_operation
 ad.primitive_jvps[_primitive] = _with_tangents
-mlir.register_lowering(_primitive, mlir.lower_fun(_by_plain, multiple_results=True))
-IN_MEMORY["operation"] = _by_native
+mlir.register_lowering(_primitive, mlir.lower_fun(_apply_plain, multiple_results=True))
+IN_MEMORY["operation"] = _apply_native

@@ -101,8 +101,8 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     if to_number or not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     short = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
-    if (factors := _few_terms(equation, short)) is not None:
-        return list(_written_product(lowering, equation, factors))
+    if (factors := _find_few_terms(equation, short)) is not None:
+        return list(_write_out_product(lowering, equation, factors))
     a, b = (in_memory(lowering, x) for x in inputs)
     free_left, free_right = (
         next((d for d in range(x.ndim) if d not in axes), None) for x, axes in ((a, left), (b, right))
@@ -129,7 +129,9 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         return as_nodes(lowering, ([], list(lowering.equation(row_equation, rows))))
 
     count = (b if in_left is None else a).shape[0]
-    return _accumulated(lowering, equation, count, turn) if summed else list(repeated(lowering, count, [], turn)[1])
+    return (
+        _accumulate_turns(lowering, equation, count, turn) if summed else list(repeated(lowering, count, [], turn)[1])
+    )
 
 
 def _of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
@@ -156,7 +158,7 @@ def _count_data(x: np.ndarray, axis: int) -> np.ndarray:
     return counts
 
 
-def _accumulated(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
+def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
     """Sum a number that each turn of a loop gives."""
     pair: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
@@ -167,7 +169,7 @@ def _accumulated(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn)
     return list(repeated(lowering, count, [start], add)[0])
 
 
-def _few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
+def _find_few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the factors of a product by a known matrix as (free, contracted) if its zeros leave few terms, else None.
 
     A known factor is an array of numbers, the other one of nodes.
@@ -186,7 +188,7 @@ def _few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.
     return (factors[0], factors[1]) if count.sum() <= WRITTEN_OUT else None
 
 
-def _written_product(
+def _write_out_product(
     lowering: Lowering, equation: JaxprEqn, factors: tuple[np.ndarray, np.ndarray]
 ) -> list[np.ndarray]:
     """Sum the terms of a product that known zeros leave, of each entry in the order of the contracted axis."""

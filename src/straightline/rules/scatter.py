@@ -31,7 +31,7 @@ def _scatter(op: str | None) -> Rule:
         sizes = [1 if a in removed else next(windows) for a in range(x.ndim)]
         at = known_integers(indices)
         if at is None:
-            return [_by_cases(lowering, equation, op, inputs, indices, sizes)]
+            return [_scatter_by_cases(lowering, equation, op, inputs, indices, sizes)]
         # Places of all updates in the flat array, which are applied in order.
         batching = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
         index_map = numbers.scatter_dims_to_operand_dims
@@ -54,7 +54,7 @@ def _combined(graph: Graph, op: str | None, old: Any, new: Any) -> Any:
     return new if op is None else graph.node(op, new.type, old, new)
 
 
-def _by_cases(
+def _scatter_by_cases(
     lowering: Lowering,
     equation: JaxprEqn,
     op: str | None,
@@ -71,7 +71,7 @@ def _by_cases(
     windows = np.moveaxis(updates, along, range(updates.ndim - len(along), updates.ndim))
     updated, count = x.copy(), 0
     for row in np.ndindex(*indices.shape[:-1]):
-        for start, here in _starts(graph, equation, x.shape, sizes, row, indices[row]):
+        for start, here in _yield_starts(graph, equation, x.shape, sizes, row, indices[row]):
             count += math.prod(sizes)
             if count > WRITTEN_OUT:
                 raise Unsupported(f"{equation.primitive.name} at one of many places that data decide")
@@ -84,7 +84,7 @@ def _by_cases(
     return updated
 
 
-def _starts(
+def _yield_starts(
     graph: Graph, equation: JaxprEqn, shape: tuple[int, ...], sizes: list[int], row: tuple[int, ...], index: np.ndarray
 ) -> Iterator[tuple[tuple[int, ...], Node]]:
     """Yield each place where a window may start, and whether it starts there."""

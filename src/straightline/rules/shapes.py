@@ -98,15 +98,15 @@ def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: 
             if last >= FEW:
                 raise Unsupported(f"one of {last + 1} places that data decide")
             known = [s if a != axis else None for a, s in enumerate(starts)]
-            cases = [_updated(lowering, x, update, known, first) for first in range(last + 1)]
+            cases = [_update_at(lowering, x, update, known, first) for first in range(last + 1)]
             return [chosen(lowering.graph, start, cases)]
-    return [_updated(lowering, x, update, starts, 0)]
+    return [_update_at(lowering, x, update, starts, 0)]
 
 
-def _updated(
+def _update_at(
     lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: Sequence[Node | None], here: int
 ) -> np.ndarray:
-    """Apply an update at known starts, `here` along the axis whose start is not known."""
+    """Return x with `update` put at these starts; along the one axis whose start is None, at `here`."""
     at = []
     for size, whole, start in zip(update.shape, x.shape, starts, strict=True):
         if start is not None and start.op != "constant" and whole > size:

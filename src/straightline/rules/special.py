@@ -173,11 +173,13 @@ def digamma(x: jax.Array) -> jax.Array:
 
 
 def _masses(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    both = _inlined(gamma_masses, lowering, equation, inputs)
+    both = _inline_in_double(gamma_masses, lowering, equation, inputs)
     return [both[equation.primitive.name == "igammac"]]
 
 
-def _inlined(function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _inline_in_double(
+    function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]
+) -> list[Value]:
     """Compute in double precision, of numbers of single precision too, for whose results it has digits to spare."""
     avals: list[Any] = [v.aval for v in equation.invars]
     if avals[0].dtype not in (np.float64, np.float32):
@@ -208,4 +210,4 @@ OF_ONE: dict[str, Callable[[jax.Array], jax.Array]] = {
     "digamma": digamma,
 }
 IN_MEMORY |= {"igamma": _masses, "igammac": _masses}
-IN_MEMORY |= {name: partial(_inlined, function) for name, function in OF_ONE.items()}
+IN_MEMORY |= {name: partial(_inline_in_double, function) for name, function in OF_ONE.items()}

@@ -19,7 +19,7 @@ from straightline.rules.shapes import chosen
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 
 
-def _viewed(name: str, view: View) -> Rule:
+def _make_view_rule(name: str, view: View) -> Rule:
     """Make a rule of one array: its view, or the rearranged nodes if there is none."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -88,11 +88,11 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
         last = x.shape[axis] - size
         if start.op != "constant" and last >= FEW:
             return _lower_dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
-        x = _window(lowering, x, axis, start, size) if last else x
+        x = _slice_window(lowering, x, axis, start, size) if last else x
     return [x]
 
 
-def _window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
+def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
     """Return `size` entries along an axis from a start that may depend on data."""
     last = x.shape[axis] - size
     cases = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
@@ -197,7 +197,7 @@ VIEWS: dict[str, View] = {
     "slice": _slice, "rev": _reverse, "transpose": _transpose, "reshape": _reshape, "squeeze": _reshape,
     "expand_dims": _reshape, "broadcast_in_dim": _broadcast,
 }  # fmt: skip
-IN_MEMORY |= {name: _viewed(name, view) for name, view in VIEWS.items()}
+IN_MEMORY |= {name: _make_view_rule(name, view) for name, view in VIEWS.items()}
 RULES |= {"dynamic_slice": _dynamic_slice_of_nodes}
 IN_MEMORY |= {"split": _split, "dynamic_slice": _lower_dynamic_slice, "gather": _gather, "concatenate": _concatenate}
 IN_MEMORY |= {name: RULES[name] for name in PASSED_ON}

@@ -60,14 +60,14 @@ def functions(names: Iterable[str], width: int) -> str:
         op = name if kind == "double" else name[:-1]
         if op in SCALAR:
             declared.append(f"declare {kind} @{name}({', '.join([kind] * SCALAR[op])})\n")
-            texts.append(_by_number(name, kind, SCALAR[op], width))
+            texts.append(_write_by_number(name, kind, SCALAR[op], width))
         else:
             formula, count = OF_FLOATS.get(op, FUNCTIONS[op]) if kind == "float" else FUNCTIONS[op]
             texts.append(function(name, formula, count, kind))
     return "\n".join([*declared, *texts, ATTRIBUTES])
 
 
-def _by_number(name: str, kind: str, count: int, width: int) -> str:
+def _write_by_number(name: str, kind: str, count: int, width: int) -> str:
     """Write a function that calls the scalar library for each number."""
     real = f"%{kind}"
     lines, total = [], "poison"

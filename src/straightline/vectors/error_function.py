@@ -76,7 +76,7 @@ LOG1P = (
 def erf(x: Vector) -> Vector:
     """Compute 2 / sqrt(pi) times the integral of e^(-t^2) from 0 to x."""
     size = abs(x)
-    centre, middle, tail = _parts(size)
+    centre, middle, tail = _evaluate_ranges(size)
     outer = select(size < 1.25, AT_ONE + middle, select(size >= 6.0, 1.0, 1 - tail))
     return copy_sign(select(size < 0.84375, fma(size, centre, size), outer), x)
 
@@ -84,7 +84,7 @@ def erf(x: Vector) -> Vector:
 def erfc(x: Vector) -> Vector:
     """Compute 1 - erf x, precise where it is small."""
     size = abs(x)
-    centre, middle, tail = _parts(size)
+    centre, middle, tail = _evaluate_ranges(size)
     inner = select(x < 0.25, 1 - fma(x, centre, x), 0.5 - (x - 0.5 + x * centre))
     positive = select(size < 1.25, (1 - AT_ONE) - middle, select(size >= 28.0, 0.0, tail))
     negative = select(size < 1.25, 1 + (AT_ONE + middle), 2 - tail)
@@ -92,7 +92,7 @@ def erfc(x: Vector) -> Vector:
     return select(size < 0.84375, inner, select(x < 0.0, negative, positive))
 
 
-def _parts(size: Vector) -> tuple[Vector, Vector, Vector]:
+def _evaluate_ranges(size: Vector) -> tuple[Vector, Vector, Vector]:
     """Compute (erf x - x) / x near 0, erf x - AT_ONE near 1, erfc x beyond: each valid in its own range."""
     square = size * size
     centre = polynomial(square, CENTRE[0]) / polynomial(square, CENTRE[1])

@@ -70,7 +70,7 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
     """e^(x + low), |low| small against 1, within 0.6 units of rounding: 1 + r as a sum of two numbers."""
     form = format_of(x)
     count, n = nearest(x * LOG2_E)
-    first, rest = _reduced(x, n)
+    first, rest = _reduce_argument(x, n)
     r = first + (rest + low)
     rest = (first - r) + (rest + low)
     leading = 1 + r
@@ -82,7 +82,7 @@ def expm1(x: Vector) -> Vector:
     """e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
     form = format_of(x)
     count, n = nearest(select(x < -50.0, -50.0, x) * LOG2_E)
-    r, low = _reduced(select(x < -50.0, -50.0, x), n)
+    r, low = _reduce_argument(select(x < -50.0, -50.0, x), n)
     # e^(r + low) - 1 = r + low + r low + r^2/2 + ...
     small = r + fma(r * r, polynomial(r, form.exp), fma(r, low, low))
     power = _power(form, count - 1)
@@ -94,7 +94,7 @@ def log(x: Vector) -> Vector:
     """log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
     form = format_of(x)
     small, lifted = x < form.tiny, form.fraction + 2
-    k, m = _exponent(select(small, x * 2.0**lifted, x))
+    k, m = _split_exponent(select(small, x * 2.0**lifted, x))
     value = _log(k - select(small, x.like(lifted), 0.0), m - 1, 0.0)
     return _with_domain(x, value)
 
@@ -103,7 +103,7 @@ def log1p(x: Vector) -> Vector:
     """log(1 + x) = log(u) + log((1 + x) / u), u = 1 + x as rounded."""
     u = 1 + x
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
-    k, m = _exponent(u)
+    k, m = _split_exponent(u)
     value = _log(k, m - 1, rounded / u)
     return select(abs(x) < format_of(x).negligible, x, _with_domain(u, value))
 
@@ -124,7 +124,7 @@ def nearest(x: Vector) -> tuple[Vector, Vector]:
     return moved.as_type(form.word) - form.round_bits, moved - form.round
 
 
-def _reduced(x: Vector, n: Vector) -> tuple[Vector, Vector]:
+def _reduce_argument(x: Vector, n: Vector) -> tuple[Vector, Vector]:
     """Return x - n ln 2 as the sum of two numbers."""
     high, low = format_of(x).ln2
     first = fma(n, -high, x)
@@ -149,7 +149,7 @@ def _limited(x: Vector, value: Vector, largest: float, smallest: float) -> Vecto
     return select(x > largest, math.inf, select(x < smallest, 0.0, value))
 
 
-def _exponent(x: Vector) -> tuple[Vector, Vector]:
+def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
     """Return k and m of x = 2^k m, sqrt(1/2) <= m < sqrt(2), of a positive normal number."""
     form = format_of(x)
     bits = x.as_type(form.word)

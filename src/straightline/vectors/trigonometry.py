@@ -52,7 +52,7 @@ TURNS = [
 
 def sin(x: Vector) -> Vector:
     """Sine: that or the cosine of what is left of x beyond the nearest multiple of pi / 2."""
-    quarter, r, low = _turned(x)
+    quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
     value = select((quarter & 2).equals(0), value, -value)
     return _of_any_size(x, select(abs(x) < 2.0 ** -(27 if x.scalar == "double" else 13), x, value), "sin")
@@ -60,13 +60,13 @@ def sin(x: Vector) -> Vector:
 
 def cos(x: Vector) -> Vector:
     """Cosine: the sine a quarter further."""
-    quarter, r, low = _turned(x)
+    quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
     value = select(((quarter + 1) & 2).equals(0), value, -value)
     return _of_any_size(x, value, "cos")
 
 
-def _turned(x: Vector) -> tuple[Vector, Vector, Vector]:
+def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
     """Return the number of quarter turns in x, and the rest as a sum; the first difference is exact."""
     quarter, n = nearest(x * (2 / math.pi))
     parts = HALF_PI if x.scalar == "double" else HALF_PI_OF_FLOATS

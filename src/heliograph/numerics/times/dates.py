@@ -57,13 +57,13 @@ def moment_of(text: str, name: str) -> tuple[int, bool]:
     try:
         if match is None:
             raise ValueError
-        return _instant(match), match["zone"] is not None
+        return _convert_to_nanoseconds(match), match["zone"] is not None
     except ValueError:
         expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
         raise fail(name, expected, show_value(text)) from None
 
 
-def _instant(match: re.Match[str]) -> int:
+def _convert_to_nanoseconds(match: re.Match[str]) -> int:
     """Return the nanoseconds since 1970 in UTC."""
     if int(match["day"][:4]) not in YEARS:
         raise ValueError

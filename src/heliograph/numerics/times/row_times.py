@@ -68,15 +68,15 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
     if getattr(getattr(value, "dtype", None), "kind", "") == "M":
         given = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
         whole = np.asarray(given)
-        return _in_nanoseconds(name, whole if whole.dtype.kind == "M" else np.asarray(given, NANOSECONDS))
-    parts = _elements(value)
+        return _convert_unit(name, whole if whole.dtype.kind == "M" else np.asarray(given, NANOSECONDS))
+    parts = _list_elements(value)
     if not any(_is_date(part) for part in parts):
         return None
     moments = [part.to_timestamp() if hasattr(part, "to_timestamp") else part for part in parts]
-    return dates([str(_in_nanoseconds(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name)
+    return dates([str(_convert_unit(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name)
 
 
-def _elements(value: object) -> list[Any]:
+def _list_elements(value: object) -> list[Any]:
     """Return what a list, or an array that is not of numbers, holds along its one axis; nothing of anything else."""
     kind = getattr(getattr(value, "dtype", None), "kind", "O")
     if isinstance(value, str | bytes | dict) or kind in "fiubcm" or getattr(value, "ndim", 1) != 1:
@@ -91,7 +91,7 @@ def _is_date(part: object) -> bool:
     return isinstance(part, str | np.datetime64) or hasattr(part, "isoformat") or hasattr(part, "to_timestamp")
 
 
-def _in_nanoseconds(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
+def _convert_unit(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
     """Return datetime64 of any unit in nanoseconds, which NumPy lets overflow.
 
     Raises:

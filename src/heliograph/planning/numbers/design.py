@@ -40,13 +40,13 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     # What cannot be is refused before any descent.
     before = problem.at(problem.numbers.start)
     problem.check_ends()
-    limits = _limits(_limit_powers(problem, task.budget), target)
+    limits = _make_limit_rows(_limit_powers(problem, task.budget), target)
     draws = np.random.default_rng(seed)
     begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
     descent = problem.descent_problem()
     best = search(descent, limits, begin)
     if best is None:
-        raise _unmet(descent, limits, begin)
+        raise _explain_unmet(descent, limits, begin)
     # The design, and what Lagrange's conditions say of it.
     now, conditions = problem.at(best), lagrange_conditions(descent, limits, best)
     network, error = problem.network(best), problem.criterion.exact(now.covariances)
@@ -76,7 +76,7 @@ def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
     return limits
 
 
-def _limits(allowed: PowerLimits, target: float | None) -> Limits:
+def _make_limit_rows(allowed: PowerLimits, target: float | None) -> Limits:
     """Return the finite limits of a budget as rows of all powers; peaks too, since powers are no free numbers here."""
     rows, most = allowed.rows()
     peak = allowed.peak.ravel()
@@ -85,7 +85,7 @@ def _limits(allowed: PowerLimits, target: float | None) -> Limits:
     return Limits(np.concatenate([peaks, rows]), np.concatenate([np.ones(len(peaks)), most]), target, len(allowed.peak))
 
 
-def _unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> ValueError:
+def _explain_unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> ValueError:
     """Error that says what is least where limits cannot be met: the error within them, or the power sent anyway."""
     starts, sharpest = len(begin), problem.sharpnesses[-1]
     if limits.target is not None:

@@ -63,7 +63,7 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            parts, gains = _periodic(m) if m.start is None else _step_through(m, m.start[None])
+            parts, gains = _solve_periodic(m) if m.start is None else _step_through(m, m.start[None])
     except np.linalg.LinAlgError:
         raise fail("network of a design", "measurements with noise", "a singular innovation covariance") from None
     if not np.all(np.isfinite(parts)) or np.linalg.eigvalsh(parts).min() < -NEAR * np.abs(parts).max():
@@ -73,7 +73,7 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     return ModeSolution(parts, gains, _close_loop(m, gains).adjoint(weights, m.start is None))
 
 
-def _periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
+def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
     """Return X and best gains for steps that repeat for ever."""
     # The recursion, until its gains stabilise.
     last = m.law[-1, :, None, None] * m.process[-1]

@@ -95,7 +95,7 @@ def check_numbers(free: object) -> Numbers:
         if len(parts) != 3:
             raise fail(f"free number {name!r}", "(start, low, high)", f"{len(parts)} numbers")
         start = array(f"start of {name!r}", parts[0], (None,) * np.ndim(parts[0]))
-        low, high = (_end(name, end, start.shape) for end in parts[1:])
+        low, high = (_check_end(name, end, start.shape) for end in parts[1:])
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
         numbers[name] = Number(start, low, high)
@@ -106,7 +106,7 @@ def check_numbers(free: object) -> Numbers:
     return Numbers(numbers)
 
 
-def _end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
+def _check_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
     """Return a least or largest value, which may be infinite, of the start's shape."""
     try:
         value = np.broadcast_to(np.asarray(end, dtype=float), shape)

@@ -172,13 +172,13 @@ def describe_reception(
         )
         chain: Array = jnp.tile(law[:, None, :], (1, law.shape[1], 1))
     else:
-        law, chain = _laws(onward, modes[0].initial, forever)
+        law, chain = _propagate_laws(onward, modes[0].initial, forever)
     # H, N and powers over each span with one sensor and one channel.
     parts = []
     for span, channel, m in zip(spans, channels, modes, strict=True):
         now = np.array(span)
         b = None if young is None else young[now]
-        parts.append(_span(at(source.sensor, span[0]), channel, m, states[now], b, law[now]))
+        parts.append(_describe_steps(at(source.sensor, span[0]), channel, m, states[now], b, law[now]))
     return Received(chain, law, *(jnp.concatenate(series) for series in zip(*parts, strict=True)))
 
 
@@ -194,12 +194,12 @@ def _observe_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
         law = jnp.stack([jnp.asarray(case.probability) for case in cases])
         maps, arrived = [case.map for case in cases], [case.arrived for case in cases]
         return _Modes(jnp.tile(law, (len(cases), 1)), law, maps, arrived, forgets=True)
-    joint = _flag_modes(name, channel)
+    joint = _make_flagged_modes(name, channel)
     everything = np.ones(joint.maps[0].outputs, dtype=bool)
     return _Modes(joint.transition, joint.initial, list(joint.maps), [everything] * len(joint.maps), forgets=False)
 
 
-def _flag_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
+def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     """Return the modes of a channel all of whose modes are observed, with the map in each."""
     parts = channel.in_parallel
     rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
@@ -209,7 +209,7 @@ def _flag_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     return joint_modes(rest[0] if len(rest) == 1 else Stack(rest), order=2)
 
 
-def _laws(
+def _propagate_laws(
     onward: Float[Array, "time M M"], initial: Float[Array, "M"], forever: bool
 ) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
     """Return the law at each step, and the chain into it: around for ever, or from the initial law on."""
@@ -221,13 +221,13 @@ def _laws(
     return jnp.stack(law), jnp.concatenate([into_first[None], onward[:-1]])
 
 
-def _span(
+def _describe_steps(
     sensor: LinearSensor, channel: AbstractRandomAffine, modes: _Modes, states: Array, young: Array | None, law: Array
 ) -> tuple[Array, Array, Array]:
     """Return H, N and powers over steps with one sensor and one channel."""
     y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
-    described = [_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
+    described = [_describe_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
     output = jnp.stack([jnp.tile(h, (len(y), 1, 1)) for h, _ in described], axis=1)
 
     def powers(now: Array, law: Array) -> Array:
@@ -238,7 +238,7 @@ def _span(
     return output, jnp.stack([noise for _, noise in described], axis=1), sent
 
 
-def _mode(
+def _describe_mode(
     channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, sensor: LinearSensor, young: Array | None
 ) -> tuple[Float[Array, "m n"], Float[Array, "time m m"]]:
     """Return H, and N: what random gains make of E (y, 1)(y, 1)', and the sensor's noise; of what is lost, noise."""

@@ -221,10 +221,12 @@ def _broadcast_to_hops(value: ArrayLike, sensors: int, hops: int) -> Float[np.nd
 
 def fading(paths: Paths) -> PathValues:
     """Return K, the product of kappa along each path."""
-    return np.asarray(_along(paths, paths.kappa)[0].prod(axis=-1))
+    return np.asarray(_arrange_by_place(paths, paths.kappa)[0].prod(axis=-1))
 
 
-def _along(paths: Paths, values: Powers) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
+def _arrange_by_place(
+    paths: Paths, values: Powers
+) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
     """Return the values of hops by path and place on it, 1 where a path has no more; and the place of each hop."""
     order = np.argsort(paths.path, kind="stable")
     counts = np.bincount(paths.path, minlength=paths.second.shape[1])
@@ -244,7 +246,7 @@ def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
 
 def path_information(paths: Paths, powers: Powers) -> PathInformation:
     """Return the information j of each path at each step, and dj/dp of each hop, at these powers (time, hop)."""
-    along, position = _along(paths, share_of_signal(powers, paths.alpha))
+    along, position = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))
     # F, and the product of the other hops' factors for its derivative.
     others = np.stack([np.delete(along, h, axis=-1).prod(axis=-1) for h in range(along.shape[-1])], axis=-1)
     product, full = along.prod(axis=-1), paths.second * fading(paths)

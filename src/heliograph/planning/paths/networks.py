@@ -105,7 +105,7 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
         affine = parts.pop(0)
         # An unobserved loss is fading.
         if isinstance(affine, Mixture):
-            inner, lost = _loss(affine)
+            inner, lost = _split_loss(affine)
             parts, fading = [*inner.in_series, *parts], fading * lost
             continue
         if not isinstance(affine, GainAndNoise):
@@ -116,7 +116,7 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
         if affine.transmits:
             if moved:
                 raise _unfit("a relay that takes a reference off")
-            hops[f"{prefix}hop{len(hops) + 1}"] = _hop(affine)
+            hops[f"{prefix}hop{len(hops) + 1}"] = _describe_hop(affine)
         elif affine.inputs != 1 or affine.outputs != 1:
             raise _unfit("a wire of several numbers behind a hop")
         elif hops:
@@ -130,7 +130,7 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
     return Chain(row, hops)
 
 
-def _hop(hop: GainAndNoise) -> tuple[float, float]:
+def _describe_hop(hop: GainAndNoise) -> tuple[float, float]:
     """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2."""
     if len(hop.law.extremes()) > 1:
         raise _unfit("a gain with uncertain probabilities")
@@ -142,7 +142,7 @@ def _hop(hop: GainAndNoise) -> tuple[float, float]:
     return square / mean**2, float(np.asarray(hop.noise.covariance)[0, 0]) / square
 
 
-def _loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
+def _split_loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
     """Return the channel behind an unobserved loss, and 1 / (arrival probability)."""
     p = np.asarray(mixture.choice.probabilities)
     silent = [isinstance(m, GainAndNoise) and not np.any(np.append(m.matrix, m.noise.covariance)) for m in mixture.maps]

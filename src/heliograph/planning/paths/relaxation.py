@@ -99,14 +99,14 @@ def split(whole: SplitPaths, total: PathValues) -> Split:
     hops = (alpha > 0).sum(axis=-1)
     log = 2 * np.log(np.where(hops[..., None] > 0, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
     for _ in range(NEWTON_STEPS):
-        p, falls = _shares(alpha, log)
+        p, falls = _split_at_multiplier(alpha, log)
         reached = p.sum(axis=-1, keepdims=True)
         step = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
         step = np.divide(step * reached, falls, out=np.zeros_like(falls), where=falls > 0)
         log = log + step
         if np.all(np.abs(step) <= 1e-15 * (1 + np.abs(log))):
             break
-    p = _shares(alpha, log)[0]
+    p = _split_at_multiplier(alpha, log)[0]
     reached = p.sum(axis=-1, keepdims=True)
     p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
     # j = (A / D) / (A - t A / D) and dj/dP = l D / (D - t)^2, in the ratio A / D, which vanishes with a power.
@@ -123,7 +123,7 @@ def split(whole: SplitPaths, total: PathValues) -> Split:
     )
 
 
-def _shares(alpha: np.ndarray, log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _split_at_multiplier(alpha: np.ndarray, log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return p_h(l) without cancellation, and -d sum P / d log l."""
     over = np.exp(-log)
     root = np.sqrt(alpha**2 + 4 * alpha * over)
@@ -154,12 +154,12 @@ def envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     low, high = np.log(1e-30 / largest), np.log(1e30 / largest)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        p = _shares(alpha, middle[..., None])[0]
+        p = _split_at_multiplier(alpha, middle[..., None])[0]
         noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
         left = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
         rises = left >= whole.signal
         low, high = np.where(rises, middle, low), np.where(rises, high, middle)
-    touch = np.where(hops > 1, _shares(alpha, low[..., None])[0].sum(axis=-1), 0.0)
+    touch = np.where(hops > 1, _split_at_multiplier(alpha, low[..., None])[0].sum(axis=-1), 0.0)
     touch = np.minimum(touch, cap)
     there = split(whole, touch)
     ray = np.divide(there.information, touch, out=np.zeros_like(touch), where=touch > 0)

@@ -45,11 +45,11 @@ def water_filling(
             smallest, best = gap, p
         if gap <= CLOSED * abs(here[0]) or idle > PATIENCE:
             break
-        p, here = _along(sensitivity, p, here, _fill_to_limits(limits, here[1], a, b) - p)
+        p, here = _search_line(sensitivity, p, here, _fill_to_limits(limits, here[1], a, b) - p)
     return best
 
 
-def _along(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead: Powers) -> tuple[Powers, Point]:
+def _search_line(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead: Powers) -> tuple[Powers, Point]:
     """Return a point lower on the way: its end, or where the slopes at both ends say that the lowest lies.
 
     Where rounding hides the way down, half of it, by which the gap still shrinks.
@@ -72,9 +72,10 @@ def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) 
     # The level at which each transmitter's mean is reached, then that of the total under these.
     no_limit = np.full(steps, np.inf)
     highest = np.broadcast_to([
-        _level(rise[:, i], dry[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps) for i in range(dry.shape[1])
+        _find_level(rise[:, i], dry[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps)
+        for i in range(dry.shape[1])
     ], dry.shape)  # fmt: skip
-    level = _level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
+    level = _find_level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
     return limits.clip(_fill_to_level(np.minimum(level, highest), rise, dry, limits.peak))
 
 
@@ -90,7 +91,7 @@ def _fill_to_level(
     return np.clip(wet, 0.0, peak)
 
 
-def _level(
+def _find_level(
     rise: Float[np.ndarray, "k"],
     dry: Float[np.ndarray, "k"],
     peak: Float[np.ndarray, "k"],

@@ -81,7 +81,7 @@ def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
     second = lifted @ products_of_monomials(moments, inputs, order // 2) @ lifted.T
-    propagated = second.reshape(-1)[_one_place(outputs, order // 2)]
+    propagated = second.reshape(-1)[_choose_places(outputs, order // 2)]
     return propagated
 
 
@@ -136,7 +136,7 @@ def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -
 
 
 @cache_arrays
-def _one_place(variables: int, degree: int) -> np.ndarray:
+def _choose_places(variables: int, degree: int) -> np.ndarray:
     """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
     table = product_table(variables, degree, degree).reshape(-1)
     places = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)

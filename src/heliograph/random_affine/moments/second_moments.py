@@ -146,7 +146,7 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
     # A sum of maps: of known laws its spread is the sum of theirs; else bounded part by part.
     if isinstance(channel, Superposed) and corners == 1:
-        mean, tensor = _mean_and_spread(channel)
+        mean, tensor = _compute_mean_and_spread(channel)
         own = map_of_known_law(tensor)
         of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
         return MomentBounds(mean, own, scale_map(own, 0.0), add_maps(signal_of_map(own), of_mean), own)
@@ -220,14 +220,14 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     ]
 
 
-def _mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
+def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
     """Mean and spread of a map of known law: the spreads of independent maps add up, and of their means no more."""
     if not isinstance(channel, Superposed):
         moments = channel.moments(2)
         mean = moments.mean[:-1]
         raw = moments.second
         return mean, raw - symmetric_product(mean, mean)
-    means, spreads = zip(*(_mean_and_spread(affine) for affine in channel.maps), strict=True)
+    means, spreads = zip(*(_compute_mean_and_spread(affine) for affine in channel.maps), strict=True)
     whole, size = channel.in_places(dict(enumerate(means)), 1), channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * _constant_power(size)
     spread: Tensor = channel.in_places(dict(enumerate(spreads)), 2) + noise

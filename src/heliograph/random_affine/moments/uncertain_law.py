@@ -33,11 +33,11 @@ def dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
     """
     xp = library(tensors)
     low, high = tensors.min(axis=0), tensors.max(axis=0)
-    exact, holds = _common_gain(tensors, mean)
+    exact, holds = _find_common_gain(tensors, mean)
     return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
 
 
-def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
+def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
     """Return the tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])

@@ -141,22 +141,22 @@ def map_figure(sites: SiteMap) -> Figure:
 def page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     design = results.design
-    sections = [_result_section(results), _front_section(drawings), _powers_section(results, drawings)]
+    sections = [_make_result_section(results), _front_section(drawings), _make_powers_section(results, drawings)]
     if results.map is not None:
         sections.append(_map_section(drawings))
     return Page(
         kicker="Heliograph design",
-        title=_headline(results),
+        title=_write_headline(results),
         lead=(
             f"The network {visible(results.reference)} has the error {design.present:.4g} and sends "
             f"{sum(results.before.values()):.4g} as it is. Designed, it has the error {design.error:.4g} and sends "
             f"{design.total:.4g}."
         ),
-        sections=[*sections, _changes_section(results), _rerun_section()],
+        sections=[*sections, _make_changes_section(results), _explain_rerun()],
     )
 
 
-def _headline(results: DesignResults) -> str:
+def _write_headline(results: DesignResults) -> str:
     """Return the title: what the design saves, of error and of power."""
     design, before = results.design, sum(results.before.values())
     changed = [f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}"
@@ -165,7 +165,7 @@ def _headline(results: DesignResults) -> str:
     return f"By design: {' with '.join(changed)}" if changed else "No design is better than the network as it is"
 
 
-def _result_section(results: DesignResults) -> Section:
+def _make_result_section(results: DesignResults) -> Section:
     """Return the error, power and certificate of the design, beside those of the network as it is."""
     design = results.design
     keys = [
@@ -183,7 +183,7 @@ def _front_section(drawings: Mapping[str, bytes]) -> Section:
     return Section("Error against power", [Picture(drawings["front"], "Error falling with total power.", caption)])
 
 
-def _powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
+def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
     """Return the powers by transmitter, before and after, and what one more watt would save at each."""
     after, slope = mean_powers(results.design), results.design.sensitivity
     rows = [
@@ -206,7 +206,7 @@ def _map_section(drawings: Mapping[str, bytes]) -> Section:
     return Section("Where", [Picture(drawings["map"], "The error over places, with the best one.", caption)])
 
 
-def _changes_section(results: DesignResults) -> Section:
+def _make_changes_section(results: DesignResults) -> Section:
     """Return what one more transmitter, relay or place would save."""
     unit = results.design.certificate.unit
     rows = [[visible(change.name), f"{change.value:.4g}", f"{change.saved:+.3g}"] for change in results.changes]
@@ -217,7 +217,7 @@ def _changes_section(results: DesignResults) -> Section:
     return Section("What one more would buy", [Table(("change", unit, "saved"), rows, caption)])
 
 
-def _rerun_section() -> Section:
+def _explain_rerun() -> Section:
     """Return how to run the designed network."""
     commands = f"heliograph run {DESIGNED} --measurements data.csv --out estimates.csv"
     text = (

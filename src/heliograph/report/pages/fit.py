@@ -141,11 +141,11 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
         lead=_summarise_gain(learned),
         sections=[
             Section("At a glance", _list_key_figures(learned)),
-            Section("What was learned", _estimates_table(learned, drawings)),
+            Section("What was learned", _make_estimates_table(learned, drawings)),
             Section("What to keep in mind", _list_sentences(learned)),
-            *_comparison_sections(learned, drawings),
-            *_losses_section(learned),
-            *_delays_section(learned),
+            *_make_comparison_sections(learned, drawings),
+            *_make_losses_section(learned),
+            *_make_delays_section(learned),
             Section("Use it", [Code("heliograph run DIR/fitted_network.py --measurements data.csv --report report"),
                                Text(["DIR is this folder: `fitted_network.py` loads the numbers of `fitted.json`."])]),
         ],
@@ -189,7 +189,7 @@ def _list_key_figures(learned: Learned) -> list[KeyFigures]:
     return [KeyFigures(keys)]
 
 
-def _estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
+def _make_estimates_table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
     """Start, estimate and interval of each number, with the figure of these."""
     starts = learned.starts
     # Start, estimate and interval of each number.
@@ -223,7 +223,7 @@ def _list_sentences(learned: Learned) -> list[Points | Text]:
     return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]
 
 
-def _comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
+def _make_comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
     """Return the sections on the held-out rows: each filter before and after, and whether the laws fit."""
     if not learned.changes:
         return []
@@ -265,7 +265,7 @@ def _comparison_sections(learned: Learned, drawings: Mapping[str, bytes]) -> lis
     return sections
 
 
-def _losses_section(learned: Learned) -> list[Section]:
+def _make_losses_section(learned: Learned) -> list[Section]:
     """Describe the statistics of lost measurements, where some were lost."""
     # One row for each law of each node: parameters, and gain on held-out packets.
     rows = []
@@ -287,7 +287,7 @@ def _losses_section(learned: Learned) -> list[Section]:
     return [Section("How measurements are lost", [table])] if rows else []
 
 
-def _delays_section(learned: Learned) -> list[Section]:
+def _make_delays_section(learned: Learned) -> list[Section]:
     """Describe how late the measurements of events were."""
     rows = [
         [visible(node), f"{steps * delays.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]

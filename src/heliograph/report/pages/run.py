@@ -163,7 +163,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     # The result is the title; doubts follow it.
     return Page(
         kicker=f"Heliograph run: {visible(network)}",
-        title=_headline(health),
+        title=_find_headline(health),
         lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_describe_span(record.time)}. "
         + _describe_agreement(health, doubts),
         sections=[
@@ -174,7 +174,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
             Section("Estimates", [*errors_table(record), *_list_pictures(health, drawings)]),
             *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
             innovations_section(health, drawings),
-            Section("Links", _links_section(health, drawings)),
+            Section("Links", _make_links_section(health, drawings)),
         ],
     )
 
@@ -189,7 +189,7 @@ def limit_size(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
     return kept
 
 
-def _headline(health: Health) -> str:
+def _find_headline(health: Health) -> str:
     """Return the last estimate of the filter that the network relies on: its first two states, or its position."""
     record = health.record
     node = _nodes_to_draw(record)[0] if _nodes_to_draw(record) else None
@@ -296,7 +296,7 @@ def _list_premises(health: Health) -> list[Text | Points]:
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []
 
 
-def _links_section(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
+def _make_links_section(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
     """Return each link: when it is due, what arrived, its longest gap, and mean and deviation of its values."""
     rows = []
     for link in health.links:

@@ -62,23 +62,23 @@ class _Check:
         """Check each promise in turn, with one service after another."""
         # First service: new messages arrive in order, and all are acknowledged.
         async with self._service() as transport:
-            await self._listening(transport)
+            await self._start_listening(transport)
             sent = await self._sent()
-            assert await self._until(transport, sent) == sent, "receive: expected new messages in order"
+            assert await self._receive_until(transport, sent) == sent, "receive: expected new messages in order"
             await self._silent(transport)
         async with self._service() as transport:
             # Second service: none of them arrives again; half of the next messages are left unacknowledged.
-            again = await self._for_a_while(transport)
+            again = await self._receive_for_a_while(transport)
             assert not again, f"acknowledge: expected nothing to come again, got {len(again)} messages"
             sent = await self._sent()
-            await self._until(transport, sent[: len(sent) // 2], acknowledge=False)
-            await self._for_a_while(transport)
+            await self._receive_until(transport, sent[: len(sent) // 2], acknowledge=False)
+            await self._receive_for_a_while(transport)
         # Third service: these arrive again, with those that were sent while nobody was reading.
         sent += await self._sent()
         async with self._service() as transport:
-            received = await self._until(transport, sent)
+            received = await self._receive_until(transport, sent)
             assert set(received) == set(sent), "acknowledge: expected no more than what was not acknowledged"
-        await self._published()
+        await self._check_published()
         return received == sent
 
     @asynccontextmanager
@@ -88,28 +88,28 @@ class _Check:
         try:
             yield transport
         finally:
-            await self._soon("close", transport.close())
+            await self._await_soon("close", transport.close())
 
-    async def _listening(self, transport: Transport) -> None:
+    async def _start_listening(self, transport: Transport) -> None:
         """Send greetings until the service receives one: before its first start a broker may store nothing."""
         greeting = self._bodies(1)
-        observation = asyncio.ensure_future(self._until(transport, greeting))
+        observation = asyncio.ensure_future(self._receive_until(transport, greeting))
         while not observation.done():
-            await self._soon("send", self.broker.send(greeting))
+            await self._await_soon("send", self.broker.send(greeting))
             await asyncio.wait({observation}, timeout=self.silence / 2)
         assert await observation == greeting, "receive: expected the bytes that were sent"
         await self._silent(transport)
 
-    async def _published(self) -> None:
+    async def _check_published(self) -> None:
         """Check that closing right after `publish` loses no output that has a number."""
         outputs = [Output(i, "a.b", "final", body) for i, body in enumerate(self._bodies(self.messages), 1)]
         now = Output(None, "a.b", "provisional", b"now")
         async with self._service() as transport:
-            await self._soon("publish", transport.publish([]))
-            await self._soon("publish", transport.publish([now, *outputs]))
+            await self._await_soon("publish", transport.publish([]))
+            await self._await_soon("publish", transport.publish([now, *outputs]))
         expected, arrived = [output.body for output in outputs], list[bytes]()
         for _ in range(1 + int(self.patience / PAUSE)):
-            published = await self._soon("published", self.broker.published())
+            published = await self._await_soon("published", self.broker.published())
             arrived = _drop_repeated(body for body in published if body != now.body)
             if len(arrived) >= len(expected):
                 break
@@ -120,10 +120,12 @@ class _Check:
 
     async def _sent(self) -> list[bytes]:
         bodies = self._bodies(self.messages)
-        await self._soon("send", self.broker.send(bodies))
+        await self._await_soon("send", self.broker.send(bodies))
         return bodies
 
-    async def _until(self, transport: Transport, bodies: Sequence[bytes], acknowledge: bool = True) -> list[bytes]:
+    async def _receive_until(
+        self, transport: Transport, bodies: Sequence[bytes], acknowledge: bool = True
+    ) -> list[bytes]:
         """Receive until all of these bodies have arrived; return each once, in the order of first arrival."""
         received = list[bytes]()
 
@@ -142,7 +144,7 @@ class _Check:
             raise AssertionError(what) from None
         return _drop_repeated(received)
 
-    async def _for_a_while(self, transport: Transport, acknowledge: bool = False) -> list[bytes]:
+    async def _receive_for_a_while(self, transport: Transport, acknowledge: bool = False) -> list[bytes]:
         """Receive for `silence` seconds, then cancel; return the bodies that arrived."""
         try:
             async with asyncio.timeout(self.silence):
@@ -153,7 +155,7 @@ class _Check:
 
     async def _silent(self, transport: Transport) -> None:
         """Receive and acknowledge late copies until none arrive."""
-        while await self._for_a_while(transport, acknowledge=True):
+        while await self._receive_for_a_while(transport, acknowledge=True):
             pass
 
     async def _unpack(self, batch: Batch | None, acknowledge: bool) -> list[bytes]:
@@ -161,12 +163,13 @@ class _Check:
         assert batch is not None, "receive: expected to wait for messages, got None, which says that all ends"
         assert batch.payloads, "receive: expected to wait for messages, got a batch of none"
         if acknowledge:
-            await self._soon("acknowledge", batch.acknowledge())
+            await self._await_soon("acknowledge", batch.acknowledge())
         bodies = [body for body in batch.payloads if isinstance(body, bytes)]
         assert len(bodies) == len(batch.payloads), "receive: expected the bytes that were sent"
         return bodies
 
-    async def _soon(self, what: str, waiting: Awaitable[T]) -> T:
+    async def _await_soon(self, what: str, waiting: Awaitable[T]) -> T:
+        """Await an action that a transport must end within the patience of the check."""
         try:
             async with asyncio.timeout(self.patience):
                 return await waiting

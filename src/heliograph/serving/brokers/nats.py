@@ -73,7 +73,7 @@ class Nats:
         while True:
             raise_if_cancelled()
             # A request that times out is repeated; a broken connection gets a new consumer.
-            reader = await self._persist(self._reading)
+            reader = await self._persist(self._open_reader)
             try:
                 messages = await reader.fetch(MOST, WAIT)
             except TimeoutError:
@@ -82,7 +82,7 @@ class Nats:
                 self._reader = None
                 await self._retry.wait(error)
                 continue
-            if not messages:  # none came meanwhile, or the connection broke, which `_reading` sees
+            if not messages:  # none came meanwhile, or the connection broke, which `_open_reader` sees
                 continue
             # The consumer counts what it sends: a gap means that messages were lost, and we read again from the last
             # one that was acknowledged.
@@ -182,16 +182,16 @@ class Nats:
             # The stream of outputs that are published exactly once.
             server = self._client.jetstream(timeout=ANSWER)
             subjects = [f"{self.topic}.out.{kind}.*" for kind in ("final", "refused")]
-            await _stream(server, StreamConfig(f"{self.stream}-out", subjects=subjects, max_age=RETENTION))
+            await _find_or_make_stream(server, StreamConfig(f"{self.stream}-out", subjects=subjects, max_age=RETENTION))
             self._server = server
             return server
 
-    async def _reading(self) -> JetStreamContext.PullSubscription:
+    async def _open_reader(self) -> JetStreamContext.PullSubscription:
         """Return a consumer of this part that begins after the last acknowledged message; remove all others."""
         if self._reader is not None and self._require_connection():
             return self._reader
         server = await self._open()
-        newest = await self._made(server)
+        newest = await self._make_stream(server)
         # Another process has taken over this part if our consumer is gone and there is another.
         mine = f"part-{self.part.number}-of-{self.part.of}-"
         others = [c for c in await server.consumers_info(self.stream) if c.name.startswith(mine)]
@@ -222,7 +222,7 @@ class Nats:
             filter_subjects=None if self.part.of > 1 else [f"{self.topic}.in.*", *self._list_subjects],
         )
 
-    async def _made(self, server: JetStreamContext) -> int:
+    async def _make_stream(self, server: JetStreamContext) -> int:
         """Make the stream of messages if there is none; return the number of its last message.
 
         The server itself writes a plant's part into the subject.
@@ -235,14 +235,14 @@ class Nats:
         transform = SubjectTransform(source, target) if parts > 1 else None
         subjects = [source, *self._list_subjects]
         expected = StreamConfig(self.stream, subjects=subjects, storage=StorageType.FILE, subject_transform=transform)
-        info = await _stream(server, expected)
+        info = await _find_or_make_stream(server, expected)
         known = info.config.subject_transform
         if (known.dest if known else None) != (target if transform else None):
             raise fail(f"stream {self.stream} of {self.address}", f"one of {parts} parts", "one of another number")
         return info.state.last_seq
 
 
-async def _stream(server: JetStreamContext, expected: StreamConfig) -> StreamInfo:
+async def _find_or_make_stream(server: JetStreamContext, expected: StreamConfig) -> StreamInfo:
     """Return the stream of this name, made if there is none, with all subjects that are expected."""
     try:
         info = await server.stream_info(str(expected.name))

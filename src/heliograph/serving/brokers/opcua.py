@@ -86,7 +86,7 @@ def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
 
 async def reporting_of(node: Node) -> Reporting:
     """Return the rule by which a variable is reported, 0 for what the server does not state."""
-    interval = await _attribute(node, ua.AttributeIds.MinimumSamplingInterval)
+    interval = await _read_attribute(node, ua.AttributeIds.MinimumSamplingInterval)
     # The deviation is a property of the variable, or of its historical configuration.
     places = [node]
     with contextlib.suppress(UaError):
@@ -125,7 +125,7 @@ class OpcUa:
     async def receive(self) -> Batch | None:
         """Wait for changes of the nodes that are subscribed to, and return what came together."""
         while True:
-            await self._connected()
+            await self._connect()
             try:
                 payloads = list(await asyncio.wait_for(self._came.get(), WAIT))
             except TimeoutError:
@@ -150,7 +150,7 @@ class OpcUa:
         self._first.discard(name)
         self._came.put_nowait(self._translator.read(name, body, datetime.now(UTC), stored))
 
-    async def _connected(self) -> None:
+    async def _connect(self) -> None:
         """Connect and subscribe, again and again while the server is away."""
         while True:
             try:
@@ -195,7 +195,7 @@ class Listener:
         """
         try:
             async with _make_client(where) as client:
-                for node in await _variables(client):
+                for node in await _find_variables(client):
                     self.kinds[node.nodeid.to_string()] = (await node.read_data_type_as_variant_type()).name
                     rule = await _monitor(client, node, self)
                     if rule.deadband > 0:
@@ -237,7 +237,7 @@ async def _monitor(client: Client, node: Node, handler: OpcUa | Listener) -> Rep
     return rule
 
 
-async def _variables(client: Client) -> list[Node]:
+async def _find_variables(client: Client) -> list[Node]:
     """Return the variables below Objects that are of no namespace of OPC UA itself, MOST at most."""
     variables, seen, waiting = list[Node](), set[ua.NodeId](), [client.nodes.objects]
     while waiting and len(variables) < MOST:
@@ -272,7 +272,7 @@ def _find_node(client: Client, name: str) -> Node:
         raise fail("variable of an OPC UA server", "an identifier as ns=2;s=Boiler.Temperature", repr(name)) from None
 
 
-async def _attribute(node: Node, attribute: ua.AttributeIds) -> float:
+async def _read_attribute(node: Node, attribute: ua.AttributeIds) -> float:
     try:
         value = (await node.read_attribute(attribute)).Value
     except UaError:

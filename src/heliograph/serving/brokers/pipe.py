@@ -40,10 +40,10 @@ class Pipe:
         """Wait for lines of standard input, and return their messages; None at its end."""
         loop = asyncio.get_running_loop()
         while True:
-            await _ready(self.source, loop.add_reader, loop.remove_reader)
+            await _wait_until_ready(self.source, loop.add_reader, loop.remove_reader)
             with naming("standard input"):
                 data = self._read()
-            lines = self._lines(data)
+            lines = self._split_lines(data)
             if self._translator is None:
                 payloads: list[Payload] = list(lines)
             else:
@@ -63,7 +63,7 @@ class Pipe:
             data += more
         return data
 
-    def _lines(self, data: bytes) -> list[bytes]:
+    def _split_lines(self, data: bytes) -> list[bytes]:
         """Return the lines that are complete with these bytes; at the end of the file, the incomplete last one."""
         *lines, rest = (self._rest + data).split(b"\n") if data else [self._rest, b""]
         if self._skipping and lines:
@@ -82,7 +82,7 @@ class Pipe:
         loop = asyncio.get_running_loop()
         with _set_nonblocking(self.target) as (target, at_once):
             while rest:
-                await _ready(target, loop.add_writer, loop.remove_writer)
+                await _wait_until_ready(target, loop.add_writer, loop.remove_writer)
                 with naming("standard output"), suppress(BlockingIOError):
                     rest = rest[os.write(target, rest[:at_once]) :]
 
@@ -107,7 +107,9 @@ def _set_nonblocking(file: int) -> Iterator[tuple[int, int | None]]:
             os.close(again)
 
 
-async def _ready(file: int, add: Callable[[int, Callable[[], None]], None], remove: Callable[[int], object]) -> None:
+async def _wait_until_ready(
+    file: int, add: Callable[[int, Callable[[], None]], None], remove: Callable[[int], object]
+) -> None:
     """Wait until a file can be used without blocking, so that the wait itself can be cancelled."""
     ready = asyncio.Event()
     try:

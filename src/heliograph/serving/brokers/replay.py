@@ -149,7 +149,7 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
         arrival = event.time if event.arrival is None else event.arrival
         values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]
         parts = {"plant": plant} if plant else {}
-        moments = {"time": _date_or_number(event.time, origin), "arrival": _date_or_number(arrival, origin)}
+        moments = {"time": _format_time(event.time, origin), "arrival": _format_time(arrival, origin)}
         yield (
             arrival,
             json.dumps(parts | {"node": event.node, "sequence": int(event.sequence)} | moments | {"values": values}),
@@ -166,7 +166,7 @@ def _sort_events(events: list[Event]) -> list[Event]:
     return sorted(events, key=lambda event: event.time if event.arrival is None else event.arrival)
 
 
-def _date_or_number(time: float, origin: np.datetime64 | None) -> float | str:
+def _format_time(time: float, origin: np.datetime64 | None) -> float | str:
     """Return a time as messages have it: a date where time 0 has one, else the number."""
     if origin is None:
         return float(time)

@@ -114,7 +114,7 @@ class Translator:
             content = _decode(payload, topic)
             for reading in self.sources.read(topic, content, topic):
                 if isinstance(reading, Unread):
-                    results.append(self._unread(topic, reading, arrival, again))
+                    results.append(self._explain_unread(topic, reading, arrival, again))
                     continue
                 if stored and reading.time is None:
                     self._stored += 1
@@ -127,7 +127,7 @@ class Translator:
             results.append(str(error))
         return results
 
-    def _unread(self, topic: str, unread: Unread, known: datetime | None, again: bool) -> UnreadMessage | str:
+    def _explain_unread(self, topic: str, unread: Unread, known: datetime | None, again: bool) -> UnreadMessage | str:
         """Return why a message could not be read, with its node, count and time where these were."""
         why = str(unread.error)
         if unread.counted is None:
@@ -158,7 +158,7 @@ class Translator:
             came = arrival if time > arrival or (known is not None and not again) else None
         sequence, name = reading.sequence, (reading.plant, reading.node)
         if sequence is None:
-            sequence = self._counts[name] if reading.time is None else self._number_among_equals(reading, again)
+            sequence = self._counts[name] if reading.time is None else self._count_equals(reading, again)
             self._counts[name] += 1
         # Checked already, and dates are no texts here.
         return Message.model_construct(
@@ -171,7 +171,7 @@ class Translator:
             arrival=came,
         )
 
-    def _number_among_equals(self, reading: Reading, again: bool) -> int:
+    def _count_equals(self, reading: Reading, again: bool) -> int:
         """Return the number of a message without a count among those of its node and time."""
         assert reading.time is not None
         values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])

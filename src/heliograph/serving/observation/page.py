@@ -240,7 +240,7 @@ def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: 
         return Response(tallies.text(), media_type=CONTENT_TYPE_LATEST)
 
     def events(request: Request) -> Response:
-        return StreamingResponse(_events(watch, request, stopped), media_type="text/event-stream")
+        return StreamingResponse(_yield_events(watch, request, stopped), media_type="text/event-stream")
 
     def plants(_: Request) -> Response:
         with watch.lock:
@@ -275,7 +275,7 @@ def file(request: Request) -> Response:
     return Response(_read_page_file(name), media_type=KINDS[name], headers=POLICY)
 
 
-async def _events(watch: Watch, request: Request, stopped: asyncio.Event) -> AsyncIterator[str]:
+async def _yield_events(watch: Watch, request: Request, stopped: asyncio.Event) -> AsyncIterator[str]:
     """Yield the view whenever it has changed, else a comment, so that we notice a reader that has gone."""
     plant, since, before = request.query_params.get("plant"), 0, None
     while not (stopped.is_set() or await request.is_disconnected()):

@@ -22,7 +22,7 @@ def engine_at(location: str) -> Engine:
     """
     engine = create_engine(url_of(location))
     if engine.dialect.name == "sqlite":
-        event.listen(engine, "connect", _durably)
+        event.listen(engine, "connect", _configure_sqlite)
         event.listen(engine, "begin", _begin_immediate)
     return engine
 
@@ -58,7 +58,7 @@ def is_away(error: SQLAlchemyError) -> bool:
     return lost and not refused
 
 
-def _durably(connection: Any, _: object) -> None:
+def _configure_sqlite(connection: Any, _: object) -> None:
     """Configure SQLite: each commit is on the disk before it returns, and readers do not wait for writers."""
     connection.isolation_level = None  # transactions begin where the engine says so
     connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # a damaged name can still be printed

@@ -41,7 +41,7 @@ def refuse_centrally(
     for i, (_, name) in enumerate(removals):
         without[list(z).index(name)][i] = np.nan
     # Whether the filters find the row plausible then.
-    votes = _judgements(filters, before, np.concatenate(without, axis=1), u, rows)
+    votes = _judge_rows(filters, before, np.concatenate(without, axis=1), u, rows)
     plausible = {removal: Judgement.why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
     refused = dict[str, dict[int, str]]()
     for k, reason in why.items():
@@ -53,7 +53,7 @@ def refuse_centrally(
     return refused
 
 
-def _judgements(
+def _judge_rows(
     filters: Mapping[str, AbstractFilter], before: Mapping[str, PyTree], z: np.ndarray, u: np.ndarray, rows: np.ndarray
 ) -> Float[np.ndarray, "row filter 4"]:
     """Let each filter judge measurements of these rows, from its states before them."""

@@ -57,7 +57,7 @@ class ObservationModel(Module):
         """Moments of the nodes' measurements at step k for a plant with these moments, zero rows up to `size`."""
 
         def single(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
-            return _linear_observation(at(sensor, k), at(channel, k), mean, covariance)
+            return _linearise_observation(at(sensor, k), at(channel, k), mean, covariance)
 
         gain, offset, noise = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), eqx.if_array(0)))(
             self.sensor, self.channel
@@ -70,7 +70,7 @@ class ObservationModel(Module):
         )
 
 
-def _linear_observation(
+def _linearise_observation(
     sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
 ) -> Observation:
     """M = E[G] C, o = E[G] E v + E n, and Cov(z - M x): the noise through the mean gain, and the spread of the gain."""
@@ -110,7 +110,7 @@ class Together(Module):
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
         """Return the moments of the rows of each node, and the cross-covariance of their noises."""
-        gain, offset, noise = _linear_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
+        gain, offset, noise = _linearise_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
         noise = jnp.pad(noise, (0, 1))
         return Observation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
@@ -251,7 +251,7 @@ def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) ->
         _check_along_estimates(rule, nodes, shared)
         return "nominal"
     _check_linear(rule, plant, nodes)
-    known: Claim = "nominal" if any(_uncertain(channel) for _, channel, _ in nodes.values()) else "exact"
+    known: Claim = "nominal" if any(_has_uncertain_law(channel) for _, channel, _ in nodes.values()) else "exact"
     return lower_to_upper(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
@@ -295,10 +295,10 @@ def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[
     channels = [link.channel for link in fusion.links(names) if link.channel is not None]
     for quantizer in fusion.quantizers(names):
         claim = quantizer.claim(claim)
-    return weakest([claim, "nominal"]) if any(map(_uncertain, channels)) else claim
+    return weakest([claim, "nominal"]) if any(map(_has_uncertain_law, channels)) else claim
 
 
-def _uncertain(channel: Channel) -> bool:
+def _has_uncertain_law(channel: Channel) -> bool:
     """Test whether probabilities of the channel's laws are known up to a radius only."""
     try:
         return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))

@@ -149,10 +149,10 @@ def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and isinstance(fusion.rule, AbstractInformedFusion) and not fusion.by_report:
             rules.setdefault(fusion.filter, {})[name] = fusion.rule
-    return tuple(_centre(network, name, mine) for name, mine in rules.items())
+    return tuple(_build_centre(network, name, mine) for name, mine in rules.items())
 
 
-def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
+def _build_centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
     """Build the centre for the nodes that have the filter `name`."""
     places, claims = network.places, network.claims()[FUSED]
     mine = network.nodes_with(name)

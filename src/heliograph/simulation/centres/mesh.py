@@ -144,7 +144,7 @@ class Mesh(Module):
         there = jnp.concatenate([self._rows(rows) for rows in z])[self.observation_model.order]
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
         present = ~jnp.isnan(there)
-        messages = self._messages(state, jnp.asarray(arrived))
+        messages = self._keep_messages(state, jnp.asarray(arrived))
         arrived = arrived if messages is None else messages.fresh
         parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead, messages)
         gains, motion = parts.gains, parts.motion
@@ -175,7 +175,7 @@ class Mesh(Module):
             after = after._replace(way=on)
         return after, self._split_by_group(mean, claimed)
 
-    def _messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:
+    def _keep_messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:
         """Return the messages that are no estimates of now as they are; None where all are."""
         if state.way is None:
             return None
@@ -212,7 +212,7 @@ class Mesh(Module):
             exchanges.append(self._map_nodes(_weights, covariance, None, arrived[:, number]))
             covariance = jnp.asarray(exchanges[-1].covariance)
         # What each node learns of the measurements, and its gains.
-        data = self._data(self.observation_model.observe(*after, jnp.asarray(k)), there)
+        data = self._exchange_measurements(self.observation_model.observe(*after, jnp.asarray(k)), there)
         information = self._collect_sums(data.information, arrived)
         complete = self.sum_of(data.complete, jnp.asarray(self.edges.present))
         arrives, senders = arrived[:, -1], None
@@ -234,7 +234,7 @@ class Mesh(Module):
         off = jnp.einsum("idab,idb->ia", parts, away) if parts.ndim == 4 else jnp.sum(parts * away, axis=1)
         return jnp.einsum("iab,ib->ia", front, off)
 
-    def _data(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
+    def _exchange_measurements(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
         """Return the messages about what was measured, and about what would be if no component were missing."""
         real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
         gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)

@@ -145,7 +145,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: HasNodes) -> None
     squares = np.zeros((len(nodes), n, n))
     for i, sensor in enumerate(sensors):
         if isinstance(sensor, Node):
-            h, noise = _model(sensor)
+            h, noise = _model_node(sensor)
             squares[i] = _scale_rows(h).T @ _scale_rows(h)
             _check_regular(f"{what}: node {nodes[i]!r}", noise)
     # Modes of the plant, unstable and decaying, that nobody upstream of a node observes.
@@ -154,7 +154,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: HasNodes) -> None
     checked: dict[int, set[bool]] = {}
     for i, places in enumerate(upstream(graph_of(fusion.neighbours or {}, nodes))):
         if id(places) not in checked:
-            checked[id(places)] = _unseen(a, values, squares[places].sum(axis=0))
+            checked[id(places)] = _find_unseen(a, values, squares[places].sum(axis=0))
         for unstable in checked[id(places)]:
             unseen[unstable].append(nodes[i])
     # Unstable ones are refused, decaying ones warned of.
@@ -205,10 +205,10 @@ def _sees(node: object, vector: np.ndarray) -> bool:
     """Test whether a node's own measurement shows a mode."""
     if not isinstance(node, Node):
         return False
-    return bool(np.any(np.abs(_scale_rows(_model(node)[0]) @ vector) > RANK))
+    return bool(np.any(np.abs(_scale_rows(_model_node(node)[0]) @ vector) > RANK))
 
 
-def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
+def _find_unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
     """Test which modes these squares of outputs do not show: True where some does not decay, False where some does."""
     size = np.linalg.norm(a, 2) or 1.0
     hidden = set()
@@ -225,7 +225,7 @@ def _scale_rows(h: np.ndarray) -> np.ndarray:
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
 
 
-def _model(node: Node) -> tuple[np.ndarray, np.ndarray]:
+def _model_node(node: Node) -> tuple[np.ndarray, np.ndarray]:
     """Return matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
@@ -253,7 +253,7 @@ def _check_fixed(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> 
     steady = all(_is_steady(n) for n in items if isinstance(n, Node))
     if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
         return
-    models = [_model(n) if isinstance(n, Node) else (np.zeros((1, len(a))), np.eye(1)) for n in items]
+    models = [_model_node(n) if isinstance(n, Node) else (np.zeros((1, len(a))), np.eye(1)) for n in items]
     squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
     check_decay(what, graph, np.asarray(fusion.rule.placed(graph).shares).T, arrival, (a, q), squares)
 
@@ -284,13 +284,13 @@ def check_decay(
     """
     arrives = np.zeros(graph.present.shape)
     arrives[:, 1:][graph.present[:, 1:]] = arrival
-    growth, sizes = _growth(graph, arrives, *_steps(graph, shares, plant, squares))
+    growth, sizes = _compute_growth(graph, arrives, *_make_error_steps(graph, shares, plant, squares))
     if growth > 1 + SLOW:
         raise fail(what, "shares with which errors decay, whatever is lost (or a rule that intersects)",
                    f"squares that grow by {growth:.3g} a step at node {graph.nodes[sizes.argmax()]!r}")  # fmt: skip
 
 
-def _steps(
+def _make_error_steps(
     graph: Graph, shares: np.ndarray, plant: tuple[np.ndarray, np.ndarray], squares: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Step of a node's error: alone (node, n, n), and what a message adds of the sender's and of its (node, degree)."""
@@ -306,7 +306,7 @@ def _steps(
     return a - p @ squares @ a, pulled, -pulled - p[:, None] @ squares[graph.senders] @ a
 
 
-def _growth(
+def _compute_growth(
     graph: Graph, arrives: np.ndarray, alone: np.ndarray, pulled: np.ndarray, pushed: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Return the growth of the errors' second moments in a step, and in the end their sizes by node."""

@@ -115,7 +115,7 @@ def mesh_errors(
         )
         raise fail(f"errors of fusion {fusion!r} before any data", "estimates that are sent at every step, as they are",
                    by_data)  # fmt: skip
-    flags = _flags(mesh, arrived)
+    flags = _check_arrivals(mesh, arrived)
     network.check_horizon(len(flags))
     u = inputs_of(network, inputs, len(flags))
     actual, claimed, last = [], [], np.zeros(())
@@ -197,7 +197,7 @@ def best_possible(
         ValueError: no such fusion, flags of another shape.
     """
     mesh = mesh_named(network, fusion)
-    flags = _flags(mesh, arrived)
+    flags = _check_arrivals(mesh, arrived)
     u = inputs_of(network, inputs, len(flags))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
@@ -271,7 +271,7 @@ def freeze(
     old = network.meshes[fusion]
     if not old.rule.needs_joint:
         raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(old.rule).__name__)
-    flags = _flags(mesh, arrived)
+    flags = _check_arrivals(mesh, arrived)
     if check_count("last", last) > len(flags):
         raise fail("last", f"at most the {len(flags)} steps", last)
     u = inputs_of(network, inputs, len(flags))
@@ -298,7 +298,7 @@ def mesh_named(network: Network, fusion: str) -> Mesh:
     return mesh_of(network, fusion)
 
 
-def _flags(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
+def _check_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
     """Return the flags of each step, all of them where a number of steps is given."""
     if mesh.edges.past:
         raise fail("errors between neighbours before any data", "messages that arrive at once or are lost", "late ones")

@@ -77,7 +77,7 @@ def mean_mesh_errors(
     graph = graph_of(between.neighbours or {}, names)
     links = {} if between.link is None else edge_links(between.link, graph)
     chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
-    patterns = _patterns(mesh, np.array(chances))
+    patterns = _list_patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
     rule = between.rule.placed(graph)
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
@@ -93,8 +93,8 @@ def mean_mesh_errors(
             step = to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k)))
             shape = (len(names), len(network.states)) * 2
             blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
-            gains = to_numpy(_gains(rows, covariance, blocks, patterns, step))
-        joint, moments = _mean(mesh, joint, blocks, patterns, gains, step), step.plant
+            gains = to_numpy(_compute_gains(rows, covariance, blocks, patterns, step))
+        joint, moments = _average_joint(mesh, joint, blocks, patterns, gains, step), step.plant
         n = len(step.motion.shift)
         errors.append(np.einsum("iaib->iab", joint.reshape(len(names), n, len(names), n)).copy())
         covariance = np.asarray(gains.covariance)[patterns.start]
@@ -103,7 +103,9 @@ def mean_mesh_errors(
 
 
 @quickly_compiled
-def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: MeshStep) -> NodeGains:
+def _compute_gains(
+    rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: MeshStep
+) -> NodeGains:
     information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]
     held = jnp.asarray(blocks)[patterns.node]
@@ -111,7 +113,7 @@ def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Pat
                       information, complete)  # fmt: skip
 
 
-def _mean(
+def _average_joint(
     mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: NodeGains, step: MeshStep
 ) -> np.ndarray:
     """Return the joint covariance (N, N) after a step."""
@@ -140,7 +142,7 @@ def _mean(
     return np.asarray(after)
 
 
-def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
+def _list_patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
     """List the patterns of every node; `chances` of arrival of all edges, receiver after receiver."""
     counts = mesh.edges.present[:, 1:].sum(axis=1)
     if len(counts) > NODES or counts.max() > DEGREE:

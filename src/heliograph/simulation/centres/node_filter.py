@@ -77,7 +77,7 @@ class NodeFilter(AbstractSizedFilter):
         """Fuse, predict and correct with what came; innovations of the measurements about the node's prediction."""
         mean, covariance = state.now.mean[0], state.now.covariance[0]
         observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
-        sensed, _ = self._parts(jnp.asarray(z), state.before)
+        sensed, _ = self._gather_measurements(jnp.asarray(z), state.before)
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
             return self._make_state(state.before, jnp.asarray(z), state.inputs, k), no_innovation()
@@ -99,7 +99,7 @@ class NodeFilter(AbstractSizedFilter):
         message = before.mean[0], before.covariance[0]
         return message if self.quantizer is None else _quantized(self.quantizer, *message)
 
-    def _parts(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
+    def _gather_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
         """Return the measurements of node and neighbours, and their estimates, of mean NaN where none came."""
         n, at_place = len(self.states), self.measured[0]
         sensed, means, covariances = [z[:at_place]], [before.mean[0]], [before.covariance[0]]
@@ -114,7 +114,7 @@ class NodeFilter(AbstractSizedFilter):
         return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
     def _make_state(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
-        sensed, all_nodes = self._parts(z, before)
+        sensed, all_nodes = self._gather_measurements(z, before)
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
         now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
         return NodeState(before, u, now)

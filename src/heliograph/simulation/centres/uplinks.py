@@ -205,11 +205,11 @@ def _model_links(
     known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
     """Return the model of the uplinks for a centre, at each step if any varies."""
-    model: ReportModel | OverTime = at_each_step(lambda *links: _links(links, received, error), *known)
+    model: ReportModel | OverTime = at_each_step(lambda *links: _read_links(links, received, error), *known)
     return model
 
 
-def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
+def _read_links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
     more = [(0, max(received) - size) for size in received]
     gain = np.stack([np.pad(link.mean_gain, (a, (0, 0))) for link, a in zip(known, more, strict=True)])
     offset = np.stack([np.pad(link.offset, a) for link, a in zip(known, more, strict=True)])

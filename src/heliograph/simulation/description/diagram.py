@@ -35,7 +35,7 @@ def diagram(network: HasNodes) -> list[DiagramLine]:
     # Nodes that are alike share a line.
     alike: dict[str, list[str]] = {}
     for name in network.names:
-        alike.setdefault(_node(network, name, claims[name]), []).append(name)
+        alike.setdefault(_describe_node(network, name, claims[name]), []).append(name)
     parts += [DiagramLine(join_names(names), words) for words, names in alike.items()]
     # Fused estimates, then what several nodes share.
     for name, fusion in network.fused.items():
@@ -59,7 +59,7 @@ def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
     return words
 
 
-def _node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
+def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
     """Return what a node receives, through which hops, and its filters with their claims."""
     node = network.nodes[name]
     filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"

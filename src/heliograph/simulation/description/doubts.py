@@ -62,13 +62,13 @@ def doubts_before_data(network: Network) -> list[Doubt]:
         ValueError: what is no network.
     """
     instance("network", network, Network, "a Network")
-    lines = [*_unobservable(network), *_doubt_boundedness(network), *_unheard(network)]
-    lines += [*_forgotten(network), *_other_worlds(network)]
+    lines = [*_find_unobservable(network), *_doubt_boundedness(network), *_find_unheard(network)]
+    lines += [*_find_forgetful_filters(network), *_find_other_beliefs(network)]
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
-    lines += _told(network)
+    lines += _find_declared_noise(network)
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
@@ -78,7 +78,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     return sorted(lines, key=lambda doubt: not doubt.serious)
 
 
-def _sensors(network: Network) -> list[AbstractSensor]:
+def _list_sensors(network: Network) -> list[AbstractSensor]:
     """Return every sensor of the network, at its first step."""
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     sensors += [] if network.common is None else [network.common.sensor]
@@ -86,9 +86,9 @@ def _sensors(network: Network) -> list[AbstractSensor]:
     return [first(sensor) for sensor in sensors]
 
 
-def _unobservable(network: Network) -> Iterator[Doubt]:
+def _find_unobservable(network: Network) -> Iterator[Doubt]:
     """Yield the directions that no sensor shows within n steps, by the names of their states."""
-    matrix = observability(first(network.plant), _sensors(network))
+    matrix = observability(first(network.plant), _list_sensors(network))
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
         return
@@ -159,7 +159,7 @@ def _warn_if_unbounded(network: Network, what: str, serious: bool) -> Iterator[D
         yield Doubt(False, f"boundedness of {what}: undecided: {boundedness.reason}")
 
 
-def _unheard(network: Network) -> Iterator[Doubt]:
+def _find_unheard(network: Network) -> Iterator[Doubt]:
     """Yield sums of links whose mean gains cancel, and links of mean gain zero; linear filters hear nothing of them."""
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not isinstance(channel := first(node.channel), Superposed):
@@ -177,7 +177,7 @@ def _unheard(network: Network) -> Iterator[Doubt]:
             yield Doubt(False, f"unheard: {join_names(silent)} at {name!r}: of mean gain 0, which only adds noise")
 
 
-def _told(network: Network) -> Iterator[Doubt]:
+def _find_declared_noise(network: Network) -> Iterator[Doubt]:
     """Yield the nodes whose messages declare their noise, which is true as far as a recording says."""
     names = [name for name, node in network.nodes.items() if isinstance(node, Node) for filter in node.filters.values()
              if isinstance(filter, ToldFilter) and declares_noise(filter)]  # fmt: skip
@@ -188,10 +188,10 @@ def _told(network: Network) -> Iterator[Doubt]:
         )
 
 
-def _other_worlds(network: Network) -> Iterator[Doubt]:
+def _find_other_beliefs(network: Network) -> Iterator[Doubt]:
     """Yield the filters that believe another world than that in which they stand, so that they claim nothing of it."""
     alike: dict[tuple[bool, str, tuple[str, ...]], list[Belief]] = {}
-    forgetful = _forgetful(network)
+    forgetful = _list_forgetful_nodes(network)
     for belief in beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
             continue  # said already, with what to do
@@ -201,16 +201,16 @@ def _other_worlds(network: Network) -> Iterator[Doubt]:
         yield Doubt(lowered, f"another world: {of[0].words}{more}{', so that its claim is nominal' * lowered}")
 
 
-def _forgotten(network: Network) -> Iterator[Doubt]:
+def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
     """Yield filters that take draws as independent over time behind a link whose gains are not."""
-    for label, names in _forgetful(network).items():
+    for label, names in _list_forgetful_nodes(network).items():
         words = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
         yield Doubt(
             True, f"{words}, another channel than its own; linear_filter or mixture_filter of the link knows it"
         )
 
 
-def _forgetful(network: Network) -> dict[str, list[str]]:
+def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
     """Return the nodes of each filter that ignores the memory of their links."""
     nodes: dict[str, list[str]] = {}
     for name, node in network.nodes.items():

@@ -18,12 +18,12 @@ SHOWN = 3  # of many that are refused for one reason
 def list_fallbacks(network: Network) -> list[str]:
     """Return a line for each reason for which XLA computes filters or fusions: who, and why."""
     by_reason: dict[str, list[str]] = {}
-    for who, why in (*_filters(network), *_meshes(network)):
+    for who, why in (*_find_refused_filters(network), *_find_refused_meshes(network)):
         by_reason.setdefault(why, []).append(who)
     return [f"{_join(those)}: {why}" for why, those in by_reason.items()]
 
 
-def _filters(network: Network) -> Iterator[tuple[str, str]]:
+def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
     """Yield each filter whose step is refused, with the reason."""
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     places = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
@@ -40,7 +40,7 @@ def _step(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
     return filter.step(state, z, u, k)
 
 
-def _meshes(network: Network) -> Iterator[tuple[str, str]]:
+def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
     """Yield each fusion between neighbours whose step is too long to be written out."""
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))

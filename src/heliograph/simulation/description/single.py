@@ -19,7 +19,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
     """Return rounded numbers, as they were meant and as they are, with the parts of the network that hold them."""
     parts: dict[tuple[float, float], list[str]] = {}
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
-    for name, model, functions in _models(network):
+    for name, model, functions in _yield_models(network):
         if id(model) not in seen:
             seen[id(model)] = next(filter(None, map(find_rounded_to_single, _arrays(model, functions))), None)
         rounded = seen[id(model)]
@@ -28,7 +28,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
     return parts
 
 
-def _models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
+def _yield_models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
     """Yield the models of a network, and their functions with arguments for these."""
     plant, x, u = first(network.plant), np.zeros(len(network.states)), np.zeros(len(network.inputs))
     yield "plant", network.plant, [(plant.transition, (x, u)), (plant.noise_covariance, (u,))]

@@ -41,9 +41,9 @@ def largest_deviation(filter: AbstractFilter) -> float:
 def wide_at_the_start(network: Network) -> Iterator[str]:
     """Yield a line for each angle of which a filter starts with less knowledge than it can use."""
     lines: dict[tuple[str, str, float], list[str]] = {}
-    for node, label, filter in _filters(network):
+    for node, label, filter in _find_filters(network):
         covariance = np.asarray(filter.estimate(filter.init()).covariance)
-        for name, deviation in _deviations(network, filter, covariance):
+        for name, deviation in _yield_deviations(network, filter, covariance):
             if deviation > largest_deviation(filter):
                 lines.setdefault((name, label, float(deviation)), []).append(node)
     for (name, label, known), nodes in lines.items():
@@ -53,9 +53,9 @@ def wide_at_the_start(network: Network) -> Iterator[str]:
 
 def wide_in_rows(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each filter that knew an angle less well in some row than it can use."""
-    for node, label, filter in _filters(network):
+    for node, label, filter in _find_filters(network):
         covariance = np.asarray(record.estimates[node][label].covariance)
-        for name, deviation in _deviations(network, filter, covariance):
+        for name, deviation in _yield_deviations(network, filter, covariance):
             wide = np.flatnonzero(deviation > largest_deviation(filter))
             if wide.size:
                 known = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
@@ -93,7 +93,7 @@ class WideAngles:
         return said
 
 
-def _filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
+def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
     """Yield the filters that have angles, with their places."""
     if not first(network.plant).circular:
         return
@@ -104,7 +104,7 @@ def _filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
             yield FUSED, label, fusion
 
 
-def _deviations(
+def _yield_deviations(
     network: Network, filter: AbstractFilter, covariance: Float[np.ndarray, "*steps n n"]
 ) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
     """Yield each angle's name and deviation."""

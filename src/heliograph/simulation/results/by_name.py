@@ -19,7 +19,7 @@ def reports_by_name(
     reports: dict[str, dict[str, SentReports]] = {}
     for name, (values, delay) in outcome.items():
         if name in network.meshes:
-            reports[name] = _arrivals(network, name, np.asarray(values))
+            reports[name] = _name_arrivals(network, name, np.asarray(values))
             continue
         fusion = network.fused[name]
         assert isinstance(fusion, Fusion)  # no other rule uses reports
@@ -32,7 +32,7 @@ def reports_by_name(
     return reports
 
 
-def _arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
+def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
     """Messages that arrived from each node's neighbours, 1 (or their ages) or NaN (..., rounds times neighbours)."""
     neighbours = network.meshes[name].neighbours or {}
     reports = {}

@@ -77,7 +77,7 @@ def nees(
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
-    return _square_normalised(
+    return _normalise_square(
         wrap_angles(x - m, angles_among(angles, x.shape[-1])), _broadcast_to_steps(covariance, x), x
     )
 
@@ -103,7 +103,7 @@ def nis(
     """
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
-    return _square_normalised(
+    return _normalise_square(
         wrap_angles(e, angles_at(angles, e.shape[-1])), _broadcast_to_steps(covariance, e), np.zeros_like(e)
     )
 
@@ -115,7 +115,7 @@ def _broadcast_to_steps(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"])
     return np.broadcast_to(array("covariance", covariance, shape, missing=True), (*x.shape, n))
 
 
-def _square_normalised(
+def _normalise_square(
     x: Float[np.ndarray, "*steps n"], covariance: Float[np.ndarray, "*steps n n"], size: Float[np.ndarray, "*steps n"]
 ) -> Float[np.ndarray, "*steps"]:
     """Return x' P^-1 x of each step, over the components that are not NaN; NaN where all are.

@@ -46,7 +46,7 @@ def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
     if runs is not None:
         index = pd.MultiIndex.from_product([range(runs), index], names=["run", "time"])
     frame = pd.DataFrame({i: values.reshape(-1) for i, values in enumerate(columns.values())}, index=index)
-    frame.columns = _labels(list(columns))
+    frame.columns = _keep_labels(list(columns))
     return frame
 
 
@@ -93,7 +93,7 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
     }
 
 
-def _labels(columns: Sequence[Column]) -> Any:
+def _keep_labels(columns: Sequence[Column]) -> Any:
     """Return the column labels as they are: none is converted to a number or to a missing value."""
     import pandas as pd
 

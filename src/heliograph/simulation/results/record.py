@@ -332,7 +332,7 @@ class Record(Saved):
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
                 what = "mean" if estimate.claim == "none" else "covariance"
-                lines += [f"{node}/{name}: no valid {what} {when}" for when in _when(~is_sound(estimate))]
+                lines += [f"{node}/{name}: no valid {what} {when}" for when in _describe_when(~is_sound(estimate))]
         # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):
@@ -357,7 +357,7 @@ def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel:
     for name in complete:
         simulated[f"measurements of node {name!r}, where nothing is lost"] = record.measurements[name]
     for what, values in simulated.items():
-        for when in _when(~np.isfinite(values).all(axis=-1)):
+        for when in _describe_when(~np.isfinite(values).all(axis=-1)):
             warnings.warn(f"{what}: no finite number {when}", stacklevel=stacklevel + 1)
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
@@ -365,11 +365,11 @@ def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel:
             if estimate.claim != "none" and node != FUSED:  # there a quantizer may say that it knows no bound
                 bad |= ~np.isfinite(np.asarray(estimate.covariance)).all(axis=(-1, -2))
             what = "mean" if estimate.claim == "none" else "covariance"
-            for when in _when(bad):
+            for when in _describe_when(bad):
                 warnings.warn(f"{node}/{name}: no valid {what} {when}", stacklevel=stacklevel + 1)
 
 
-def _when(bad: np.ndarray) -> list[str]:
+def _describe_when(bad: np.ndarray) -> list[str]:
     """Say from which step on, and in how many runs, something (..., time) is bad; nothing where it never is."""
     if not np.any(bad):
         return []

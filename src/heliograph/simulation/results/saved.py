@@ -92,7 +92,7 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
         ModuleNotFoundError: an extra is not installed.
     """
     path = file_path("file of results", path)
-    kind = _kind(path)
+    kind = _find_package(path)
     import_module(kind)
     # Names as text that any file can hold; floats without a fill value.
     plain = dataset.assign_coords(
@@ -121,7 +121,7 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
         ModuleNotFoundError: an extra is not installed.
     """
     path = file_path("file of results", path)
-    kind = _kind(path)
+    kind = _find_package(path)
     import_module(kind)
     import xarray as xr
 
@@ -135,7 +135,7 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
     return dataset.assign_coords({name: (c.dims, _map_names(unquote_file, c), c.attrs) for name, c in _texts(dataset)})
 
 
-def _kind(path: Path) -> str:
+def _find_package(path: Path) -> str:
     """Return the name of the package that writes the format."""
     kinds = {NETCDF: "h5netcdf", ZARR: "zarr"}
     if path.suffix.lower() not in kinds:

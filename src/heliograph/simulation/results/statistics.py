@@ -123,7 +123,7 @@ class ErrorStatistics:
         """
         self._tell()
         n = self.outer.shape[-1]
-        mean, error = _batch_mean(self.nees.mean(axis=1) / n, self.count)
+        mean, error = _average_batches(self.nees.mean(axis=1) / n, self.count)
         width = (
             float(scipy.special.stdtrit(max(int(np.count_nonzero(self.count)) - 1, 1), (1 + confidence) / 2)) * error
         )
@@ -167,7 +167,7 @@ class ErrorStatistics:
         ratio = float(error.sum() / bound.sum())
         # Linearised error of a ratio of means: residuals error - ratio bound have mean zero over the batches.
         weights = self.count[judged]
-        _, residual_error = _batch_mean(error - ratio * bound, weights)
+        _, residual_error = _average_batches(error - ratio * bound, weights)
         scale = bound.sum() / weights.sum()
         standard_error = float(residual_error / scale)
         return WorstDirection(ratio, standard_error, step, d / np.linalg.norm(d))
@@ -233,7 +233,7 @@ class WorstDirection:
         return (self.ratio - 1) / self.standard_error if self.standard_error else 0.0
 
 
-def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
+def _average_batches(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
     """Return the mean of per-run values from batch sums, and its standard error from the scatter of batch means."""
     used = count > 0
     sums, count = sums[used], count[used]
@@ -247,7 +247,7 @@ def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 
 def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
     """Return the root of the mean of per-run values, and its standard error."""
-    mean, error = _batch_mean(sums, count)
+    mean, error = _average_batches(sums, count)
     root = float(np.sqrt(mean))
     return root, error / (2 * root) if root else 0.0
 

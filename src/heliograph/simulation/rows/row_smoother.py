@@ -222,7 +222,7 @@ class RowSmoother:
     def _fuses(self, fusion: StackedFusions, kinds: tuple[int, ...]) -> bool:
         return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
-    def _program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
+    def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
         """Return the program for histories of this length, which an engine is chosen for once."""
         key = len(history.rows), setting()
         if key not in self._programs:
@@ -238,7 +238,7 @@ class RowSmoother:
     def estimates(self, history: RowHistory, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
         """Return the estimates after row `begin` given the rows after it, up to `stop`, by node and filter."""
         with jax.enable_x64(True):
-            by_kind, fused = self._program(history)(history, np.array([begin, stop], dtype=np.int32))
+            by_kind, fused = self._find_program(history)(history, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
         for k, outputs in by_kind.items():
             for f, name in enumerate(self.network.kinds[k].filters):

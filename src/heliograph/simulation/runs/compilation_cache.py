@@ -26,7 +26,7 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
     """
     if os.environ.get(FOLDER):
         return Path(os.environ[FOLDER])
-    path = _default() if folder is None else Path(folder)
+    path = _find_default_folder() if folder is None else Path(folder)
     _make_private(path)
     # Settings for JAX, read from the environment or changed where it is loaded already.
     os.environ[FOLDER] = str(path)
@@ -39,7 +39,7 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
     return path
 
 
-def _default() -> Path:
+def _find_default_folder() -> Path:
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "heliograph" / "compilations"
     try:

@@ -136,14 +136,14 @@ def _find_program(
     counting: bool,
     precision: Precision,
 ) -> tuple[Any, Any] | Unsupported:
-    """Cached `_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
+    """Cached `_compile_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
     try:
-        return _program(tree, held, fixed, known, precision)
+        return _compile_program(tree, held, fixed, known, precision)
     except Unsupported as error:
         return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
-def _program(
+def _compile_program(
     tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], precision: Precision
 ) -> tuple[Any, Any]:
     """Compile the code of networks of one structure; also return the structure of what is collected of a run.
