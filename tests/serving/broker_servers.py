@@ -81,5 +81,5 @@ def numbered(start: int, stop: int) -> list[bytes]:
 async def made(where: Address, part: Part = Part()) -> Nats:  # noqa: B008
     """A reader that has made its stream."""
     reader = Nats(where, part)
-    await asyncio.wait_for(reader._reading(), 20)
+    await asyncio.wait_for(reader._open_reader(), 20)
     return reader

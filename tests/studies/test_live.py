@@ -59,7 +59,7 @@ def test_nothing_is_sent_before_there_is_a_stream_to_send_to(tmp_path: Path):
                 group.create_task(_send(client, [b"{}"]))
                 await asyncio.sleep(30)
         assert error.group_contains(NoStreamResponseError)
-        await transport._reading()
+        await transport._open_reader()
         assert await _reads(client)
         await _send(client, [b"{}"])
         await asyncio.gather(transport.close(), client.close())

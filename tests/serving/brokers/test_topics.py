@@ -158,7 +158,7 @@ def test_subjects_of_nats_are_the_same_sources(server, translator):
         where = at(server, "nats", "field")
         transport = make_transport(where, translator=translator)
         try:
-            await asyncio.wait_for(transport._reading(), 20)
+            await asyncio.wait_for(transport._open_reader(), 20)
             client = await nats.connect(f"nats://{where.host}:{where.port}")
             await client.publish("zigbee2mqtt.garden", b'{"temperature": 18.0}')
             await client.publish("v3.farm@ttn.devices.field-7.up", json.dumps(UPLINK).encode())
