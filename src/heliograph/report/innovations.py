@@ -88,8 +88,8 @@ def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Sectio
             "fuses are tested here, and itself on the live page of `heliograph serve`."
         )
     missing = say_not_drawn(left, "Their numbers are in the table.")
-    return Section("Innovations", [Text([text]), table, *choose_picture(pictures), *missing, *_make_outputs_table(health),
-                                   *_make_declared_table(health)])  # fmt: skip
+    tables = [*_make_outputs_table(health), *_make_declared_table(health)]
+    return Section("Innovations", [Text([text]), table, *choose_picture(pictures), *missing, *tables])
 
 
 def _make_tests_table(health: Health) -> Table:
