@@ -112,9 +112,60 @@ def test_several_states_are_searched_beside_their_bound():
     assert made.total <= 1.0 + 1e-9
 
 
+@pytest.mark.parametrize("options", [{}, {"correlation": 0.3}, {"same": True}])
+def test_the_least_power_of_an_error_has_that_error(options):
+    """The least error falls with the power, so that the least power of it is the power again; to the halvings' 1e-9."""
+    designed = hg.design(network(**options), budget=1.5)
+    least = hg.design(network(**options), target_error=designed.error)
+    assert least.total == pytest.approx(1.5, rel=1e-9)
+    assert least.error == pytest.approx(designed.error, rel=1e-9)
+    assert least.certificate.unit == "power"
+    assert least.certificate.gap == 0
+
+
+def test_the_least_power_of_several_states_stands_beside_its_bound():
+    """Searched: the power of a design of power 1 is found again to 1e-6, what a descent leaves."""
+    plant = hg.LinearPlant(0.8 * np.eye(2), np.diag([0.3, 0.2]), np.zeros(2), np.eye(2))
+    sensor = hg.LinearSensor(np.eye(2), 0.05 * np.eye(2))
+    channel = hg.superposed([hg.hop(hg.Rayleigh(1.0), 0.0), hg.hop(hg.Rayleigh(0.7), 0.0)], 0.1)
+    summed = hg.Network(plant, {"a": hg.Node(sensor, channel, {})})
+    target = hg.design(summed, budget=1.0, starts=2).error
+    least = hg.design(summed, target_error=target, starts=2)
+    assert least.error <= target * (1 + 1e-9)
+    assert least.total == pytest.approx(1.0, rel=1e-6)
+    assert 0 < least.bound < least.total
+
+
+def test_links_that_are_not_free_keep_their_power():
+    """The best two of three amplitudes, by a fine grid of how they share what is left, to its squared spacing."""
+    whole = network()
+    sent = hg.power(whole).mean
+    made = hg.design(whole, budget=Budget(1.5 + sent["a.link2.hop1"]), free=["a.link1", "a.link3"], starts=4)
+    assert made.powers["a.link2.hop1"][0] == pytest.approx(sent["a.link2.hop1"], rel=1e-12)
+    assert made.powers["a.link1.hop1"][0] + made.powers["a.link3.hop1"][0] == pytest.approx(1.5, rel=1e-9)
+    scale, unit = np.array([1.0, 0.4, 1.6]), np.array(list(sent.values()))
+    c, r = whole.nodes["a"].sensor.matrix[:, 0], np.diagonal(whole.nodes["a"].sensor.noise.covariance)
+    best = np.inf
+    for angle in np.linspace(0, 2 * np.pi, 401):
+        a = np.array([np.cos(angle) * np.sqrt(1.5 / unit[0]), 1.0, np.sin(angle) * np.sqrt(1.5 / unit[2])])
+        mean = scale * np.sqrt(np.pi / 2) * a
+        noise = mean**2 @ r + (2 - np.pi / 2) * (scale * a) ** 2 @ unit + 0.13
+        best = min(best, error_of((mean @ c) ** 2 / noise))
+    assert made.error == pytest.approx(best, rel=1e-4)
+    assert made.error <= best
+    assert made.bound < made.error
+
+
+def test_a_target_that_no_power_reaches_is_refused():
+    with pytest.raises(ValueError, match=r"target error: expected at least 0\.0973393"):
+        hg.design(network(), target_error=1e-9)
+    with pytest.raises(ValueError, match="the least found within the budget"):
+        hg.design(network(), target_error=0.1, budget=Budget(0.1))
+
+
 def test_what_the_formulas_do_not_cover_is_refused():
-    with pytest.raises(ValueError, match="design of a sum of links: expected all powers free"):
-        hg.design(network(), budget=1.0, target_error=0.1)
+    with pytest.raises(ValueError, match="design of a sum of links: expected the steady error"):
+        hg.design(network(), budget=1.0, error=hg.planning.Error(horizon=3))
     late = hg.superposed([hg.model.delayed(hg.hop(1.0, 0.1), 1)], 0.1)
     plant, sensor = hg.LinearPlant([[0.9]], [[0.2]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 0.1)
     with pytest.raises(ValueError, match="else give a function of free numbers"):

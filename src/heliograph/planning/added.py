@@ -18,13 +18,13 @@ import numpy as np
 import scipy
 
 from heliograph.model.sensor import LinearSensor
-from heliograph.numerics.check import check_count, check_seed, fail
-from heliograph.numerics.types import Float
-from heliograph.planning.budget import PowerLimits, check_budget, power_limits
+from heliograph.numerics.check import check_count, check_seed, fail, scalar
+from heliograph.numerics.types import Bool, Float
+from heliograph.planning.budget import PowerLimits, check_budget, make_unlimited, power_limits
 from heliograph.planning.moments import check_constant_noise, check_design_plant, measurement_moment, steady_moment
 from heliograph.planning.network_of_design import add_best_filter
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.transmitters import amplify_transmitter, compute_sent_powers, transmitter_names
+from heliograph.planning.transmitters import amplify_transmitter, compute_sent_powers, find_free, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.random_affine.superposed import Superposed
@@ -33,7 +33,9 @@ from heliograph.simulation.node import Node
 
 Vector = Float[np.ndarray, "links"]
 ALIKE = 1e-12  # relative: rows of one signal, noises that are independent
-HALVINGS = 200  # of an interval that holds a multiplier
+HALVINGS = 200  # of an interval that holds a multiplier or a power
+SEARCHES = 30  # of a power that reaches a target: to 1e-9 of it
+DOUBLINGS = 100  # of a power without limit, until it reaches a target
 
 
 class SummedLinks(NamedTuple):
@@ -66,8 +68,88 @@ def adds_up(network: object) -> bool:
     return len(nodes) == 1 and isinstance(nodes[0], Node) and isinstance(nodes[0].channel, Superposed)
 
 
+class SumTask(NamedTuple):
+    """What a design of a sum of links searches: amplitudes of the free links, within limits, for a small error.
+
+    links: rows, noises and amplitudes at present. limits: of the free links' powers. free: which links are. covariance:
+    of the steady error, from the information of a step; error: the criterion of it. starts, seed: of searches.
+    """
+
+    links: SummedLinks
+    limits: PowerLimits
+    free: Bool[np.ndarray, "links"]
+    covariance: Callable[[np.ndarray], np.ndarray]
+    error: Callable[[np.ndarray], float]
+    starts: int
+    seed: int
+
+    @property
+    def fixed(self) -> float:
+        """Power of the links that are not free."""
+        links = self.links
+        return float((links.present**2 * links.unit)[~self.free].sum())
+
+    @property
+    def caps(self) -> Vector:
+        """Largest amplitude of each link; of one that is not free the present one."""
+        links = self.links
+        caps: Vector = np.abs(links.present)
+        caps[self.free] = np.sqrt(np.minimum(self.limits.peak[0], self.limits.mean) / links.unit[self.free])
+        return caps
+
+    @property
+    def most(self) -> float:
+        """Largest power of all free links together."""
+        links = self.links
+        return min(self.limits.total, float((self.caps**2 * links.unit)[self.free].sum()))
+
+    def value(self, amplitudes: Vector) -> float:
+        """Return the error with these amplitudes."""
+        return self.error(self.covariance(self.links.information(amplitudes)))
+
+    def bound(self, total: float) -> float:
+        """Return the error that no amplitudes with this total power of the free links are below."""
+        most = total + self.fixed
+        least = self.links.best_information(most) if most > 0 else np.zeros((self.links.rows.shape[1],) * 2)
+        return self.error(self.covariance(least))
+
+    def closed(self, total: float) -> Vector | None:
+        """Return the best amplitudes where a formula has them: of one signal, all links free."""
+        return solve_closed_form(self.links, total, self.caps) if np.all(self.free) else None
+
+    def search(self, total: float, starts: int, first: Vector | None = None) -> Vector:
+        """Return the amplitudes of the least error that descents find, from random starts and one given; signs matter."""
+        links, free = self.links, self.free
+        unit = links.unit[free]
+        generator, best, found = np.random.default_rng(self.seed), links.present, np.inf
+        scale = np.minimum(self.caps[free], np.sqrt(total / unit))
+        if not np.all(np.isfinite(scale)):
+            raise fail("budget", "one that limits every transmitter", "no limit")
+
+        def allowed(x: Vector) -> Vector:
+            a = np.clip(x, -1, 1) * scale
+            power = float(a**2 @ unit)
+            whole = links.present.copy()
+            whole[free] = a * np.sqrt(total / power) if power > total else a
+            return whole
+
+        def loss(x: Vector) -> float:
+            return self.value(allowed(x))
+
+        drawn = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
+        if first is not None:
+            drawn = [np.divide(first[free], scale, out=np.zeros_like(scale), where=scale > 0), *drawn]
+        for start in drawn:
+            result = scipy.optimize.minimize(loss, start, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
+            if result.fun < found:
+                best, found = allowed(np.asarray(result.x)), float(result.fun)
+        return best
+
+
 def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
-    """Return the powers of the least steady error within the budget: closed forms of one signal, a search of several.
+    """Return the powers of the least steady error within the budget, or the least power that reaches a target error.
+
+    Closed forms where all links of one signal are free, else a search with a bound beside it.
 
     Raises:
         ValueError: parts that the formulas do not cover; `hg.design` of a function of free numbers does.
@@ -75,45 +157,105 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
     (name, node), error = next(iter(network.nodes.items())), problem.criterion
     assert isinstance(node, Node)
     assert isinstance(node.channel, Superposed)
-    if problem.budget is None or problem.target_error is not None or problem.free is not None or error.steps > 1:
-        raise fail("design of a sum of links", "all powers free, the steady error, and a budget", "another problem")
+    if error.steps > 1:
+        raise fail("design of a sum of links", "the steady error", f"an error over {error.steps} steps")
     plant, process = check_constant_noise(check_design_plant(network.plant))
-    second = np.asarray(measurement_moment(node.sensor, steady_moment(plant)))
-    links, unit_channel = links_of(node, second)
-    names = [f"{name}.{hop}" for hop in transmitter_names(node.channel)]
+    links, unit_channel = links_of(node, np.asarray(measurement_moment(node.sensor, steady_moment(plant))))
+    names = tuple(f"{name}.{hop}" for hop in transmitter_names(node.channel))
+    free = find_free(names, problem.free)
     sent = links.present**2 * links.unit
-    limits = power_limits(check_budget(problem.budget), names, np.ones(len(names), dtype=bool), sent[None])
+    limits = make_unlimited(1, int(free.sum()))
+    if problem.budget is not None:
+        limits = power_limits(check_budget(problem.budget), names, free, sent[None])
+    moves, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
     criterion = error.criterion(network.states)
-
-    def covariance(information: np.ndarray) -> np.ndarray:
-        return steady_error(np.asarray(plant.matrix), np.asarray(process.covariance), information)
-
-    def value(amplitudes: Vector) -> float:
-        return criterion.exact(covariance(links.information(amplitudes))[None])
-
-    caps = np.sqrt(np.minimum(limits.peak[0], limits.mean) / links.unit)
-    closed = solve_closed_form(links, limits.total, caps)
-    starts = 1 if closed is not None else check_count("starts", problem.starts)
-    seed = check_seed("seed", problem.seed)
-    chosen = search_amplitudes(links, limits.total, caps, value, starts, seed) if closed is None else closed
-    found = value(chosen)
-    bound = found if closed is not None else criterion.exact(covariance(_limit(links, limits, caps))[None])
+    task = SumTask(
+        links,
+        limits,
+        free,
+        lambda information: steady_error(moves, noise, information),
+        lambda covariance: criterion.exact(covariance[None]),
+        check_count("starts", problem.starts),
+        check_seed("seed", problem.seed),
+    )
+    chosen, certificate = (
+        _least_error(task, limits.total)
+        if problem.target_error is None
+        else _least_power(task, float(scalar("target error", problem.target_error, 0.0)))
+    )
     channel: AbstractRandomAffine = unit_channel
     for hop, amplitude in zip(transmitter_names(node.channel), chosen, strict=True):
         channel = amplify_transmitter(channel, hop, float(amplitude))
-    powers = {name: np.array([power]) for name, power in zip(names, chosen**2 * links.unit, strict=True)}
     return PowerDesign(
         problem=problem,
-        powers=powers,
-        error=found,
-        certificate=Certificate(closed is not None, found, bound, np.nan if closed is None else 0.0, starts, "error"),
-        present=value(links.present),
-        covariance=covariance(links.information(chosen))[None],
+        powers={name: np.array([power]) for name, power in zip(names, chosen**2 * links.unit, strict=True)},
+        error=task.value(chosen),
+        certificate=certificate,
+        present=task.value(links.present),
+        covariance=task.covariance(links.information(chosen))[None],
         sensitivity=dict.fromkeys(names, float("nan")),
         price=float("nan"),
         numbers={},
         realised=Network(network.plant, {name: add_best_filter(network.plant, node, channel)}),
     )
+
+
+def _least_error(task: SumTask, total: float) -> tuple[Vector, Certificate]:
+    """Return the amplitudes of the least error with a total power of the free links, and the certificate."""
+    closed = task.closed(total)
+    chosen = task.search(total, task.starts) if closed is None else closed
+    found = task.value(chosen)
+    bound = found if closed is not None else min(task.bound(min(total, task.most)), found)
+    slope, starts = (np.nan, task.starts) if closed is None else (0.0, 1)
+    return chosen, Certificate(closed is not None, found, bound, slope, starts, "error")
+
+
+def _least_power(task: SumTask, target: float) -> tuple[Vector, Certificate]:
+    """Return the amplitudes of the least power that reach a target error, by halving it, and the certificate.
+
+    The least error falls with the power, and so does its bound: no power below that at which the bound reaches the
+    target does. A search begins from what it found with more power.
+    """
+    chosen, certificate = _largest_needed(task, target)
+    closed = certificate.convex
+    high = float((chosen**2 * task.links.unit)[task.free].sum())
+    low, most = 0.0, high
+    for _ in range(HALVINGS if closed else SEARCHES):
+        middle = (low + high) / 2
+        tried = task.closed(middle) if middle > 0 else None
+        if tried is None:
+            tried = task.search(middle, 1, chosen) if middle > 0 else np.where(task.free, 0.0, task.links.present)
+        if task.value(tried) <= target:
+            high, chosen = middle, tried
+        else:
+            low = middle
+        if high - low <= ALIKE * most:
+            break
+    needed = float((chosen**2 * task.links.unit).sum())
+    bound = needed
+    if not closed:
+        low, high = 0.0, needed - task.fixed
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if task.bound(middle) <= target else (middle, high)
+        bound = low + task.fixed
+    return chosen, certificate._replace(value=needed, bound=bound, unit="power")
+
+
+def _largest_needed(task: SumTask, target: float) -> tuple[Vector, Certificate]:
+    """Return amplitudes that reach a target error with what the limits allow, or with ever more power where nothing does."""
+    unlimited = not np.isfinite(task.most)
+    total = max(float((task.links.present**2 * task.links.unit).sum()), task.links.floor) if unlimited else task.most
+    chosen, certificate = _least_error(task, total)
+    for _ in range(DOUBLINGS if unlimited else 0):
+        if certificate.value <= target:
+            break
+        total = 2 * total
+        chosen, certificate = _least_error(task, total)
+    if certificate.value > target * (1 + ALIKE):
+        within = "whatever the power" if unlimited else "within the budget"
+        raise fail("target error", f"at least {certificate.value:.6g}, the least found {within}", f"{target:.6g}")
+    return chosen, certificate
 
 
 def links_of(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
@@ -215,34 +357,3 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
         middle = (low + high) / 2
         low, high = (middle, high) if excess(middle) < 0 else (low, middle)
     return at(high)
-
-
-def search_amplitudes(
-    links: SummedLinks, total: float, caps: Vector, value: Callable[[Vector], float], starts: int, seed: int
-) -> Vector:
-    """Return the amplitudes of the least error that searches from random starts find; signs matter."""
-    generator, best, found = np.random.default_rng(seed), links.present, np.inf
-    scale = np.minimum(caps, np.sqrt(total / links.unit))
-    if not np.all(np.isfinite(scale)):
-        raise fail("budget", "one that limits every transmitter", "no limit")
-
-    def allowed(x: Vector) -> Vector:
-        a = np.clip(x, -1, 1) * scale
-        power = float(a**2 @ links.unit)
-        return np.asarray(a * np.sqrt(total / power)) if power > total else a
-
-    def loss(x: Vector) -> float:
-        return value(allowed(x))
-
-    for _ in range(starts):
-        start = generator.uniform(-1.0, 1.0, len(scale))
-        result = scipy.optimize.minimize(loss, start, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
-        if result.fun < found:
-            best, found = allowed(np.asarray(result.x)), float(result.fun)
-    return best
-
-
-def _limit(links: SummedLinks, limits: PowerLimits, caps: Vector) -> Float[np.ndarray, "n n"]:
-    """Information that no amplitudes within the limits exceed: with the total, or with all that each may send."""
-    most = float(caps**2 @ links.unit)
-    return links.best_information(min(limits.total, most))

@@ -1,13 +1,11 @@
 """`hg.design`: powers, relays, or other numbers, for a small error, or the least power for a target error."""
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
-from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar, show_value
-from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar, show_value
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.added import adds_up, design_added
 from heliograph.planning.budget import check_budget, make_unlimited, power_limits
 from heliograph.planning.error import Error
@@ -18,7 +16,7 @@ from heliograph.planning.paths.design import design_paths, power_task
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.paths.networks import paths_of
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
-from heliograph.planning.transmitters import select_transmitters
+from heliograph.planning.transmitters import find_free
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic import (
     periodic_behind_relays,
@@ -100,9 +98,6 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     """Design of the powers of a network of independent paths, or of paths from arrays, all of whose powers are free."""
     if problem.budget is None and problem.target_error is None:
         raise fail("design", "a budget of power or a target error", "neither")
-    if isinstance(problem.free, Mapping):
-        expected = "names of transmitters (numbers are free of a function that returns a network)"
-        raise fail("free", expected, show_value(problem.free))
     if isinstance(problem.network, Network) and adds_up(problem.network):
         return design_added(problem, problem.network)
     starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
@@ -121,7 +116,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         if problem.free is not None:
             raise fail("free powers of paths", "all of them", show_value(problem.free))
     # What is free, and its limits.
-    chosen = _mask_free(paths, problem.free)
+    chosen = find_free(paths.names, problem.free)
     if problem.budget is None:
         limits = make_unlimited(error.steps, int(chosen.sum()))
     else:
@@ -130,18 +125,6 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     task = power_task(paths, criterion, limits, chosen, fixed, starts, seed)
     present = task.problem.exact(fixed[:, chosen]) if isinstance(network, Network) else float("nan")
     return design_paths(problem, task, target, present)
-
-
-def _mask_free(paths: Paths, free: Sequence[str] | None) -> Bool[np.ndarray, "hop"]:
-    """Return the mask of the free transmitters."""
-    if free is None:
-        names: Sequence[str] = paths.names
-    else:
-        names = tuple(items("free", free if not isinstance(free, str) else [free], "names"))
-    chosen = select_transmitters(paths.names, names, "free")
-    if not np.any(chosen):
-        raise fail("free", f"at least one transmitter of {list(paths.names)}", "none: nothing is free")
-    return chosen
 
 
 Gains = dict[str, Float[np.ndarray, "slots n _"]]

@@ -13,9 +13,9 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, items, show_value
 from heliograph.numerics.traced import is_traced, is_zero, library, plain
-from heliograph.numerics.types import Array, Float, Scalar
+from heliograph.numerics.types import Array, Bool, Float, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
@@ -141,3 +141,19 @@ def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float 
         return changed
 
     return visit_hops(channel, change)
+
+
+def find_free(names: Sequence[str], free: Sequence[str] | Mapping[str, object] | None) -> Bool[np.ndarray, "hop"]:
+    """Return which transmitters are free, all unless some are named.
+
+    Raises:
+        ValueError: numbers instead of names, or none of the transmitters is named.
+    """
+    if isinstance(free, Mapping):
+        expected = "names of transmitters (numbers are free of a function that returns a network)"
+        raise fail("free", expected, show_value(free))
+    wanted = names if free is None else tuple(items("free", [free] if isinstance(free, str) else free, "names"))
+    chosen = select_transmitters(names, wanted, "free")
+    if not np.any(chosen):
+        raise fail("free", f"at least one transmitter of {list(names)}", "none: nothing is free")
+    return chosen
