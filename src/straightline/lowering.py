@@ -48,7 +48,7 @@ class Lowering:
             jaxpr, consts = program.jaxpr, program.consts
         values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.known, consts), strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
-        for equation in jaxpr.eqns:
+        for equation in _find_used(jaxpr):
             arguments = [self._read(values, v) for v in equation.invars]
             values |= zip(equation.outvars, self.equation(equation, arguments), strict=True)
         return [self._read(values, v) for v in jaxpr.outvars]
@@ -245,3 +245,14 @@ def traced(function: Callable[..., PyTree], *examples: PyTree, single: bool = Fa
         flat, tree = jax.tree.flatten(examples)
         program = jax.make_jaxpr(call)(*(map(_halved, flat) if single else flat))
     return program, structure[0]
+
+
+def _find_used(jaxpr: Jaxpr) -> list[JaxprEqn]:
+    """Return the operations on which a program's results depend, or which do something beside, such as printing."""
+    needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
+    used: list[JaxprEqn] = []
+    for equation in reversed(jaxpr.eqns):
+        if equation.effects or not needed.isdisjoint(equation.outvars):
+            needed |= {v for v in equation.invars if isinstance(v, Var)}
+            used.append(equation)
+    return used[::-1]

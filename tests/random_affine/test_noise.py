@@ -57,3 +57,12 @@ def test_samples_of_a_singular_covariance_stay_in_its_range(covariance):
         samples = np.array([noise.sample(jax.random.key(i)) for i in range(20)])
     assert np.abs(samples @ null).max() <= 1e-14 * np.abs(samples * null).max()
     np.testing.assert_allclose(noise.factor @ noise.factor.T, s, rtol=1e-12)
+
+
+def test_a_thousand_independent_components_need_no_eigenvectors():
+    """Unlike variances, one of them zero and one of 1e-20: the root is exact, where eigenvectors lose the smallest."""
+    variances = np.linspace(0.1, 2.0, 1000)
+    variances[:2] = 0.0, 1e-20
+    noise = hg.Gaussian(np.diag(variances))
+    np.testing.assert_array_equal(np.asarray(noise.factor), np.diag(np.sqrt(variances)))
+    assert noise.covariance[1, 1] == 1e-20

@@ -296,10 +296,17 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     skew = np.abs(matrix - matrix.T)
     if np.any(skew > SYMMETRY_TOLERANCE * np.outer(unit, unit)):
         raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
-    smallest = np.min(np.linalg.eigvalsh(matrix / np.outer(unit, unit)), initial=np.inf)
+    scaled = matrix / np.outer(unit, unit)
+    eigenvalues = np.diagonal(scaled) if is_diagonal(scaled) else np.linalg.eigvalsh(scaled)
+    smallest = np.min(eigenvalues, initial=np.inf)
     if smallest < -DEFINITENESS_TOLERANCE:
         raise fail(name, "a positive semidefinite matrix", f"smallest eigenvalue {np.linalg.eigvalsh(matrix)[0]:.3g}")
     return matrix / 2 + matrix.T / 2  # the sum of two large variances may overflow
+
+
+def is_diagonal(matrix: np.ndarray) -> bool:
+    """Return whether a square matrix is zero off its diagonal."""
+    return np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix))
 
 
 def standard_deviations(matrix: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from heliograph.random_affine.moments.components import (
 )
 from heliograph.random_affine.moments.monomials import Exponents, exponents
 
+LARGE = 100  # components of independent noises whose root needs no eigenvectors: 18 ms for 1,000 alike, 3 s with them
 FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
 
 Number = float | jax.Array
@@ -173,6 +174,9 @@ def _factor_by_eigenvectors(covariance: Square) -> np.ndarray:
     have none.
     """
     matrix = np.asarray(covariance)
+    if len(matrix) > LARGE and check.is_diagonal(matrix):
+        root: np.ndarray = np.diag(np.sqrt(np.diagonal(matrix)))
+        return root
     deviation = np.sqrt(np.diagonal(matrix))
     unit = np.where(deviation > 0, deviation, 1.0)
     for scale in (np.ones_like(unit), unit):

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.factors.columns import Columns, columns_of
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import is_traced, is_zero, library, stack_parts
+from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
 from heliograph.random_affine.combine import Stack
@@ -78,10 +78,14 @@ def divide_spread(spread: Tensor) -> tuple[Tensor, Columns]:
     apart = xp.all(spread[..., :-1, -1] == 0)
     corner = np.zeros(spread.shape[-2:])
     corner[-1, -1] = 1.0
-    noise = columns_of(xp.where(apart, covariance, 0.0))
-    lacking = len(covariance) - noise.matrix.shape[1]
-    padded = Columns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
-    return spread - xp.where(apart, covariance, 0.0)[..., None, None] * corner, padded
+    noise = _pad_columns(columns_of(xp.where(apart, covariance, 0.0)))
+    return spread - xp.where(apart, covariance, 0.0)[..., None, None] * corner, noise
+
+
+def _pad_columns(noise: Columns) -> Columns:
+    """Columns of a covariance, with columns of zeros to as many as it has rows."""
+    xp, lacking = library(noise), len(noise.matrix) - noise.matrix.shape[1]
+    return Columns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
 
 
 def join_gain_and_noise(gain: Tensor, noise: Columns) -> Tensor:
@@ -127,7 +131,14 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """
     check_maps("channel of a filter", [channel])
     check_forgets("channel of a filter", channel)
-    return describe_second_moments(*_bound_moments(channel), uncertain=count_corners(channel) != 1)
+    bounds, uncertain = _bound_moments(channel), count_corners(channel) != 1
+    if uncertain or not channel.has_known_gain:
+        return describe_second_moments(*bounds, uncertain)
+    # A known gain has no spread: the noise of the parts of a channel is all, and no tensor of all outputs is needed.
+    mean, spread, shift, power, nominal = bounds
+    noise = _pad_columns(columns_of(_noise_covariance(channel)))
+    none = np.zeros(nominal.center.shape)
+    return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, none, noise, uncertain)
 
 
 class MomentBounds(NamedTuple):
@@ -144,8 +155,8 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     """Nominal mean of (G, n), and maps W -> matrix that dominate spread, shift and power under every possible law."""
     corners = count_corners(channel)
     listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
-    # A sum of maps: of known laws its spread is the sum of theirs; else bounded part by part.
-    if isinstance(channel, Superposed) and corners == 1:
+    # Independent maps, added up or side by side: of known laws their spreads are all; else bounded part by part.
+    if isinstance(channel, Superposed | Stack) and corners == 1:
         mean, tensor = _compute_mean_and_spread(channel)
         own = map_of_known_law(tensor)
         of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
@@ -221,17 +232,42 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
 
 
 def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
-    """Mean and spread of a map of known law: the spreads of independent maps add up, and of their means no more."""
-    if not isinstance(channel, Superposed):
+    """Mean and spread of a map of known law: of independent maps the spreads of each alone, and no more."""
+    if not isinstance(channel, Superposed | Stack):
         moments = channel.moments(2)
         mean = moments.mean[:-1]
-        raw = moments.second
-        return mean, raw - symmetric_product(mean, mean)
+        return mean, _drop_known_gain(channel, moments.second - symmetric_product(mean, mean))
     means, spreads = zip(*(_compute_mean_and_spread(affine) for affine in channel.maps), strict=True)
+    if isinstance(channel, Stack):
+        return library(means).concatenate(means), _stack_spreads(spreads)
+    # Spreads of a sum add up, and that of its noise.
     whole, size = channel.in_places(dict(enumerate(means)), 1), channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * _constant_power(size)
     spread: Tensor = channel.in_places(dict(enumerate(spreads)), 2) + noise
     return whole + channel.noise.mean[:, None] * np.eye(size)[-1], spread
+
+
+def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.ndarray, "m m"]:
+    """Cov(z | y) of a channel of known gain, as that of its parts where these are independent."""
+    covariance: Matrix
+    if isinstance(channel, Stack):
+        covariance = block_diagonal([_noise_covariance(affine) for affine in channel.maps])
+    elif isinstance(channel, Superposed):
+        covariance = sum((_noise_covariance(affine) for affine in channel.maps), channel.noise.covariance)
+    else:
+        covariance = _compute_mean_and_spread(channel)[1][..., -1, -1]
+    return covariance
+
+
+def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
+    """Spreads of independent maps side by side, as diagonal blocks of that of all outputs."""
+    sizes, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
+    outputs = sum(sizes)
+    rows = [np.arange(start, start + m) for start, m in zip(np.cumsum([0, *sizes]), sizes, strict=False)]
+    where = np.concatenate([(outputs * at[:, None] + at).reshape(-1) for at in rows])
+    flat = library(spreads).concatenate([spread.reshape(-1, size**2) for spread in spreads])
+    whole: Tensor = scatter((outputs**2, size**2), where, flat).reshape(outputs, outputs, size, size)
+    return whole
 
 
 def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
