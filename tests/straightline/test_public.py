@@ -42,6 +42,24 @@ def test_what_is_not_taken_is_refused_with_its_line():
         sl.compile(lambda x: x @ x, np.eye(3), most=3)
 
 
+def test_what_no_result_depends_on_is_left_out_but_printing_is_not():
+    """An operation that is not taken stands in nobody's way where nothing uses it; one with an effect has a use."""
+
+    def sum_beside_svd(x):
+        jnp.linalg.svd(x)
+        return x.sum()
+
+    def print_and_double(x):
+        jax.debug.print("{}", x[0])
+        return 2 * x
+
+    alone = sl.compile(lambda x: x.sum(), np.eye(3))
+    assert sl.compile(sum_beside_svd, np.eye(3)).operations == alone.operations
+    assert sl.compile(sum_beside_svd, np.eye(3))(np.eye(3)[None]) == [3.0]
+    with pytest.raises(sl.Unsupported, match="debug"):
+        sl.compile(print_and_double, np.ones(2))
+
+
 def test_one_run_is_computed_in_place():
     """x+ = x / 2 + u, y = x: the state is written over itself, also where the result is counted from the last."""
     for number in (0, -2):
