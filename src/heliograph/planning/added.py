@@ -118,7 +118,7 @@ class SumTask(NamedTuple):
         return solve_closed_form(self.links, total, self.caps) if np.all(self.free) else None
 
     def search(self, total: float, starts: int, first: Vector | None = None) -> Vector:
-        """Return the amplitudes of the least error that descents find, from random starts and one given; signs matter."""
+        """Return the amplitudes of the least error that descents find; signs matter."""
         links, free = self.links, self.free
         unit = links.unit[free]
         generator, best, found = np.random.default_rng(self.seed), links.present, np.inf
@@ -243,7 +243,7 @@ def _least_power(task: SumTask, target: float) -> tuple[Vector, Certificate]:
 
 
 def _largest_needed(task: SumTask, target: float) -> tuple[Vector, Certificate]:
-    """Return amplitudes that reach a target error with what the limits allow, or with ever more power where nothing does."""
+    """Return amplitudes that reach a target error within the limits, or with ever more power where there are none."""
     unlimited = not np.isfinite(task.most)
     total = max(float((task.links.present**2 * task.links.unit).sum()), task.links.floor) if unlimited else task.most
     chosen, certificate = _least_error(task, total)
