@@ -306,7 +306,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
 
 def is_diagonal(matrix: np.ndarray) -> bool:
     """Return whether a square matrix is zero off its diagonal."""
-    return np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix))
+    return bool(np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)))
 
 
 def standard_deviations(matrix: np.ndarray) -> np.ndarray:
