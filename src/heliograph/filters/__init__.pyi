@@ -14,6 +14,9 @@ from .wrappers.clock import (
 from .gaussian.bounds import (
     Scalars as Scalars,
 )
+from .wrappers.mean_error import (
+    mean_error_bound as mean_error_bound,
+)
 from .wrappers.delay import (
     late_filter as late_filter,
 )

@@ -10,6 +10,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 
+GAINS, ERRORS = 96, 24  # nodes of a gain, and of the error of its reading
 NODES = 64  # of Gauss-Legendre, over all that matters of the posterior
 NATS = 36.0  # below its mode, where a density no longer counts: e^-36 is a rounding error
 GRID = 33  # points among which the mode, and then each end, is looked for
@@ -139,3 +140,44 @@ def _find_end(nats: Nats, outer: jax.Array, top: jax.Array, least: jax.Array) ->
 
     end: jax.Array = jax.lax.fori_loop(0, ZOOMS // 2, zoom, (outer, top))[0]
     return end
+
+
+def gain_nodes(
+    law: AbstractLaw, count: int = GAINS
+) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
+    """Return gains (nodes, 1) and weights (nodes,) by which a mean over a gain is a sum: those of Gauss and Legendre.
+
+    Args:
+        law: of the gain, with a density or of finitely many values.
+
+    Raises:
+        ValueError: another law; uncertain probabilities.
+    """
+    check_density(law)
+    if isinstance(law, Constant | Discrete):
+        weights, values = np.array(law.list_atoms(), dtype=float).T
+        return values[:, None], weights
+    x, w = np.polynomial.legendre.leggauss(GAINS)
+    low, high = (float(end) for end in law.bulk())
+    with jax.enable_x64(True):
+        ends = np.log([low, high]) if law.logarithmic else np.array([low, high]) ** 0.25
+        t = ends.mean() + (ends[1] - ends[0]) / 2 * x
+        g = np.exp(t) if law.logarithmic else t**4
+        nats = np.asarray(jax.vmap(law.log_density)(jnp.asarray(g))) + (t if law.logarithmic else 3 * np.log(t))
+    weights = w * np.exp(nats - nats.max())
+    return g[:, None], weights / weights.sum()
+
+
+def reading_nodes(
+    law: AbstractLaw, variance: float
+) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
+    """Return readings a = g + e (nodes, 1) and weights (nodes,) by which a mean over a reading is a sum.
+
+    Args:
+        law: of the gain g, as `gain_nodes` takes it.
+        variance: of e, positive.
+    """
+    gains, weights = gain_nodes(law)
+    x, w = np.polynomial.hermite_e.hermegauss(ERRORS)
+    readings = gains + np.sqrt(variance) * x
+    return readings.reshape(-1, 1), np.outer(weights, w / w.sum()).ravel()

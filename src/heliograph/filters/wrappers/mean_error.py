@@ -1,0 +1,138 @@
+"""Mean error of a filter that is told numbers, before any: a bound without drawing them."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.gaussian import from_covariance
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.linear.belief import LinearBelief
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.wrappers.told import ToldFilter
+from heliograph.model.over_time import first
+from heliograph.numerics.check import check_count, fail, show_value
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.times.rows import check_rows
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.chain import AbstractMemory, MarkovChain
+from heliograph.random_affine.law import AbstractLaw
+from heliograph.random_affine.noise import FiniteSupport
+from heliograph.random_affine.reading import gain_nodes, reading_nodes
+from heliograph.random_affine.told import FreshNumbers, FreshReading, told_maps
+
+MOST = 20_000  # combinations of numbers that are summed over
+
+
+Carry = tuple[LinearBelief, jax.Array, jax.Array]  # a state, covariances by mode (modes, n, n), the modes' law
+
+
+class Contexts(NamedTuple):
+    """Numbers that may be told at a step, by mode of the chain that tells them; one mode where they are fresh.
+
+    Shapes: numbers (modes, nodes, told), weights (modes, nodes) that sum to 1 in each mode, initial (modes,),
+    transition (modes, modes).
+    """
+
+    numbers: Float[np.ndarray, "modes nodes told"]
+    weights: Float[np.ndarray, "modes nodes"]
+    initial: Float[np.ndarray, " modes"]
+    transition: Float[np.ndarray, "modes modes"]
+
+
+def mean_error_bound(
+    filter: AbstractFilter, steps: int, inputs: "Float[ArrayLike, 'steps inputs'] | None" = None
+) -> Float[np.ndarray, "steps n n"]:
+    """Bound the mean over all that may be told of a filter's covariance, at each step and before any data.
+
+    What is left of a covariance P after a message with numbers a, f(P, a), is concave and increasing in P. So
+    V+ = E f(V, a) over numbers that are drawn anew each step is at least E P+, and at most what the filter of the law
+    alone claims. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, b_ij = P(i before | j now).
+    Means over gains with a density are sums over Gauss's nodes. A message is taken to arrive at each step.
+
+    Args:
+        filter: a `linear_filter` behind a link that tells gains, readings of gains, or numbers of finitely many values
+            or of one gain's law.
+        steps: how many.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+
+    Claim: "upper".
+
+    Raises:
+        ValueError: another filter, numbers without a law or with another one, inputs of another size.
+    Source: Jensen's inequality.
+    """
+    check_count("steps", steps)
+    if not (isinstance(filter, ToldFilter) and isinstance(filter.base, LinearFilter)):
+        got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
+        raise fail("filter", "a linear_filter behind a link without memory that tells numbers", got)
+    given = np.zeros((steps, 0)) if inputs is None and not filter.inputs else inputs
+    u = check_rows("inputs", given, steps, len(filter.inputs), missing=False)
+    return np.asarray(_bound(filter, _list_contexts(filter), np.asarray(u)))
+
+
+@compile_in_float64
+def _bound(filter: ToldFilter, contexts: Contexts, u: Array) -> jax.Array:
+    """Compiled body of `mean_error_bound`."""
+    start = filter.init()
+    modes = len(contexts.initial)
+
+    def left(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
+        z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
+        after: LinearBelief = filter.correct(prior, z, k)[0]
+        covariance: jax.Array = after.gaussian.covariance
+        return covariance
+
+    def step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
+        state, before, law = carry
+        k, u_k = row
+
+        def of_mode(covariance: jax.Array, numbers: jax.Array, weights: jax.Array) -> tuple[LinearBelief, jax.Array]:
+            gaussian = from_covariance(state.gaussian.mean, covariance)
+            prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
+            after = jax.vmap(lambda a: left(prior, a, k))(numbers)
+            return prior, jnp.tensordot(weights, after, 1)
+
+        priors, after = jax.vmap(of_mode)(before, jnp.asarray(contexts.numbers), jnp.asarray(contexts.weights))
+        following = law @ contexts.transition
+        back = law[:, None] * contexts.transition / jnp.where(following > 0, following, 1.0)  # P(i now | j then)
+        moved = jnp.einsum("ij,iab->jab", back, after)
+        return (jax.tree.map(lambda leaf: leaf[0], priors), moved, following), jnp.tensordot(law, after, 1)
+
+    covariances = jnp.broadcast_to(start.gaussian.covariance, (modes, *start.gaussian.covariance.shape))
+    carry = jax.tree.map(jnp.asarray, start), covariances, jnp.asarray(contexts.initial)
+    covariances_over_time: jax.Array = jax.lax.scan(step, carry, (jnp.arange(len(u)), jnp.asarray(u)))[1]
+    return covariances_over_time
+
+
+def _list_contexts(filter: ToldFilter) -> Contexts:
+    """List the numbers that may be told, with their probabilities."""
+    memories = [affine.memory for affine in told_maps(first(filter.link))]
+    chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
+    if chains:
+        if len(memories) > 1 or chains[0].is_uncertain or np.ndim(chains[0].transition) > 2:
+            raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
+        modes = chains[0].modes
+        numbers = np.arange(float(modes))[:, None, None]
+        return Contexts(numbers, np.ones((modes, 1)), np.asarray(chains[0].initial), np.asarray(chains[0].transition))
+    values, weights = np.zeros((1, 0)), np.ones(1)
+    for memory in memories:
+        more, chances = _nodes_of(memory)
+        if len(values) * len(more) > MOST:
+            raise fail("numbers told", f"at most {MOST} combinations of nodes", len(values) * len(more))
+        values = np.concatenate([np.repeat(values, len(more), axis=0), np.tile(more, (len(values), 1))], axis=1)
+        weights = np.outer(weights, chances).ravel()
+    return Contexts(values[None], weights[None], np.ones(1), np.ones((1, 1)))
+
+
+def _nodes_of(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
+    """Return numbers that are drawn anew at each step, with their probabilities."""
+    if isinstance(memory, FreshReading):
+        return reading_nodes(memory.law, float(memory.variance))
+    if isinstance(memory, FreshNumbers) and isinstance(memory.law, AbstractLaw) and memory.count == 1:
+        return gain_nodes(memory.law)
+    if isinstance(memory, FreshNumbers) and isinstance(memory.law, FiniteSupport):
+        return np.asarray(memory.law.atoms), np.asarray(memory.law.probabilities)
+    law = memory.law if isinstance(memory, FreshNumbers) else memory
+    raise fail("numbers told", "a law of one gain or of finitely many values", type(law).__name__)
