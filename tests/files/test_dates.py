@@ -9,8 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.files.table import columns_of, read_table, write_table
-from heliograph.numerics.times.dates import dates, format_dates, instant, seconds_between
+from heliograph.files.table import read_table, write_table
+from heliograph.numerics.times.dates import dates, format_dates
+from heliograph.serving import Message
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
 SENSOR = hg.Sensor(lambda x: x, noise=0.1, outputs=["pos"])
@@ -50,8 +51,9 @@ def test_what_else_is_a_date_and_what_is_none():
 
 def test_seconds_between_dates_lose_nothing():
     time = np.datetime64("2026-11-21T23:25:00", "ns") + np.array([0, 1, 1_000_000_001]) * np.timedelta64(1, "ns")
-    np.testing.assert_array_equal(seconds_between(time), [0, 1e-9, 1.0])
-    np.testing.assert_array_equal(seconds_between(np.array([3.0, 3.5])), [0, 0.5])
+    for moments, expected in ((time, [0, 1e-9, 1.0]), (np.array([3.0, 3.5]), [0, 0.5])):
+        recording = hg.files.read_recording({"time": moments, "pos": np.zeros(len(moments))}, NETWORK)
+        np.testing.assert_array_equal(recording.inputs[:, 0], expected)  # dt
 
 
 ACROSS_WINTER_TIME = ["2026-10-25T02:59:58+02:00", "2026-10-25T02:59:59+02:00", "2026-10-25T02:00:00+01:00"]
@@ -105,8 +107,9 @@ class OfPolars:
 
 
 def test_other_frames_are_tables():
-    result = columns_of(OfPolars(time=np.array(["2026-11-21T23:25"], dtype="datetime64[us]"), pos=[3]))
-    assert result["time"].dtype == "datetime64[ns]" and result["pos"].dtype == np.float64
+    table = OfPolars(time=np.array(["2026-11-21T23:25"], dtype="datetime64[us]"), pos=[3])
+    result = hg.files.read_recording(table, NETWORK)
+    assert result.time.dtype == "datetime64[ns]" and result.measurements["a"].dtype == np.float64
 
 
 @pytest.mark.parametrize(
@@ -166,7 +169,8 @@ def test_a_column_of_dates_in_a_table_is_dates(tmp_path):
 @given(moment=MOMENTS, zone=ZONES, space=st.booleans())
 def test_an_instant_is_the_date_that_python_says(moment, zone, space):
     aware = moment.replace(tzinfo=zone)
-    assert instant(aware.isoformat(sep=" " if space else "T")) == aware
+    text = aware.isoformat(sep=" " if space else "T")
+    assert Message(node="a", sequence=0, time=text).time == aware
 
 
 @pytest.mark.parametrize(
@@ -175,12 +179,13 @@ def test_an_instant_is_the_date_that_python_says(moment, zone, space):
 )  # fmt: skip
 def test_no_other_text_is_an_instant(text):
     with pytest.raises(ValueError):
-        instant(text)
+        Message(node="a", sequence=0, time=text)
 
 
 def test_text_among_numbers_is_no_number():
-    with pytest.raises(ValueError, match=r"column 'x': expected numbers or dates, got '2\.0'"):
-        columns_of({"x": np.array([1.0, "2.0"], dtype=object)})
+    table = {"time": np.arange(2.0), "pos": np.array([1.0, "2.0"], dtype=object)}
+    with pytest.raises(ValueError, match=r"column 'pos': expected numbers or dates, got '2\.0'"):
+        hg.files.read_recording(table, NETWORK)
 
 
 def test_missing_dates_are_said_where_each_row_is_a_step():

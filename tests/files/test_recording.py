@@ -5,12 +5,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import heliograph as h
-from heliograph.files.recording import (
-    estimate_columns,
-    read_recording,
-    write_estimates,
-)
-from heliograph.files.table import write_table
+from heliograph.files import read_recording, read_table, write_estimates, write_table
 from heliograph.simulation.results.record import Record
 
 NAN = np.nan
@@ -157,7 +152,18 @@ def record_of(*filters: str, nodes=("a",), states=("p", "v")) -> Record:
     return Record(np.array([0.0, 0.5, 0.7]), states, None, {}, estimates)
 
 
-def test_columns_of_estimates():
+@pytest.fixture
+def estimate_columns(tmp_path):
+    """What `write_estimates` writes, by column."""
+
+    def written(record):
+        write_estimates(record, tmp_path / "estimates.csv")
+        return read_table(tmp_path / "estimates.csv")
+
+    return written
+
+
+def test_columns_of_estimates(estimate_columns):
     result = estimate_columns(record_of("aware"))
     assert list(result) == ["time", "p", "p.sd", "v", "v.sd", "cov.p.v", "valid"]
     np.testing.assert_array_equal(result["v"], [2, 4, 6])
@@ -167,7 +173,7 @@ def test_columns_of_estimates():
     np.testing.assert_array_equal(result["valid"], [True, False, False])
 
 
-def test_no_columns_for_a_covariance_that_is_not_claimed():
+def test_no_columns_for_a_covariance_that_is_not_claimed(estimate_columns):
     record = record_of("silent")
     means = record.estimates["a"]["silent"].mean
     record.estimates["a"]["silent"] = h.model.Estimate(means, np.full((3, 2, 2), np.nan), "none")
@@ -176,14 +182,14 @@ def test_no_columns_for_a_covariance_that_is_not_claimed():
     np.testing.assert_array_equal(result["valid"], np.isfinite(means).all(axis=1))
 
 
-def test_prefixes_of_nodes_and_filters():
+def test_prefixes_of_nodes_and_filters(estimate_columns):
     assert list(estimate_columns(record_of("aware", "other")))[1] == "aware.p"
     assert list(estimate_columns(record_of("aware", nodes=("a", "b"))))[1] == "a.p"
     named = list(estimate_columns(record_of("aware", "other", nodes=("a", "b"))))
     assert named[1:3] == ["a.aware.p", "a.aware.p.sd"] and named[-1] == "b.other.valid"
 
 
-def test_estimates_that_cannot_be_a_table():
+def test_estimates_that_cannot_be_a_table(estimate_columns):
     with pytest.raises(ValueError, match=r"^columns of the estimates: expected distinct names, got 'time' more"):
         estimate_columns(record_of("aware", states=("time", "v")))
     net = network({"a": ("pos",)})

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.fusion.quantizer import Symbols, widen
+from heliograph.fusion.quantizer import widen
 from heliograph.testing import check_quantizer
 
 ESCAPE = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
@@ -73,7 +73,7 @@ def test_a_receiver_of_symbols_alone_knows_value_and_amplitude(values, levels, g
     here, there, stepped = quantizer.init(1), quantizer.init(1), quantizer.init(1)
     for x in values:
         symbols = quantizer.encode(here, [x])
-        over_the_link = Symbols(*([int(s[0])] for s in symbols))  # whole numbers, nothing else
+        over_the_link = type(symbols)(*([int(s[0])] for s in symbols))  # whole numbers, nothing else
         there, received = quantizer.decode(there, over_the_link)
         here, sent = quantizer.decode(here, symbols)
         stepped, known = quantizer.step(stepped, [x])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments.second_moments import nominal_spread
+from heliograph.random_affine import second_order
 from tests.filters.modal_problems import PLANT, SENSOR, bursts, variances
 
 Series, Stack, Modes, known = (getattr(hg.random_affine, n) for n in ("Series", "Stack", "Modes", "known"))
@@ -33,7 +33,7 @@ def received(link):
 def step(second, size, move, receive):
     """E[r r'] of r = (y, 1, z_1, ..., z_k) moved and received once: what is known of a map is its mean and spread."""
     for channel, replace in ((move, True), (receive, False)):
-        mean, spread = np.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel).center
+        mean, spread = np.asarray(channel.moments(1).mean[:-1]), second_order(channel).nominal.center
         y = second[:size, :size]
         rows = np.hstack([mean, np.zeros((len(mean), len(second) - size))])
         added = np.einsum("abij,ij->ab", spread, y)

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import heliograph as hg
 from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
-from heliograph.numerics.angle import angles_named, continue_angles, nearest, wrap_angles
+from heliograph.numerics.angle import continue_angles, nearest, wrap_angles
 
 TURN = 2 * np.pi
 ANGLE = st.floats(-1e3, 1e3)
@@ -28,10 +29,13 @@ def test_what_is_in_range_keeps_every_bit_and_what_is_missing_stays_missing():
 
 
 def test_names_are_checked():
-    assert angles_named("circular", ["b"], ("a", "b")) == (1,)
+    def angles(circular):
+        return hg.LinearPlant(np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["a", "b"], circular=circular).angles
+
+    assert angles(["b"]) == (1,)
     for wrong in (["c"], ["a", "a"], "a"):
-        with pytest.raises(ValueError, match="circular: expected"):
-            angles_named("circular", wrong, ("a", "b"))
+        with pytest.raises(ValueError, match="circular states: expected"):
+            angles(wrong)
 
 
 def heading(x: jax.Array) -> jax.Array:

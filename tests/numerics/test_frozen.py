@@ -2,19 +2,27 @@
 
 import pytest
 
-from heliograph.numerics.frozen import FrozenMapping
+import heliograph as hg
+
+PLANT, SENSOR = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+NODE = hg.Node(SENSOR, hg.perfect(), {"f": hg.kalman_filter(PLANT, SENSOR)})
+
+
+def claimed(nodes):
+    """Claims by node and filter, which a network holds in such a mapping."""
+    return hg.Network(PLANT, nodes).claimed
 
 
 def test_equal_items_are_equal_mappings_with_one_hash():
-    one, other = FrozenMapping({"a": 1, "b": 2}), FrozenMapping({"b": 2, "a": 1})
-    assert one == other == {"a": 1, "b": 2} and hash(one) == hash(other)
-    assert one != FrozenMapping({"a": 1}) and list(one) == ["a", "b"]
+    one, other = claimed({"a": NODE, "b": NODE}), claimed({"b": NODE, "a": NODE})
+    assert one == other == {("a", "f"): "exact", ("b", "f"): "exact"} and hash(one) == hash(other)
+    assert one != claimed({"a": NODE}) and list(one) == [("a", "f"), ("b", "f")]
 
 
 def test_nothing_is_changed_through_it_or_from_outside():
-    items = {"a": 1}
-    frozen = FrozenMapping(items)
-    items["a"] = 2
-    assert frozen["a"] == 1
+    nodes = {"a": NODE}
+    frozen = claimed(nodes)
+    nodes["b"] = NODE
+    assert dict(frozen) == {("a", "f"): "exact"}
     with pytest.raises(TypeError):
-        frozen["a"] = 3
+        frozen["a", "f"] = "upper"

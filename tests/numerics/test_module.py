@@ -6,17 +6,24 @@ import jax
 import jax.numpy as jnp
 
 import heliograph as hg
-from heliograph.numerics.module import Module
 
 
-class Scaled(Module):
-    """A number to multiply by."""
+class Scaled(hg.random_affine.AbstractLaw):
+    """A number to multiply by, held by a law."""
 
     factor: jax.Array
 
     def of(self, x: jax.Array) -> jax.Array:
         """The product."""
         return self.factor * x
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw the number."""
+        return self.factor
+
+    def moment(self, order: int) -> jax.Array:
+        """Its power."""
+        return self.factor**order
 
 
 def test_methods_are_bound_as_python_does():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.recording import estimate_columns, read_recording
+from heliograph.files.recording import read_recording
 
 
 def unit_of(name):
@@ -41,7 +41,8 @@ def test_units_are_in_records_columns_and_files(tmp_path):
     assert recording.measurements["a"][:, 0].tolist() == [1.0, 2.0, 3.0] and recording.truth is not None
     record = hg.run(network, *recording)
     assert record.units == {"position": "m"} and record.with_units({"position": "cm"}).units == {"position": "cm"}
-    assert {"position (m)", "position.sd (m)"} <= set(estimate_columns(record))
+    hg.files.write_estimates(record, tmp_path / "estimates.csv")
+    assert {"position (m)", "position.sd (m)"} <= set(hg.files.read_table(tmp_path / "estimates.csv"))
     statistics = hg.monte_carlo(network, 3, runs=2, key=0, keep=hg.Statistics())
     assert statistics.units == {"position": "m"}
 

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.check import array, scalar
 from heliograph.serving.message import read_message
 
 
 def unpacking(x):
     position, speed = x
     return jnp.stack([position, speed])
+
+
+SENSOR = hg.LinearSensor([[1.0]], 0.1)
 
 
 def single(x):
@@ -28,13 +30,21 @@ def single(x):
             lambda: hg.LinearSensor([1, 0, 0, 0], 1.0),
             "sensor matrix: expected shape (outputs, states), such as [[1, 0]], got shape (4,)",
         ),
-        (lambda: array("table", np.ones((2, 2, 2)), (None, 3)), "table: expected shape (rows, 3), got shape (2, 2, 2)"),
-        (lambda: array("list", [[1.0]], (2,)), "list: expected shape (2), got shape (1, 1)"),
+        (
+            lambda: hg.random_affine.Shaped(np.ones((2, 2, 2)), hg.Gaussian(np.eye(3))),
+            "noise matrix: expected shape (rows, 3), got shape (2, 2, 2)",
+        ),
+        (
+            lambda: hg.Contaminated(np.eye(2), 0.1, [[1.0]], 1.0),
+            "covariance of the outliers: expected shape (2, 2), got shape (1, 1)",
+        ),
         (lambda: hg.random_affine.Rician(1.0, 0.0), "Rician scale: expected a positive number, got 0"),
-        (lambda: scalar("x", -1.0, 0.0), "x: expected a number of at least 0, got -1"),
-        (lambda: scalar("x", 2.0, -np.inf, 1.0), "x: expected a number of at most 1, got 2"),
-        (lambda: scalar("x", 2.0, 0.0, 1.0), "x: expected a number from 0 to 1, got 2"),
-        (lambda: scalar("x", 0.0, float(np.finfo(float).tiny), 1.0), "x: expected a positive number up to 1, got 0"),
+        (lambda: hg.hop(1.0, 0.1, power=-1.0), "hop power: expected a number of at least 0, got -1"),
+        (lambda: hg.erasure(hg.perfect(), 2.0), "arrival probability: expected a number from 0 to 1, got 2"),
+        (
+            lambda: hg.adaptive_filter(hg.kalman_filter(hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), SENSOR), memory=0.0),
+            "memory of an adaptive filter: expected a positive number up to 1, got 0",
+        ),
     ],
 )
 def test_a_line_says_what_to_write(make, line):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments.route import apply
 from tests.planning.published import one_hop, two_hops
 
 PLANT = hg.LinearPlant([[0.9]], [[0.19]], [2.0], [[1.0]])
@@ -72,7 +71,7 @@ def test_a_relay_sends_what_draws_of_the_first_hop_give_it(kind):
             y = jnp.sqrt(y2)  # its sign and law do not matter: noise has mean zero
             for k in keys[:3]:
                 state, h = hops[0].draw(state, k)
-            z = h[0, :1] * y + h[0, -1] if kind != "delay" else apply(h, jnp.tile(y, 3))
+            z = h[0, :1] * y + h[0, -1] if kind != "delay" else h[:-1, :-1] @ jnp.tile(y, 3) + h[:-1, -1]
             return jnp.where(jnp.isnan(z[0]), 0.0, (1.5 * z[0]) ** 2)
 
         drawn = np.asarray(jax.jit(jax.vmap(received))(jax.random.split(jax.random.key(1), 40_000)))

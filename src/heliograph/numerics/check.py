@@ -161,9 +161,7 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
 def _describe_range(low: float, high: float) -> str:
     if 0 < low <= TINY:
         return "a positive number" + (f" up to {high:g}" if high < np.inf else "")
-    if high == np.inf:
-        return f"a number of at least {low:g}"
-    return f"a number of at most {high:g}" if low == -np.inf else f"a number from {low:g} to {high:g}"
+    return f"a number of at least {low:g}" if high == np.inf else f"a number from {low:g} to {high:g}"
 
 
 def items(name: str, value: object, what: str) -> list[Any]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.moments.second_moments import nominal_spread
+from heliograph.random_affine import second_order
 from tests.filters.modal_problems import BAD, CHAIN_A, GOOD, LAW_A, RELAY, chain_a
 from tests.follow import follow
 from tests.oracles import links_with_memory as oracle
@@ -44,7 +44,7 @@ def errors(item, horizon=STEPS, written_out=True):
 def expected(initial, transitions, maps):
     """maps[k][i]: the channel in mode i at step k, made without any memory."""
     means = [[np.asarray(m.moments(1).mean[:-1]) for m in row] for row in maps]
-    spreads = [[nominal_spread(m).center for m in row] for row in maps]
+    spreads = [[second_order(m).nominal.center for m in row] for row in maps]
     return oracle.by_all_paths(
         SECOND,
         MEASURES,
@@ -167,7 +167,7 @@ def test_drifting_gains_need_no_grid(name):
     for weight, c in drifts(correlations, steps, 3 if name == "two hops that drift together" else 2):
         maps = [at_c(lambda value: hg.hop(1.1 + 0.4 * value, 0.2), row) for row in c]
         parts = oracle.path_moments(
-            sent, [np.asarray(m.moments(1).mean[:-1]) for m in maps], [nominal_spread(m).center for m in maps]
+            sent, [np.asarray(m.moments(1).mean[:-1]) for m in maps], [second_order(m).nominal.center for m in maps]
         )
         total = (
             [weight * p for p in parts]
