@@ -47,7 +47,7 @@ WITH_PEERS = {  # what is no function of its arguments alone
     "keep_compilations",  # changes where JAX keeps programs, of all tests after it
     "show_progress",  # writes to the terminal until its block ends
 }
-TRACED = {"gaussian_innovation", "mixed_innovation"}  # stand inside a filter that has checked what it was given
+TRACED = {"at", "gaussian_innovation", "mixed_innovation"}  # stand inside a filter that has checked what it was given
 RESULTS = {"StatisticsByName"}  # made by the package alone, from what it has checked
 WITH_ARGUMENTS = {getattr(call, "__name__", "") for call, _ in test_fuzz.CALLS + test_fuzz_rooms.CALLS}
 

@@ -5,7 +5,6 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.senders import LossChain
-from heliograph.model.over_time import first
 
 PLANT, SENSOR = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
 LOSSY = hg.erasure(hg.perfect(), 0.8)
@@ -73,7 +72,7 @@ def chain(channel):
     """Losses of a link, of which a node and an event filter say the same."""
     node = network(channel).nodes["a"]
     filter = node.filters["f"]
-    result, known = LossChain.of_channel(node.channel), first(filter.channel)
+    result, known = LossChain.of_channel(node.channel), hg.model.at(filter.channel, 0)
     lost = np.asarray(known.chance) @ ~np.any(np.asarray(known.present), axis=1)
     for part, same in zip(result, (lost, known.transition, filter.initial), strict=True):
         np.testing.assert_allclose(part, same, rtol=1e-12)

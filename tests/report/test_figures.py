@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.report.figures import png, svg
+from heliograph.report import png, svg
 from heliograph_studies.curves import Curve, consistency_over_time, errors_with_bands, label_right, paths
 
 BLUE, VERMILION = "#0072b2", "#d55e00"

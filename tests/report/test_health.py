@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.report.health import examine
+from heliograph.report import examine
 from heliograph.report.held import held_value
 
 PLANT = hg.LinearPlant([[1.0]], 0.01, [0.0], 1.0, states=["x"])

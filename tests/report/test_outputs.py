@@ -7,8 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.report.health import examine
-from heliograph.report.pages.run import run_figures, run_page, run_summary
+from heliograph.report import examine, run_figures, run_page, run_summary
 
 STEPS = 200
 PLANT = hg.LinearPlant([[0.95]], [[1.0]], [0.0], [[10.0]], states=["level"])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.report.health import examine
-from heliograph.report.pages.run import run_summary, shared_text
+from heliograph.report import examine, run_summary
+from heliograph.report.pages.run import shared_text
 
 PLANT = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]])
 SENSOR = hg.LinearSensor([[0.0]], hg.Gaussian([[0.0]], [1.0]))  # y = 1, so that z is the gain

@@ -5,9 +5,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.cli.run import run as command
-from heliograph.report.health import examine
+from heliograph.report import examine, run_summary
 from heliograph.report.outputs import errors_of, round_to
-from heliograph.report.pages.run import errors_table, run_summary
+from heliograph.report.pages.run import errors_table
 
 PLANT = hg.LinearPlant([[1.0, 0.2], [0.0, 0.9]], 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["place", "speed"])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3, outputs=["range"])

@@ -1,6 +1,6 @@
 import numpy as np
 
-from heliograph.report.figures import svg
+from heliograph.report import svg
 from heliograph_studies.curves import Curve, Panel, curves_over, curves_over_time
 
 BLUE, INK = "#0072b2", "#1f2933"

@@ -7,7 +7,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.live.timeline import Timeline
-from heliograph.report.figures import svg
+from heliograph.report import svg
 from heliograph_studies.demo.recording import read_recording
 from heliograph_studies.late_data import Setting, example, figures, plaza
 from heliograph_studies.late_data.compute import Outcome, Trace, through_moving, through_plaza

@@ -12,4 +12,5 @@ from .run import (
 )
 from .summary import (
     open_results as open_results,
+    read_summary as read_summary,
 )

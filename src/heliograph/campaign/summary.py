@@ -65,11 +65,26 @@ class Score:
     finite_runs: int
 
 
-def read_summary(path: Path) -> list[Score]:
-    """Read the scores that `write_summary` wrote."""
-    kinds = get_type_hints(Score)
+def read_summary(path: str | Path) -> list[Score]:
+    """Read the scores of a campaign from its summary.csv: one for each setting, node and filter, as numbers and names.
+
+    Args:
+        path: the file summary.csv in the folder of the results.
+
+    Returns:
+        Scores in the order of the rows, with the columns of the file as attributes.
+
+    Raises:
+        ValueError: no such file, or one without these columns.
+    """
+    path, kinds = file_path("summary", path), get_type_hints(Score)
+    if not path.is_file():
+        raise fail(f"summary {path}", "a file", "none of that name")
     with path.open(newline="", encoding="utf-8") as file:
-        rows = [{name: unquote_cell(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+        table = csv.DictReader(file)
+        if missing := [name for name in kinds if name not in (table.fieldnames or ())]:
+            raise fail(f"summary {path}", f"columns {', '.join(kinds)}", f"none {', '.join(missing)}")
+        rows = [{name: unquote_cell(cell) for name, cell in row.items()} for row in table]
     return [Score(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in rows]
 
 

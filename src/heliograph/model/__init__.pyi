@@ -27,6 +27,7 @@ from .fading import (
     autoregressive_fading as autoregressive_fading,
 )
 from .over_time import (
+    at as at,
     over_time as over_time,
     OverTime as OverTime,
 )

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from heliograph.disk.palette import COLOURS as COLOURS
+from heliograph.numerics.check import check_count, instance
 
 INK, PALE, GRID = "#1f2933", "#bcc4cd", "#e4e7eb"
 BLUE, VERMILION, GREEN, PURPLE, AMBER, MUTED = COLOURS
@@ -62,7 +63,17 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
 
 @matplotlib.rc_context(STYLE)
 def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
-    """Export the figure as PNG."""
+    """Export the figure as PNG.
+
+    Args:
+        figure: a figure of matplotlib.
+        dots_per_inch: how fine it is.
+
+    Raises:
+        ValueError: what is no figure, or no whole number of dots.
+    """
+    instance("figure", figure, Figure, "a figure of matplotlib")
+    dots_per_inch = check_count("dots per inch", dots_per_inch, 1)
     buffer, before = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     figure.dpi = dots_per_inch
@@ -74,7 +85,15 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
 
 @matplotlib.rc_context(STYLE)
 def svg(figure: Figure) -> bytes:
-    """Export the figure as SVG, text as outlines and dense lines as pixels, the same bytes for the same figure."""
+    """Export the figure as SVG, text as outlines and dense lines as pixels, the same bytes for the same figure.
+
+    Args:
+        figure: a figure of matplotlib.
+
+    Raises:
+        ValueError: what is no figure.
+    """
+    instance("figure", figure, Figure, "a figure of matplotlib")
     buffer, before = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     _rasterise_dense(figure)

@@ -11,8 +11,8 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.trigger import Periodic
-from heliograph.numerics.check import InputError
-from heliograph.numerics.types import Float
+from heliograph.numerics.check import InputError, array, fail, instance
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
@@ -184,9 +184,28 @@ def _say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float
 
 
 def examine(
-    network: Network, record: Record, inputs: np.ndarray, advance: Callable[[str], object] = lambda what: None
+    network: Network,
+    record: Record,
+    inputs: ArrayLike | None = None,
+    advance: Callable[[str], object] = lambda what: None,
 ) -> Health:
-    """Diagnose links and filters of a recording that was run through the network."""
+    """Diagnose links and filters of a recording that was run through the network.
+
+    Args:
+        network: the network.
+        record: what `run` of this network returned.
+        inputs: inputs of the plant, as they were given to `run`. Shape (steps, inputs); None for a plant without.
+        advance: called with a few words before each filter is tested.
+
+    Returns:
+        The diagnosis; its `warnings()` are one line for each reason to doubt the network.
+
+    Raises:
+        ValueError: no network, no record of one recording run through it, inputs of another shape.
+    """
+    _check_run(network, record)
+    shape = len(record.time), len(network.inputs)
+    u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
     for listener in listeners(network, record):
@@ -194,12 +213,12 @@ def examine(
         advance(f"testing {node}/{name}")
         white = test = None
         if filter.claim != "none" and filter.received:
-            white = whitened_innovations(z, filter, inputs)
-            outputs += outputs_of(network, listener, record, inputs)
+            white = whitened_innovations(z, filter, u)
+            outputs += outputs_of(network, listener, record, u)
             test = _test_innovations(about_mean(white) if weighs(filter) else white)
         lost = np.any(record.estimates[node][name].claims == "none")
         claim = "none" if lost else filter.claim
-        declared = None if test is None else _judge_declared(filter, z, inputs)
+        declared = None if test is None else _judge_declared(filter, z, u)
         unit = _time_unit(record) if TIME_STEP in network.inputs else "steps"
         filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit))
     others = tuple(belief.words for belief in network.beliefs())
@@ -219,6 +238,18 @@ def _judge_declared(filter: AbstractFilter, z: np.ndarray, inputs: np.ndarray) -
 def _time_unit(record: Record) -> str:
     """Return the unit of the times of a record, in words."""
     return record.units.get("time", "s" if record.time.dtype.kind == "M" else "of the unit of time")
+
+
+def _check_run(network: Network, record: Record) -> None:
+    """Refuse a record of other filters, or of several runs."""
+    instance("network", network, Network, "a Network")
+    instance("record", record, Record, "a Record")
+    filters = {node: set(network.nodes[node].filters) for node in network.names}
+    if any(not names <= set(record.estimates.get(node, ())) for node, names in filters.items()):
+        raise fail("record", "the run of this network", f"one of the nodes {', '.join(record.estimates)}")
+    for estimate in (estimate for named in record.estimates.values() for estimate in named.values()):
+        if estimate.mean.ndim != 2:
+            raise fail("record", "the run over one recording", f"estimates of shape {estimate.mean.shape}")
 
 
 def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:

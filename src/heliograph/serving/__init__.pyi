@@ -19,6 +19,7 @@ from .output import (
     Refused as Refused,
 )
 from .storage.store_protocol import (
+    AwayError as AwayError,
     InMemoryStore as InMemoryStore,
     identity as identity,
 )
@@ -32,8 +33,12 @@ from .brokers.transport import (
     Batch as Batch,
     Transport as Transport,
     Part as Part,
+    TakenOverError as TakenOverError,
     part_of as part_of,
     encode_name as encode_name,
+)
+from .brokers.translator import (
+    Translator as Translator,
 )
 from .brokers.pipe import (
     Pipe as Pipe,

@@ -1,7 +1,7 @@
 import re
 from importlib.resources import files
 
-from heliograph.report.pages.page import (
+from heliograph.report import (
     Code,
     Judged,
     KeyFigure,

@@ -10,10 +10,9 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.report.arrivals import Arrivals
-from heliograph.report.health import FilterHealth, examine
+from heliograph.report import Arrivals, FilterHealth, examine, run_figures, run_page, run_summary
 from heliograph.report.outputs import errors_of, round_to
-from heliograph.report.pages.run import errors_table, run_figures, run_page, run_summary
+from heliograph.report.pages.run import errors_table
 from heliograph.simulation.results.whiteness import MemoryTest
 from tests.losing import Tied
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
+from typing_extensions import TypeAliasType
 
 VERDICTS = {"fails": "fails", "does_not_apply": "does not apply", "holds_vacuously": "true but empty", "holds": "holds"}
 
@@ -123,7 +124,7 @@ class Code:
     kind: str = "code"
 
 
-Block = Text | Points | KeyFigures | Table | Statements | Picture | Choice | Code
+Block = TypeAliasType("Block", Text | Points | KeyFigures | Table | Statements | Picture | Choice | Code)
 
 
 @dataclass(frozen=True)

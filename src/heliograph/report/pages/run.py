@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.numerics.check import instance
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above, stacked_panels
 from heliograph.report.forecasts import draw_forecasts, forecast_tables
@@ -26,8 +27,9 @@ from heliograph.report.innovations import (
     say_not_drawn,
     tested_by_figure,
 )
-from heliograph.report.outputs import errors_of, output_numbers, round_to
+from heliograph.report.outputs import errors_of, round_to
 from heliograph.report.pages.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.run_summary import run_summary
 from heliograph.report.position_map import coordinates_of, map_figure
 from heliograph.report.results import Json, Results, write_into
 from heliograph.simulation.network import Network
@@ -79,7 +81,15 @@ def _make_overview(examined: Mapping[str, Health], network: str, folders: Mappin
 
 
 def run_figures(health: Health) -> dict[str, Figure]:
-    """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links."""
+    """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links.
+
+    Args:
+        health: what `examine` returned.
+
+    Raises:
+        ValueError: what is no diagnosis.
+    """
+    instance("health", health, Health, "what examine returns")
     drawn: dict[str, Figure] = {}
     if coordinates_of(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
@@ -148,7 +158,18 @@ def _draw_deliveries(health: Health) -> Figure:
 
 
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
-    """Return the report; `drawings` holds each figure as SVG, of which those stay that fit into a page."""
+    """Return the report of a run as a page, whose `html()` is one file that needs no other.
+
+    Args:
+        health: what `examine` returned.
+        network: the network's name, for the title.
+        drawings: each figure as SVG, by the names of `run_figures`; those stay that fit into a page.
+
+    Raises:
+        ValueError: what is no diagnosis, or no name.
+    """
+    instance("health", health, Health, "what examine returns")
+    instance("name of the network", network, str, "a text")
     record, doubts, drawings = health.record, health.warnings(), limit_size(drawings, PAGE)
     shares = [link.share for link in health.links if link.due is not None]
     arrived = f"{np.mean(shares):.1%}" if shares else "–"
@@ -348,49 +369,3 @@ def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
         for name, nodes in shared.items()
     ]
     return [Text(said)] if said else []
-
-
-def run_summary(health: Health) -> dict[str, Json]:
-    """Return all numbers of the report, by node and filter, and by node and component."""
-    filters: dict[str, dict[str, Json]] = {}
-    for tested_filter in health.filters:
-        results: dict[str, Json] = {"claim": tested_filter.claim}
-        if tested_filter.test is not None:
-            results |= {
-                "size": tested_filter.test.power,
-                "size_error": tested_filter.test.power_error,
-                "correlation": float(tested_filter.test.correlation[0]),
-                "p_value": tested_filter.test.p_value,
-            }
-        if tested_filter.declared is not None:
-            results["declared"] = [dict(one._asdict()) for one in tested_filter.declared.classes]
-        filters.setdefault(tested_filter.node, {})[tested_filter.filter] = results
-    # What the innovations say of each output.
-    outputs: dict[str, dict[str, dict[str, Json]]] = {}
-    for output in health.outputs:
-        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.judged.output] = output_numbers(output)
-    # Errors, where the truth is known.
-    errors: dict[str, dict[str, Json]] = {}
-    for of_filter in errors_of(health.record):
-        size = None if np.isnan(of_filter.nees) else of_filter.nees
-        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
-        errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}
-    # Links, by node and component.
-    links: dict[str, dict[str, Json]] = {}
-    for link in health.links:
-        share = None if link.due is None else link.share
-        numbers: dict[str, Json] = {"arrived": share, "longest_gap": link.longest_gap}
-        regular: dict[str, Json] = {} if link.period is None else {"period": link.period}
-        if link.pattern is not None:
-            regular |= {"due": link.due_in}
-        links.setdefault(link.node, {})[link.component] = numbers | regular
-    return {
-        "rows": len(health.record.time),
-        "warnings": health.warnings(),
-        "remarks": health.remarks(),
-        "filters": filters,
-        "outputs": outputs,
-        "errors": errors,
-        "links": links,
-        "shared": {name: list(nodes) for name, nodes in health.shared.items()},
-    }

@@ -8,7 +8,7 @@ from heliograph.files.event_columns import YEAR
 from heliograph.files.fields import decode_json, parse_arrival
 from heliograph.files.message_files import log_line, of_log
 from heliograph.files.sources import Reading, Sources, Unread
-from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.serving.brokers.transport import LOG
 from heliograph.serving.message import LONGEST, Message, UnreadMessage
 from heliograph.simulation.network import Network
@@ -39,6 +39,9 @@ class Translator:
     """
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
+        instance("network", network, Network, "a Network")
+        if isinstance(others, str) or not isinstance(others, Collection):
+            raise fail("nodes of other processes", "a list of names", show_value(others))
         self.sources = Sources(table, network, others)
         topics = self.sources.topics
         self._alone = topics[0] if len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/")) else None

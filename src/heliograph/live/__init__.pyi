@@ -1,0 +1,8 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .event import (
+    Event as Event,
+)
+from .plant import (
+    LinkCounts as LinkCounts,
+)

@@ -1,0 +1,76 @@
+"""All numbers of the report of a run, as they stand in its summary.json."""
+
+import numpy as np
+
+from heliograph.numerics.check import instance
+from heliograph.report.arrivals import Arrivals
+from heliograph.report.health import FilterHealth, Health
+from heliograph.report.outputs import errors_of, output_numbers
+from heliograph.report.results import Json
+from heliograph.simulation.results.record import Record
+
+
+def run_summary(health: Health) -> dict[str, Json]:
+    """Return all numbers of the report, by node and filter, and by node and component.
+
+    Args:
+        health: what `examine` returned.
+
+    Raises:
+        ValueError: what is no diagnosis.
+    """
+    instance("health", health, Health, "what examine returns")
+    filters: dict[str, dict[str, Json]] = {}
+    for tested in health.filters:
+        filters.setdefault(tested.node, {})[tested.filter] = _filter_numbers(tested)
+    outputs: dict[str, dict[str, dict[str, Json]]] = {}
+    for output in health.outputs:
+        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.judged.output] = output_numbers(output)
+    links: dict[str, dict[str, Json]] = {}
+    for link in health.links:
+        links.setdefault(link.node, {})[link.component] = _link_numbers(link)
+    return {
+        "rows": len(health.record.time),
+        "warnings": health.warnings(),
+        "remarks": health.remarks(),
+        "filters": filters,
+        "outputs": outputs,
+        "errors": _error_numbers(health.record),
+        "links": links,
+        "shared": {name: list(nodes) for name, nodes in health.shared.items()},
+    }
+
+
+def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
+    """What a filter claims, and what its innovations say of the claim and of the variances that messages declare."""
+    numbers: dict[str, Json] = {"claim": tested.claim}
+    if tested.test is not None:
+        numbers |= {
+            "size": tested.test.power,
+            "size_error": tested.test.power_error,
+            "correlation": float(tested.test.correlation[0]),
+            "p_value": tested.test.p_value,
+        }
+    if tested.declared is not None:
+        numbers["declared"] = [dict(one._asdict()) for one in tested.declared.classes]
+    return numbers
+
+
+def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
+    """Errors by node and filter, where the truth is known."""
+    errors: dict[str, dict[str, Json]] = {}
+    for of_filter in errors_of(record):
+        size = None if np.isnan(of_filter.nees) else of_filter.nees
+        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
+        errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}
+    return errors
+
+
+def _link_numbers(link: Arrivals) -> dict[str, Json]:
+    """How often a component arrived, its longest gap, and when it is due."""
+    numbers: dict[str, Json] = {"arrived": None if link.due is None else link.share, "longest_gap": link.longest_gap}
+    if link.period is not None:
+        numbers["period"] = link.period
+    if link.pattern is not None:
+        numbers["due"] = link.due_in
+    return numbers
