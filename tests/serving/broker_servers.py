@@ -13,9 +13,9 @@ import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.serving.brokers.nats import Nats
 from heliograph.serving.brokers.transport import Part, Transport, encode_name
 from heliograph.serving.brokers.url import Address, parse_address
+from heliograph.serving.running import make_transport
 from heliograph_studies.live.server import Server
 
 KINDS = [pytest.param(kind, marks=pytest.mark.real(part)) for kind, part in (("nats", "NATS"), ("mqtt", "MQTT"))]
@@ -78,8 +78,8 @@ def numbered(start: int, stop: int) -> list[bytes]:
     return [str(i).encode() for i in range(start, stop)]
 
 
-async def made(where: Address, part: Part = Part()) -> Nats:  # noqa: B008
+async def made(where: Address, part: Part = Part()) -> Transport:  # noqa: B008
     """A reader that has made its stream."""
-    reader = Nats(where, part)
+    reader = make_transport(where, part)
     await asyncio.wait_for(reader._open_reader(), 20)
     return reader

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import socket
 import subprocess
 import sys
 import threading
@@ -11,7 +13,7 @@ import pytest
 
 from heliograph.serving.patience import WaitingService, retry_while_away
 from heliograph.serving.service import Service
-from heliograph.serving.storage.owner import name_of_process, own_store
+from heliograph.serving.storage.owner import own_store
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import AwayError, identity
 from tests.postgres import Postgres
@@ -53,7 +55,7 @@ def test_a_file_has_one_owner_who_is_named(tmp_path):
     location = str(tmp_path / "a.db")
     held_elsewhere(location)
     with own_store(location, ""):
-        assert name_of_process() in (tmp_path / "a.db.lock").read_text()
+        assert f"{socket.gethostname()} {os.getpid()}" in (tmp_path / "a.db.lock").read_text()
 
 
 class Away:

@@ -16,13 +16,13 @@ from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import LinkCounts
 from heliograph.serving.observation.page import Tallies
 from heliograph.serving.observation.watch import watch_of
-from heliograph.serving.output import AnyOutput
+from heliograph.serving.output import Estimates, Refused
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from tests.losing import Losing
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
-READER = TypeAdapter(AnyOutput)
+READER = TypeAdapter(Estimates | Refused)
 
 
 def served(network, sent, size, **options):

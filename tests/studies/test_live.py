@@ -13,8 +13,7 @@ pytest.importorskip("sqlalchemy")
 import nats
 from nats.js.errors import NoStreamResponseError
 
-from heliograph.serving.brokers.nats import Nats
-from heliograph.serving.brokers.url import parse_address
+from heliograph.serving import make_transport, parse_address
 from heliograph_studies.live.compute import differences
 from heliograph_studies.live.killed import TOPIC, _finals_read, _reads, _send, killed, left_alone
 from heliograph_studies.live.mower import read_drive
@@ -50,7 +49,7 @@ def test_nothing_is_sent_before_there_is_a_stream_to_send_to(tmp_path: Path):
     """A service makes the stream of what it tells before that of what it reads: a message in between would be lost."""
 
     async def work(server: Server) -> None:
-        transport = Nats(parse_address(f"nats://127.0.0.1:{server.nats}/{TOPIC}", {}))
+        transport = make_transport(parse_address(f"nats://127.0.0.1:{server.nats}/{TOPIC}", {}))
         client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
         await transport._open()
         assert await _finals_read(client, 0) and not await _reads(client)

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 
@@ -13,11 +13,10 @@ pytest.importorskip("paho")
 import nats
 import nats.js.errors
 
-from heliograph.serving.brokers.mqtt import Mqtt
-from heliograph.serving.brokers.nats import Nats
-from heliograph.serving.brokers.transport import Part, TakenOverError, Transport, encode_name, part_of
-from heliograph.serving.brokers.url import Address, parse_address
+from heliograph.serving.brokers.transport import Part, TakenOverError, encode_name, part_of
+from heliograph.serving.brokers.url import parse_address
 from heliograph.serving.output import Output
+from heliograph.serving.running import make_transport
 from heliograph_studies.live.server import Server
 from tests.serving.broker_servers import KINDS, at, made, numbered, published, received, running, sent, silent
 
@@ -78,7 +77,7 @@ def test_one_cancellation_ends_a_wait_whatever_the_client_makes_of_it(error, mon
     """Else it would stand still for as long as nothing comes."""
 
     async def work() -> None:
-        transport = Nats(parse_address("nats://127.0.0.1:1/away", {}))
+        transport = make_transport(parse_address("nats://127.0.0.1:1/away", {}))
         deaf = Deaf(error)
         monkeypatch.setattr(transport, "_reader", deaf)
         monkeypatch.setattr(transport, "_require_connection", lambda: True)
@@ -105,7 +104,7 @@ def test_what_was_not_acknowledged_comes_again_in_order(server: Server):
         done = await received(first, 1)
         held = await received(first, 1, acknowledge=False)
         assert done + held == numbered(0, len(done + held)) and len(done) < 1500
-        second = Nats(where)  # as after kill -9: the first never says that it went
+        second = make_transport(where)  # as after kill -9: the first never says that it went
         await sent(where, numbered(1500, 1600))
         assert await received(second, 1600 - len(done)) == numbered(len(done), 1600)
         assert await silent(second)
@@ -154,7 +153,7 @@ def test_the_server_cuts_plants_into_parts_as_we_do(server: Server):
         for i, reader in enumerate(readers):
             mine = [plant for plant in plants if part_of(plant, parts) == i]
             assert mine and [body.decode() for body in await received(reader, len(mine))] == mine
-        other = Nats(where, Part(0, 4))
+        other = make_transport(where, Part(0, 4))
         with pytest.raises(ValueError, match="one of 4 parts"):
             await other.receive()
         await asyncio.gather(*[reader.close() for reader in [*readers, other]])
@@ -166,7 +165,7 @@ def test_the_server_cuts_plants_into_parts_as_we_do(server: Server):
 def test_a_session_keeps_what_was_not_acknowledged(server: Server):
     async def work() -> None:
         where = at(server, "mqtt", "session")
-        first = Mqtt(where)
+        first = make_transport(where)
         await asyncio.sleep(0.3)  # the session is there once it was connected
         await asyncio.to_thread(published, where, numbered(0, 100))
         assert await received(first, 100) == numbered(0, 100)
@@ -174,7 +173,7 @@ def test_a_session_keeps_what_was_not_acknowledged(server: Server):
         assert await received(first, 100, acknowledge=False) == numbered(100, 200)
         await first.close()
         await asyncio.to_thread(published, where, numbered(200, 300))
-        second = Mqtt(where)
+        second = make_transport(where)
         result = set[
             bytes
         ]()  # this server sends what is new first, the rest after a second, and again on a busy machine
@@ -190,7 +189,7 @@ def test_a_session_keeps_what_was_not_acknowledged(server: Server):
 def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
     async def work() -> None:
         where = at(server, "mqtt", "parted")
-        readers = [Mqtt(where, Part(i, 2)) for i in range(2)]
+        readers = [make_transport(where, Part(i, 2)) for i in range(2)]
         await asyncio.sleep(0.5)
         for plant in ("a", "b", "c", "d"):
             below = f"{part_of(plant, 2)}/{encode_name(plant)}"
@@ -207,7 +206,6 @@ def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho leaves sockets to the collector
 def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatch, caplog, impatient):
-    make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
     certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
     what = ["-subj", "/CN=here", "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", key, "-out", certificate]
     subprocess.run(["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", *what], check=True, capture_output=True)
@@ -223,7 +221,7 @@ def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatc
 
     async def report(url: str, environment: dict[str, str]) -> bool:
         """Whether the broker took it, or did not let us in twice."""
-        transport, before = make(parse_address(url, environment)), caplog.text.count("trying again")
+        transport, before = make_transport(parse_address(url, environment)), caplog.text.count("trying again")
         work = asyncio.create_task(transport.publish(outputs))
         async with asyncio.timeout(20):
             while not work.done() and caplog.text.count("trying again") < before + 2:

@@ -7,9 +7,7 @@ import pytest
 
 pytest.importorskip("paho")
 
-from heliograph.serving.brokers.mqtt import Mqtt
-from heliograph.serving.brokers.url import parse_address
-from heliograph.serving.output import Output
+from heliograph.serving import Output, Transport, make_transport, parse_address
 
 CONNECT, PUBLISH, DISCONNECT = 1, 3, 14  # kinds of packets of MQTT 3.1.1
 OUTPUTS = [Output(None, "", "provisional", b"now"), *(Output(i, "", "final", str(i).encode()) for i in range(3))]
@@ -47,13 +45,13 @@ class Reluctant:
         self.writer.write(bytes([0x40, 2]) + self.numbers.pop(0))
 
 
-def serve(work: Callable[[Reluctant, Mqtt], Coroutine[None, None, None]]) -> None:
+def serve(work: Callable[[Reluctant, Transport], Coroutine[None, None, None]]) -> None:
     """Run a test beside a server and a transport that is connected to it."""
 
     async def run() -> None:
         broker = Reluctant()
         server = await asyncio.start_server(broker.serve, "127.0.0.1", 0)
-        transport = Mqtt(parse_address(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}", {}))
+        transport = make_transport(parse_address(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}", {}))
         async with asyncio.timeout(30):
             await until(transport._writer.client.is_connected)
             await work(broker, transport)
@@ -69,7 +67,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 def test_publish_returns_when_the_server_has_acknowledged_every_output_with_a_number():
-    async def work(broker: Reluctant, transport: Mqtt) -> None:
+    async def work(broker: Reluctant, transport: Transport) -> None:
         publishing = asyncio.create_task(transport.publish(OUTPUTS))
         await until(lambda: len(broker.bodies) == len(OUTPUTS))
         assert broker.bodies == [output.body for output in OUTPUTS]
@@ -83,7 +81,7 @@ def test_publish_returns_when_the_server_has_acknowledged_every_output_with_a_nu
 
 
 def test_what_was_not_acknowledged_is_published_again_after_the_connection_ended():
-    async def work(broker: Reluctant, transport: Mqtt) -> None:
+    async def work(broker: Reluctant, transport: Transport) -> None:
         publishing = asyncio.create_task(transport.publish(OUTPUTS))
         await until(lambda: len(broker.bodies) == len(OUTPUTS))
         broker.acknowledge()
