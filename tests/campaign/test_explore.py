@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from heliograph import cli
-from heliograph.campaign import explore, open_results
+from heliograph.campaign import explore, load_campaign, open_results
 from heliograph.campaign.explore import Detail, details
 from heliograph.campaign.run import run_campaign
-from heliograph.campaign.store import restore_campaign
 from heliograph.campaign.summary import Score, read_summary
 from tests.campaign.example import CAMPAIGN, NETWORK, write
 
@@ -22,7 +21,7 @@ HOSTILE = "</script><img src=x onerror=alert(1)> $$x$$"
 
 @pytest.fixture(scope="module")
 def campaign(finished):
-    return restore_campaign(finished / "results.zarr")
+    return load_campaign(finished.parent / "campaign.toml")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ import pytest
 from heliograph import cli
 from heliograph.campaign import engines
 from heliograph.campaign.engines import run_in_processes
-from heliograph.campaign.plan import versions
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.work import Job
 from heliograph.disk.whole_file import only_here, try_lock
@@ -184,7 +183,7 @@ def test_flags_that_decide_about_bytes_are_versions(tmp_path, finished, monkeypa
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
     with pytest.raises(ValueError, match="got XLA_FLAGS --xla_cpu_enable_fast_math=true \\(was "):
         run_campaign(write(tmp_path), finished, workers=0)
-    assert {"XLA_FLAGS", "device", "jax_default_matmul_precision", "jax"} <= versions().keys()
+    assert {"XLA_FLAGS", "device", "jax_default_matmul_precision", "jax"} <= write(tmp_path).versions.keys()
 
 
 @pytest.mark.parametrize("address", ["nonsense", "tcp://127.0.0.1:1", "", "8786", "http://127.0.0.1:1"])

@@ -1,10 +1,11 @@
 """`heliograph export`: what it writes and says, and what it refuses."""
 
+import shutil
+
 import pytest
 
 import heliograph as h
 from heliograph import cli
-from heliograph.export import c_files
 from heliograph.files.network_file import load_network
 from tests.cli.example import NETWORK, contents, refused
 from tests.export.device import needs_compiler
@@ -38,7 +39,7 @@ def test_it_writes_what_the_library_writes_and_says_what_it_costs(folder, capsys
 
 
 def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
-    monkeypatch.setattr(c_files.shutil, "which", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     assert cli.main(arguments("--precision", "float")) == 0
     said = capsys.readouterr().out
     assert "remote/aware (nominal), float precision" in said

@@ -1,5 +1,6 @@
 """A filter as C: the numbers of Python, what it refuses, and what the files hold."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.disk import whole_file
 from tests.export.device import COMPILER, FLAGS, Device, needs_compiler
 from tests.follow import apart, follow_known
 
@@ -296,7 +296,7 @@ def test_one_line_and_nothing_written(make, path, precision, words, tmp_path):
 
 def test_both_files_or_none(tmp_path, monkeypatch):
     """The second file cannot take its place: the first is what it was before."""
-    item, replace = hg.linear_filter(LINE, RANGE, FADING), whole_file.replace
+    item, replace = hg.linear_filter(LINE, RANGE, FADING), os.replace
     (tmp_path / "a.h").write_text("before")
 
     def full(partial, path):
@@ -304,7 +304,7 @@ def test_both_files_or_none(tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
         replace(partial, path)
 
-    monkeypatch.setattr(whole_file, "replace", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(OSError, match=r"No space left on device: '.*a\.c'"):
         hg.export_c(item, tmp_path / "a.c")
     assert [p.name for p in tmp_path.iterdir()] == ["a.h"] and (tmp_path / "a.h").read_text() == "before"

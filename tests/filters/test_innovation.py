@@ -7,14 +7,15 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph.filters.innovation import gaussian_innovation, posterior_weights
-from heliograph.numerics.density import log_density
 
 ROUNDING = 1e-12
 
 
-def density(value, covariance, size=1.0):
+def density(value, covariance):
     with jax.enable_x64(True):
-        return float(log_density(np.asarray(value), np.asarray(covariance), np.full(len(value), size)))
+        return float(
+            gaussian_innovation(np.asarray(value), np.zeros(len(value)), np.asarray(covariance)).log_likelihood
+        )
 
 
 @pytest.mark.parametrize("m", [1, 2, 5, 12])

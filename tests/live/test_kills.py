@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.disk.whole_file import whole_file
 
 STEPS, KILLS, BETWEEN = 120, 2, 40
 
@@ -30,8 +29,8 @@ def go_on(path: Path) -> None:
     stream = hg.Stream.restore(stream_filter(), path.read_bytes()) if path.exists() else hg.Stream(stream_filter())
     for z in measurements()[stream.steps :]:
         stream.push(z)
-        with whole_file(path) as partial:
-            partial.write_bytes(stream.save())
+        path.with_suffix(".new").write_bytes(stream.save())
+        path.with_suffix(".new").replace(path)
         print(stream.steps, flush=True)
 
 

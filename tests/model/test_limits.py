@@ -5,19 +5,24 @@ import pytest
 from scipy.stats import norm
 
 import heliograph as hg
-from heliograph.model.limits import Limits
 
 PLANT, SENSOR = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0], [1.0]], np.eye(2), ["near", "far"])
 
 
+def limits_of(count, limits=None, invalid=()):
+    """Limits of a node of so many numbers."""
+    sensor = hg.LinearSensor(np.ones((count, 1)), np.eye(count))
+    return hg.Node(sensor, hg.perfect(count), {}, limits=limits, invalid=invalid).limits
+
+
 def test_what_is_beyond_does_not_count():
-    limits = Limits(2, [(0, 10), (None, 5)], [-999, -1])
+    limits = limits_of(2, [(0, 10), (None, 5)], [-999, -1])
     z = np.array([[0.0, -50.0], [10.1, 5.0], [-999, np.nan], [np.nan, -1.0], [3.0, 5.1]])
     expected = [[False, False], [True, False], [True, False], [False, True], [False, True]]
     np.testing.assert_array_equal(limits.outside(z), expected)
     assert limits.why(z[1], ("near", "far")) == "near 10.1 is outside 0 to 10"
     assert limits.why(np.array([-999, 6.0]), ("near", "far")) == "near -999 is a code, far 6 is outside -inf to 5"
-    np.testing.assert_array_equal(Limits(2, (-1, 1)).outside(np.array([1.0, 1.5])), [False, True])
+    np.testing.assert_array_equal(limits_of(2, (-1, 1)).outside(np.array([1.0, 1.5])), [False, True])
 
 
 @pytest.mark.parametrize(
@@ -58,7 +63,7 @@ def test_honest_values_beyond_limits_cost_the_claim_what_is_said(c):
     x = rng.normal(0, np.sqrt(p), 400_000)
     s, k = p + noise, p / (p + noise)
     z = x + rng.normal(0, np.sqrt(noise), x.size)
-    outside = Limits(1, (-c * np.sqrt(s), c * np.sqrt(s))).outside(z[:, None])[:, 0]
+    outside = limits_of(1, (-c * np.sqrt(s), c * np.sqrt(s))).outside(z[:, None])[:, 0]
     squares = np.where(outside, x, x - k * z) ** 2
     claimed = np.where(outside, p, p - k * s * k).mean()
     excess = 2 * c * norm.pdf(c) * k * s * k
@@ -81,5 +86,5 @@ def test_honest_values_beyond_limits_cost_the_claim_what_is_said(c):
     ],
 )
 def test_a_code_is_equal_in_the_type_in_which_it_came(value, code, same):
-    assert Limits(1, None, code).outside(np.array([value])).tolist() == [same]
-    assert ("is a code" in Limits(1, None, code).why(np.array([value]), ["z"])) == same
+    assert limits_of(1, None, code).outside(np.array([value])).tolist() == [same]
+    assert ("is a code" in limits_of(1, None, code).why(np.array([value]), ["z"])) == same

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.model.sensor import check_sensor
 
 
 def test_a_linear_sensor_shows_its_shape_without_a_trace(monkeypatch):
     """Of a thousand nodes each would be traced by itself."""
+    nodes = {"a": hg.Node(hg.LinearSensor(np.ones((3, 2)), 1.0), hg.perfect(3), {})}
+    plants = {n: hg.LinearPlant(np.eye(n), 0.1, np.zeros(n), 1.0) for n in (2, 4)}
     monkeypatch.setattr(jax, "eval_shape", None)
-    check_sensor(hg.LinearSensor(np.ones((3, 2)), 1.0), 2)
+    hg.Network(plants[2], nodes)
     with pytest.raises(ValueError, match=r"measure a state of length 4.* a matrix of shape \(3, 2\)"):
-        check_sensor(hg.LinearSensor(np.ones((3, 2)), 1.0), 4)
+        hg.Network(plants[4], nodes)
 
 
 @pytest.mark.parametrize(
@@ -26,7 +27,8 @@ def test_a_linear_sensor_shows_its_shape_without_a_trace(monkeypatch):
 )
 def test_a_function_must_measure_what_its_noise_disturbs(measure, message):
     with pytest.raises(ValueError, match=message):
-        check_sensor(hg.Sensor(measure, np.eye(2)), 2)
+        nodes = {"a": hg.Node(hg.Sensor(measure, np.eye(2)), hg.perfect(2), {})}
+        hg.Network(hg.LinearPlant(np.eye(2), 0.1, np.zeros(2), 1.0), nodes)
 
 
 @pytest.mark.parametrize(("make", "thing", "got"), [

@@ -4,7 +4,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.moments.monomials import exponents
-from heliograph.random_affine.noise import as_noise, noise_vector
+from heliograph.random_affine.noise import noise_vector
 
 COVARIANCE = np.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.8]])
 
@@ -44,7 +44,7 @@ def test_a_singular_covariance_is_sampled_on_its_subspace():
 )
 def test_what_is_no_covariance_is_refused(value, message):
     with pytest.raises(ValueError, match=message):
-        as_noise("noise", value, 2)
+        hg.LinearSensor(np.eye(2), value)
 
 
 @pytest.mark.parametrize("covariance", [[[0.1, 0.3], [0.3, 0.9]], [[1.0, 1e-9], [1e-9, 1e-18]]])

@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from pydantic_core import to_json
 
 import heliograph as hg
 from heliograph.live.network_program import NetworkProgram
-from heliograph.serving.estimate_writer import HEAD, EstimateWriter, line
+from heliograph.serving.estimate_writer import EstimateWriter
 from tests.losing import Losing
 from tests.serving.worlds import fleet, stepping
 
@@ -43,7 +44,7 @@ def test_a_line_from_the_template_is_that_of_its_row(program):
     rows = [(f'p{i}, "%b"', float(i) if i % 3 else "2026-11-26T00:00:00+00:00") for i in range(300)]
     written = writer.lines(b"final", rows, outputs)
     for (plant, moment), row, body in zip(rows, outputs.tolist(), written, strict=True):
-        head = HEAD % (b"final", line(plant), line(moment))
-        assert body == head + line(writer._write_estimates(row)) + b"}"
+        head = b'{"kind":"final","plant":%b,"time":%b,"estimates":' % (to_json(plant), to_json(moment))
+        assert body == head + to_json(writer._write_estimates(row), inf_nan_mode="null") + b"}"
         assert json.loads(body)["plant"] == plant
     assert writer.lines(b"final", [], outputs[:0]) == []

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.report import examine, run_summary
-from heliograph.report.pages.run import shared_text
+from heliograph.report import examine, run_page, run_summary
 
 PLANT = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]])
 SENSOR = hg.LinearSensor([[0.0]], hg.Gaussian([[0.0]], [1.0]))  # y = 1, so that z is the gain
@@ -74,10 +73,13 @@ def test_a_central_filter_believes_what_the_world_does():
 def test_reports_say_what_is_shared():
     road = hg.shared(LORA, "road")
     item = network(a=road, b=road)
-    health = examine(item, hg.run(item, {"a": np.ones(20), "b": np.ones(20)}), np.zeros((20, 0)))
-    assert run_summary(health)["shared"] == {"road": ["a", "b"]}
-    assert shared_text(health.shared)[0].paragraphs == ["a, b share road: their links are in one state at each step."]
-    assert shared_text({}) == []
+    health, alone = (
+        examine(one, hg.run(one, {"a": np.ones(20), "b": np.ones(20)})) for one in (item, network(a=LORA, b=LORA))
+    )
+    assert run_summary(health)["shared"] == {"road": ["a", "b"]} and run_summary(alone)["shared"] == {}
+    said = "their links are in one state at each step."
+    assert f"a, b share road: {said}" in run_page(health, "roads", {}).html()
+    assert said not in run_page(alone, "roads", {}).html()
 
 
 def test_nodes_of_one_channel_share_it():

@@ -35,6 +35,9 @@ from .recording import (
     write_estimates as write_estimates,
     write_recording as write_recording,
 )
+from .sources import (
+    Reading as Reading,
+)
 from .table import (
     read_table as read_table,
     write_table as write_table,

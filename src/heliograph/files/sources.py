@@ -14,6 +14,7 @@ from heliograph.files.senders import SeveralSenders
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
@@ -22,6 +23,7 @@ LISTED = 8  # topics in one line
 COPY = 10 * SECOND  # a message that comes again so soon, with its count and values, is a copy
 
 
+@readable
 class Reading(NamedTuple):
     """Content of one message for one node.
 

@@ -5,13 +5,21 @@ import pytest
 from scipy.stats import norm
 
 import heliograph as hg
-from heliograph.learning.likelihood.predictive_density import StackDensities, law_nodes, score_signals
+from heliograph.learning.likelihood.predictive_density import law_nodes
 from heliograph.random_affine import AbstractLaw
 
 SIGNAL = (np.array([[2.0]]), np.array([[[0.5]]]))
 PAIR = (np.array([[2.0, -1.0]]), np.array([[[0.5, 0.2], [0.2, 0.4]]]))
 PLANT = hg.Plant(lambda x, u: 3 + 0.9 * (x - 3), 0.2, [3.0], 1.0)
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
+
+
+def predicted(signal, channel, z):
+    """Density of what comes of a signal with this mean and covariance, at the first step."""
+    (mean,), (covariance,) = signal
+    n = len(mean)
+    plant = hg.LinearPlant(np.eye(n), np.zeros((n, n)), mean, covariance)
+    return hg.learning.predictive(plant, hg.LinearSensor(np.eye(n), np.zeros((n, n))), channel, z, nodes=64)
 
 
 class Uniform(AbstractLaw):
@@ -44,7 +52,7 @@ def test_nodes_have_the_laws_moments(law, tolerance):
 
 def test_density_and_pit_of_one_hop_are_the_mixtures():
     channel, z = hg.hop(hg.Discrete([0.5, 1.0], [0.25, 0.75]), 0.3), np.array([[1.4]])
-    result = score_signals((*SIGNAL, z), StackDensities.of(channel, 64))
+    result = predicted(SIGNAL, channel, z)
     parts = [(0.25, norm(1.0, np.sqrt(0.25 * 0.5 + 0.3))), (0.75, norm(2.0, np.sqrt(0.5 + 0.3)))]
     assert result.log_likelihood[0] == pytest.approx(np.log(sum(w * item.pdf(1.4) for w, item in parts)), rel=1e-13)
     assert result.pit[0, 0] == pytest.approx(sum(w * item.cdf(1.4) for w, item in parts), rel=1e-13)
@@ -53,7 +61,7 @@ def test_density_and_pit_of_one_hop_are_the_mixtures():
 def test_a_common_gain_ties_its_outputs():
     """Two outputs of one gain: the joint density by integrating over the gain, pit of the second given the first."""
     channel, z = hg.hop(hg.Discrete([0.5, 1.0], [0.4, 0.6]), 0.3 * np.eye(2)), np.array([[1.4, -0.2]])
-    result = score_signals((*PAIR, z), StackDensities.of(channel, 64))
+    result = predicted(PAIR, channel, z)
     total, first, below = 0.0, 0.0, 0.0
     for w, g in ((0.4, 0.5), (0.6, 1.0)):
         mean, cov = g * PAIR[0][0], g**2 * PAIR[1][0] + 0.3 * np.eye(2)
@@ -74,7 +82,7 @@ def test_parts_of_a_stack_are_received_one_after_another():
         z[0, missing] = np.nan
         local, e = cov[np.ix_(there, there)], error[there]
         expected = -(e @ np.linalg.solve(local, e) + np.linalg.slogdet(2 * np.pi * local)[1]) / 2 if len(there) else 0.0
-        result = score_signals((*PAIR, z), StackDensities.of(channel, 64))
+        result = predicted(PAIR, channel, z)
         assert result.log_likelihood[0] == pytest.approx(expected, rel=1e-13)
         assert np.isnan(result.pit[0]).tolist() == [i in missing for i in (0, 1)]
 

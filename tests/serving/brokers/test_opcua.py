@@ -9,11 +9,11 @@ pytest.importorskip("asyncua")
 from asyncua import Server, ua
 
 import heliograph as hg
-from heliograph.files.inspection import Topic, suggestion
+from heliograph.files.inspection import suggestion
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.brokers.listening import listen
-from heliograph.serving.brokers.opcua import Reporting, read_reporting, reporting_of
+from heliograph.serving.brokers.opcua import Reporting, read_reporting
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.url import parse_address
 from heliograph.serving.running import make_transport
@@ -83,7 +83,8 @@ def test_what_the_server_states_is_read_and_subscribed():
         transport = make_transport(where, translator=Translator(sources, network()))
         try:
             variable = server.get_node(VARIABLE)
-            assert await reporting_of(variable) == Reporting(0.5, 0.1)
+            stated = await asyncio.to_thread(read_reporting, f"opc.tcp://127.0.0.1:{port}/plant", [VARIABLE])
+            assert stated == {VARIABLE: Reporting(0.5, 0.1)}
             values = []
             for value in (None, 20.3, 21.0):
                 if value is not None:
@@ -183,7 +184,7 @@ def test_inspect_lists_the_variables_of_a_server_and_suggests_sources():
             await asyncio.sleep(0.2)
             await server.get_node(VARIABLE).write_value(float(value))
 
-    async def work() -> dict[str, Topic]:
+    async def work() -> dict:
         port = free_port()
         server = await served(port)
         changes = asyncio.create_task(changed(server))
