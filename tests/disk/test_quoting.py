@@ -1,12 +1,14 @@
 """Names from outside, where they land."""
 
 import matplotlib
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_cell, quote_for_figure, unquote_cell, visible
+import heliograph as hg
+from heliograph.disk.quoting import quote_for_cell, unquote_cell, visible
 
 matplotlib.use("agg")
 
@@ -27,7 +29,9 @@ def test_what_is_visible_moves_no_cursor(text):
 def test_a_figure_draws_any_name_and_shows_it_in_the_legend(name):
     figure = Figure()
     axes = figure.subplots()
-    axes.plot([0, 1], label=quote_for_figure(name))
-    axes.set_title(quote_for_figure(name))
-    assert len(axes.legend().get_texts()) == 1
+    estimate = hg.model.Estimate(np.zeros((2, 1)), np.ones((2, 1, 1)), "exact")
+    hg.Record(np.arange(2.0), (name,), None, {}, {"node": {name: estimate}}).plot(
+        axes=axes
+    )  # the state's name is at the axis
+    assert len(axes.get_legend().get_texts()) == 1 and axes.get_ylabel()
     figure.canvas.draw()

@@ -12,6 +12,9 @@ from .event_table import (
 from .fitted import (
     load_fitted as load_fitted,
 )
+from .forecasts import (
+    write_forecast as write_forecast,
+)
 from .json_field import (
     Count as Count,
     Field as Field,

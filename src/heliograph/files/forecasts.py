@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.files.recording import estimate_columns, make_header
 from heliograph.files.table import write_table
 from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.types import unit_of
 from heliograph.simulation.results.record import Record
 
@@ -45,7 +46,10 @@ def forecast_columns(record: Record, forecasts: ByFilter) -> dict[str, np.ndarra
 
 
 def write_forecast(record: Record, forecasts: ByFilter, path: str | Path) -> None:
-    """Write `forecast_columns` to a CSV or Parquet file, as a whole or not at all.
+    """Write the estimates of a run, and forecasts in rows below them, to a CSV or Parquet file, whole or not at all.
+
+    Rows of forecasts have 1 in the column `forecast`; what each sensor would measure stands in forecast.OUTPUT and
+    forecast.OUTPUT.sd.
 
     Args:
         record: the result of `run`.
@@ -53,9 +57,14 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path) -> Non
         path: the file, ending in .csv or .parquet.
 
     Raises:
-        ValueError: another format, or a folder that cannot be written.
+        ValueError: no record, no forecast, another format, or a folder that cannot be written.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
+    instance("record", record, Record, "a Record")
+    if not isinstance(forecasts, Mapping) or not all(isinstance(part, Mapping) and part for part in forecasts.values()):
+        raise fail("forecasts", "those of `forecast`, by node and filter", show_value(forecasts))
+    if not forecasts:
+        raise fail("forecasts", "one at least", "none")
     write_table(forecast_columns(record, forecasts), path)
 
 

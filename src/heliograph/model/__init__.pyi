@@ -29,6 +29,7 @@ from .fading import (
 from .over_time import (
     at as at,
     over_time as over_time,
+    steps_covered as steps_covered,
     OverTime as OverTime,
 )
 from .enlarged import (

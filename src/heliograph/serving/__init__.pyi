@@ -57,6 +57,7 @@ from .brokers.contract import (
 )
 from .brokers.replay import (
     Link as Link,
+    delay_as_traced as delay_as_traced,
     encode_messages as encode_messages,
     recorded as recorded,
     simulate_link as simulate_link,

@@ -9,7 +9,6 @@ from scipy.stats import binomtest, chi2_contingency
 import heliograph as hg
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses, Runs
 from heliograph.learning.losses.loss_law import IndependentLosses, MarkovLosses
-from heliograph.learning.losses.losses import loss_memory
 
 NAN = np.nan
 LOGITS = logit([0.1, 0.6, 0.05, 0.2])  # loss when good, when bad, fail, recover
@@ -124,7 +123,7 @@ def test_the_running_rate_is_a_recursion(learned, bursts):
 
 
 def test_tests_of_memory_are_the_known_ones(bursts):
-    result = loss_memory(bursts)
+    result = hg.learning.LossMemory.of(bursts)
     table = MarkovLosses.fit(bursts).counts
     expected = chi2_contingency(table, correction=False, lambda_="log-likelihood")
     assert result.likelihood_ratio == pytest.approx(expected.statistic, rel=1e-10)
@@ -134,13 +133,13 @@ def test_tests_of_memory_are_the_known_ones(bursts):
 def test_tests_of_memory_find_none_where_there_is_none():
     """2,000 recordings of 300 independent losses: a test at 5 % rejects 5 %, to three standard errors."""
     drawn = (np.random.default_rng(1).random((2000, 300)) < 0.3).astype(float)
-    results = [loss_memory(item) for item in drawn]
+    results = [hg.learning.LossMemory.of(item) for item in drawn]
     for p in ("likelihood_p", "runs_p"):
         assert np.mean([getattr(item, p) < 0.05 for item in results]) == pytest.approx(0.05, abs=0.0146)
 
 
 def test_nothing_that_varies_is_no_evidence():
-    result = loss_memory(np.zeros(20))
+    result = hg.learning.LossMemory.of(np.zeros(20))
     assert (result.likelihood_p, result.runs_p) == (1.0, 1.0)
 
 

@@ -55,6 +55,32 @@ class LossMemory(NamedTuple):
         """True if the likelihood ratio rejects independence at 1 %."""
         return self.likelihood_p < 0.01
 
+    @classmethod
+    def of(cls, fates: object) -> "LossMemory":
+        """Test losses that the receiver knows of for memory; where nothing varies there is no evidence, p = 1.
+
+        Args:
+            fates: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a list of stretches.
+
+        Raises:
+            ValueError: what is no fates (see `heliograph.learning`).
+        Source: Anderson and Goodman (1957); Wald and Wolfowitz (1940), given the losses of each unbroken stretch.
+        """
+        counts = MarkovLosses.fit(fates, intervals=False).counts
+        both = counts.sum(axis=0)
+        ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
+        # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
+        off, variance = 0.0, 0.0
+        for stretch in check_fates(fates):
+            # of a stretch between arrivals the packets between them, which are exchangeable if losses are independent
+            for lost in _split_at_unknown(np.where(is_trial(stretch), stretch, np.nan)):
+                n, ones = len(lost), float(lost.sum())
+                pairs = 2 * ones * (n - ones)
+                off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
+                variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
+        z = float(off / np.sqrt(variance)) if variance > 0 else 0.0
+        return cls(float(ratio), float(scipy.stats.chi2.sf(ratio, 1)), z, float(2 * scipy.stats.norm.sf(abs(z))))
+
 
 @readable
 @dataclass(frozen=True)
@@ -105,7 +131,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     held_out_scores = _score_held_out(parts, known, cut) if 0 < cut < known.sum() else {}
     best = max(held_out_scores, key=lambda name: held_out_scores[name].log_likelihood) if held_out_scores else HIDDEN
     lost = int(np.sum(np.concatenate(parts) == 1))
-    return Losses(int(known.sum()), lost, _fit_laws(parts, True), loss_memory(parts), held_out_scores, best)
+    return Losses(int(known.sum()), lost, _fit_laws(parts, True), LossMemory.of(parts), held_out_scores, best)
 
 
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
@@ -132,32 +158,6 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
         gain, error = mean_and_error(logs - said[INDEPENDENT])
         scores[name] = HeldOutScores(float(logs.mean()), gain, error)
     return scores
-
-
-def loss_memory(fates: object) -> LossMemory:
-    """Test losses that the receiver knows of for memory; where nothing varies there is no evidence, p = 1.
-
-    Args:
-        fates: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a list of stretches.
-
-    Raises:
-        ValueError: what is no fates (see `heliograph.learning`).
-    Source: Anderson and Goodman (1957); Wald and Wolfowitz (1940), given the losses of each unbroken stretch.
-    """
-    counts = MarkovLosses.fit(fates, intervals=False).counts
-    both = counts.sum(axis=0)
-    ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
-    # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
-    off, variance = 0.0, 0.0
-    for stretch in check_fates(fates):
-        # of a stretch between arrivals the packets between them, which are exchangeable if losses are independent
-        for lost in _split_at_unknown(np.where(is_trial(stretch), stretch, np.nan)):
-            n, ones = len(lost), float(lost.sum())
-            pairs = 2 * ones * (n - ones)
-            off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
-            variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
-    z = float(off / np.sqrt(variance)) if variance > 0 else 0.0
-    return LossMemory(float(ratio), float(scipy.stats.chi2.sf(ratio, 1)), z, float(2 * scipy.stats.norm.sf(abs(z))))
 
 
 def _likelihood(counts: np.ndarray) -> float:

@@ -121,7 +121,7 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     Raises:
         ValueError: no column `delay`, or a negative one.
     """
-    trace = file_path("trace", trace)
+    events, trace = items("events", events, "events"), file_path("trace", trace)
     columns = columns_of(str(trace), str(trace))
     if DELAY not in columns:
         raise fail(f"trace {trace}", f"a column {DELAY!r}, nan where a message was lost", list(columns))
