@@ -6,8 +6,7 @@ import pytest
 
 from heliograph.factors.columns import columns_of
 from heliograph.factors.gaussian import condition_on_observation, from_covariance
-from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
-from heliograph.numerics.lapack import add_information
+from heliograph.factors.roots import covariance_of_root, observe_information, observe_root, roots_of
 from tests.factors.exact import after, congruence, exactly
 
 
@@ -104,6 +103,7 @@ def test_roots_are_those_of_the_nearest_covariance():
 
 def test_information_adds_to_that_of_the_prior_which_may_be_singular():
     p, h, _ = problem(3, 2)
-    np.testing.assert_allclose(add_information(p, h.T @ h), np.linalg.inv(np.linalg.inv(p) + h.T @ h), rtol=1e-9)
-    known = add_information(np.diag([0.0, 1.0]), np.array([[3.0, 1.0], [1.0, 2.0]]))
+    after = observe_information(roots_of(p), h.T @ h).covariance
+    np.testing.assert_allclose(after, np.linalg.inv(np.linalg.inv(p) + h.T @ h), rtol=1e-9)
+    known = observe_information(roots_of(np.diag([0.0, 1.0])), np.array([[3.0, 1.0], [1.0, 2.0]])).covariance
     np.testing.assert_allclose(known, [[0.0, 0.0], [0.0, 1 / 3]], atol=1e-15)

@@ -77,6 +77,17 @@ def observe_root(
     return Observed(gain, np.concatenate([lower[..., m:, m:], unused], axis=-1))
 
 
+def observe_information(
+    root: Float[np.ndarray, "*items n c"], information: Float[np.ndarray, "*items n n"]
+) -> Observed:
+    """Condition x of covariance W W' on measurements of information J = C' Cov(v)^-1 C: P+ = (P^-1 + J)^-1.
+
+    With J = U U' they say as much as U' x + v, Cov v = I; P may be singular.
+    """
+    rows = roots_of(information).swapaxes(-1, -2)
+    return observe_root(root, rows, np.eye(rows.shape[-1]))
+
+
 def _find_rows_that_add(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.ndarray, "*items m"]:
     """Find which rows have more than RANK of their square left beside those before them that have, by Gram-Schmidt."""
     rest, adds = rows, np.zeros(rows.shape[:-1], bool)

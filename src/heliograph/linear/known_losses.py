@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.factors.roots import observe_root, roots_of
 from heliograph.linear.jump_system import JumpSystem, mix_modes, propagate_by_mode, unpack_entries
 from heliograph.numerics.check import fail
-from heliograph.numerics.lapack import pseudo_solve, spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Float, Int
 
 BELOW_ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did to it
@@ -143,8 +144,7 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
         modes = np.flatnonzero(system.known == s)
         v = before[modes].sum(axis=0)
         r = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(c), len(c))))
-        cross = c @ v @ system.transition.T
-        results.append(pseudo_solve(c @ v @ c.T + r, cross).T if len(c) else cross.T)
+        results.append(system.transition @ observe_root(roots_of(v), c, roots_of(r)).gain)
     return tuple(results)
 
 

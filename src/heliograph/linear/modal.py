@@ -9,12 +9,11 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import check_maps
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.tensors import symmetric_product
+from heliograph.random_affine.moments.second_moments import nominal_spread
 
 Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  # E[(G, n)] and its spread, by mode
 
@@ -69,7 +68,7 @@ def modal_system(
     parts = []
     for step in steps:
         maps = [m.maps for m in step.maps if isinstance(m, Stack)]
-        move_moments, received = (_take_moments_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
+        move_moments, received = (_take_moments_by_mode([m[i] for m in maps]) for i in range(2))
         # F, Cov(w) and E_i of one step; Cov(v) = sum_j Spread_j(E_j).
         transition, process, moments = _propagate_modes(move_moments, rows, moments)
         noise = np.einsum("jabcd,jcd->ab", received[1], moments)
@@ -80,10 +79,9 @@ def modal_system(
     return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), np.kron(law, mean), start, whole)
 
 
-def _take_moments_by_mode(items: list[tuple[np.ndarray, np.ndarray]]) -> Moments:
-    mean = np.array([first_order for first_order, _ in items])
-    second = np.array([second_order for _, second_order in items])
-    return mean, second - np.array([symmetric_product(m, m) for m in mean])
+def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
+    means, spreads = zip(*((m.moments(1).mean[:-1], nominal_spread(m).center) for m in maps), strict=True)
+    return np.array(means), np.array(spreads)
 
 
 def _propagate_modes(

@@ -50,14 +50,3 @@ def regular_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Flo
 
 _eigh = sequential_vmap(lambda a: tuple(jnp.linalg.eigh(a)))  # type: ignore[no-untyped-call]
 _regular_solve = sequential_vmap(jnp.linalg.solve)  # type: ignore[no-untyped-call]
-
-
-def add_information(
-    predicted: Float[np.ndarray, "*nodes n n"], information: Float[np.ndarray, "*nodes n n"]
-) -> Float[np.ndarray, "*nodes n n"]:
-    """Covariance after a measurement: P = (P-^-1 + J)^-1 = (I + P- J)^-1 P-, of information J = C' Cov(v)^-1 C.
-
-    P- may be singular.
-    """
-    after = np.linalg.solve(np.eye(predicted.shape[-1]) + predicted @ information, predicted)
-    return np.asarray(after + after.swapaxes(-1, -2)) / 2

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from heliograph.factors.roots import observe_information, roots_of
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Bool, Float
@@ -303,8 +304,7 @@ def steady_error(
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))
     output = (vectors[:, used] * np.sqrt(values[used])).T
     prior = scipy.linalg.solve_discrete_are(matrix.T, output.T, process, np.eye(len(output)))
-    gain = np.linalg.solve(output @ prior @ output.T + np.eye(len(output)), output @ prior)
-    return np.asarray(prior - prior @ output.T @ gain)
+    return observe_information(roots_of(prior), information).covariance
 
 
 def solve_closed_form(links: SummedLinks, total: float, caps: Vector) -> Vector | None:

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph as hg
+from heliograph.factors.roots import observe_information, roots_of
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.lapack import add_information
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.paths.model import Paths, Plants, error_covariances, path_information
 from heliograph.planning.paths.relaxation import envelope, split_paths
@@ -176,13 +176,14 @@ def _greedy(paths: Paths, information: Float[np.ndarray, "path"]) -> Steps:
     """The sensor that lowers each step's error most, until choices and covariance repeat themselves."""
     a, q, rows = paths.plants.transition[0], paths.plants.process[0], paths.rows[0]
     alone = information[:, None, None] * rows[:, :, None] * rows[:, None, :]
-    p = q
+    root = process = roots_of(q)
     before: list[np.ndarray] = []
     taken: list[int] = []
     for _ in range(LONGEST):
-        after = [add_information(a @ p @ a.T + q, received) for received in alone]
-        best = int(np.argmin([np.trace(covariance) for covariance in after]))
-        p = after[best]
+        after = observe_information(np.concatenate([a @ root, process], axis=1), alone)
+        covariances = after.covariance
+        best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
+        root, p = after.root[best], covariances[best]
         for k, past in enumerate(before):
             if taken[k] == best and np.abs(past - p).max() <= SAME * np.abs(p).max():
                 return tuple((i,) for i in (*taken[k + 1 :], best))

@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from scipy.special import logsumexp, ndtr
 
+from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
 from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.row_times import judge_dates
@@ -182,24 +183,22 @@ def _score_block(
     total, pits, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
-        weight, error, root = _weigh_combinations(y, spread, z[:, start:stop], law)
+        weight, error = _weigh_combinations(y, spread, z[:, start:stop], law)
         for j in range(stop - start):
             now = np.exp(weight[..., j] - logsumexp(weight[..., j], axis=1, keepdims=True))
             pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(now * ndtr(error[..., j]), axis=1)))
         last = logsumexp(weight[..., -1], axis=1)
         total += last
         if i + 1 < len(parts):
-            y, spread = _correct_signal(
-                y, spread, z[:, start:stop], law, np.exp(weight[..., -1] - last[:, None]), error, root
-            )
+            y, spread = _correct_signal(y, spread, z[:, start:stop], law, np.exp(weight[..., -1] - last[:, None]))
         start = stop
     return total, np.stack(pits, axis=1)
 
 
 def _weigh_combinations(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackDensity
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log-weights of the combinations before each component and after the last (t, a, m + 1), L^-1 (z - E z), and L."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-weights of the combinations before each component and after the last (t, a, m + 1), and L^-1 (z - E z)."""
     there = ~np.isnan(z)[:, None]
     both = there[..., None] & there[..., None, :]
     total = np.einsum("amp,tpq,anq->tamn", law.gain, spread, law.gain) + law.noise
@@ -212,25 +211,18 @@ def _weigh_combinations(
     weight = law.log_weight[:, None] + np.concatenate(
         [np.zeros((*density.shape[:2], 1)), np.cumsum(density, axis=2)], axis=2
     )
-    return weight, error, root
+    return weight, error
 
 
 def _correct_signal(
-    y: np.ndarray,
-    spread: np.ndarray,
-    z: np.ndarray,
-    law: StackDensity,
-    weight: np.ndarray,
-    error: np.ndarray,
-    root: np.ndarray,
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackDensity, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moments of the signal given these components too: those of the mixture over its combinations, weight (t, a)."""
     there = ~np.isnan(z)[:, None, :, None]
-    cross = np.where(there, np.einsum("amp,tpq->tamq", law.gain, spread), 0.0)
-    white = np.linalg.solve(root, cross)  # L^-1 G P
-    moved = np.einsum("tamq,tam->taq", white, error)
-    shift = np.einsum("ta,taq->tq", weight, moved)
-    apart = moved - shift[:, None]
-    known = np.einsum("ta,tamq,tamr->tqr", weight, white, white)
-    between = np.einsum("ta,taq,tar->tqr", weight, apart, apart)
-    return y + shift, spread - known + between
+    value = np.where(there[..., 0], z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
+    gain, noise = (np.where(there, rows, 0.0) for rows in (law.gain, roots_of(law.noise)))
+    after = observe_root(roots_of(spread)[:, None], gain, noise)
+    moved = np.einsum("tapm,tam->tap", after.gain, value)
+    shift = np.einsum("ta,tap->tp", weight, moved)
+    apart = np.append(after.root, (moved - shift[:, None])[..., None], axis=-1)
+    return y + shift, np.einsum("ta,tapq->tpq", weight, covariance_of_root(apart))

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.roots import observe_root, roots_of
 from heliograph.linear.jump_system import JumpSystem
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
@@ -59,16 +60,17 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     """Return the covariances with the best gains, and their adjoint under the criterion.
 
     Raises:
-        ValueError: an error that grows without limit, measurements without any noise.
+        ValueError: an error that grows without limit.
     """
+    expected = "one that converges (what is received informs too little of an unstable plant)"
+    growth = fail("steady error", expected, "growth")
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             parts, gains = _solve_periodic(m) if m.start is None else _step_through(m, m.start[None])
-    except np.linalg.LinAlgError:
-        raise fail("network of a design", "measurements with noise", "a singular innovation covariance") from None
+    except np.linalg.LinAlgError:  # of numbers that are none, or of a growth of exactly 1
+        raise growth from None
     if not np.all(np.isfinite(parts)) or np.linalg.eigvalsh(parts).min() < -NEAR * np.abs(parts).max():
-        expected = "one that converges (what is received informs too little of an unstable plant)"
-        raise fail("steady error", expected, "growth")
+        raise growth
     weights = criterion.smooth(parts.sum(axis=1))[1]
     return ModeSolution(parts, gains, _close_loop(m, gains).adjoint(weights, m.start is None))
 
@@ -105,12 +107,10 @@ def _update(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[n
     """Return the best gains of a step, and X after it."""
     law = m.law[k][:, None, None]
     prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)
-    cross = m.output[k] @ prior
     # A mode that never occurs has the gain zero.
     noise = np.where(law > 0, law * m.noise[k], np.eye(m.noise.shape[-1]))
-    gains = np.linalg.solve(cross @ m.output[k].swapaxes(1, 2) + noise, cross).swapaxes(1, 2)
-    after = prior - gains @ cross
-    return gains, (after + after.swapaxes(1, 2)) / 2
+    after = observe_root(roots_of(prior), m.output[k], roots_of(noise))
+    return after.gain, after.covariance
 
 
 def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:

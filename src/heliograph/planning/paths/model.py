@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
 from heliograph.linear.jump_system import JumpSystem
 from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank
-from heliograph.numerics.lapack import add_information
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error import Error
@@ -87,12 +87,13 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
         predicted = solve_fixed_point(reduce(compose, steps))
     else:
         predicted = a[0] @ plants.start @ a[0].T + q[0]
-    # The recursion through the steps.
-    posteriors: list[np.ndarray] = []
+    # The recursion through the steps, on roots.
+    root, process, posteriors = roots_of(predicted), roots_of(q), list[np.ndarray]()
     for k, received in enumerate(information):
         if k:
-            predicted = a[k] @ posteriors[-1] @ a[k].T + q[k]
-        posteriors.append(add_information(predicted, received))
+            root = np.concatenate([a[k] @ root, process[k]], axis=1)
+        root = observe_information(root, received).root
+        posteriors.append(covariance_of_root(root))
     return np.array(posteriors)
 
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
 from heliograph.fusion.mesh.joint import scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import DiffusionWeights, FrozenWeights
@@ -17,7 +18,6 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
-from heliograph.numerics.lapack import add_information
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import claim_of_informed
 from heliograph.simulation.centres.edges import arrival_chance, edge_links, edges_of, loss_rate
@@ -298,9 +298,11 @@ def _make_error_steps(
     n = len(a)
     # Gains of a filter that receives all its neighbours' measurements, in the long run.
     total = np.where(graph.present[:, :, None, None], squares[graph.senders], 0.0).sum(axis=1)
-    p = np.tile(np.eye(n), (len(squares), 1, 1))
+    root = np.tile(np.eye(n), (len(squares), 1, 1))
+    process = np.broadcast_to(roots_of(q), root.shape)
     for _ in range(STEPS):
-        p = add_information(a @ p @ a.T + q, total)
+        root = observe_information(np.concatenate([a @ root, process], axis=-1), total).root
+    p = covariance_of_root(root)
     # c_ij F_i A e_j, and -c_ij F_i A e_i - P_i S_j A e_i.
     pulled = shares[:, :, None, None] * ((np.eye(n) - p @ total) @ a)[:, None]
     return a - p @ squares @ a, pulled, -pulled - p[:, None] @ squares[graph.senders] @ a

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
 from heliograph.fusion.mesh.joint import blocks_of, error_transitions, joint_after, measurement_weights, scatter_blocks
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
@@ -16,7 +17,6 @@ from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, instance, is_whole
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
-from heliograph.numerics.lapack import add_information
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
@@ -216,11 +216,12 @@ def best_possible(
         s = np.asarray(steps[k].data.information)
         information.append((known @ s.reshape(count, -1)).reshape(s.shape))
     # Riccati recursions of all nodes side by side, oldest measurement first.
-    covariance = np.array(start.covariance)
+    root = roots_of(np.asarray(start.covariance))
     for model, total in zip(steps, reversed(information), strict=True):
-        a = np.asarray(model.motion.matrix)
-        covariance = add_information(propagate_by_mode(a, covariance, model.motion.noise), total)
-    return covariance
+        a, process = np.asarray(model.motion.matrix), roots_of(np.asarray(model.motion.noise))
+        process = np.broadcast_to(process, (count, *process.shape))
+        root = observe_information(np.concatenate([a @ root, process], axis=-1), total).root
+    return covariance_of_root(root)
 
 
 @quickly_compiled
