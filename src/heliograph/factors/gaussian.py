@@ -236,6 +236,15 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
     return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
 
 
+def correct_by_gain(x: Gaussian, slopes: jax.Array, noise: Columns, gain: jax.Array, innovation: jax.Array) -> Gaussian:
+    """Correct x = m + L xi by any gain K of e = slopes xi + v: mean m + K e, error (L - K slopes) xi - K v.
+
+    Joseph's form, sums of squares; with Kalman's gain it is `condition_on_observation`.
+    """
+    left = Columns(x.root - gain @ slopes, x.variances)
+    return from_columns(x.mean + gain @ innovation, join_columns(left, noise.through(gain)))
+
+
 def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
     """Give t = E t + row xi a new mean and variance (shift, ratio) and leave x given t: a rank-one update of L, d.
 

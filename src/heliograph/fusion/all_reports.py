@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import Columns, columns_of, eliminate, join_columns, rounding_of, square_root, unit_of
-from heliograph.factors.gaussian import Gaussian, from_columns, gain_of, predict_affine, take_leading
+from heliograph.factors.gaussian import Gaussian, correct_by_gain, from_columns, gain_of, predict_affine, take_leading
 from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
 from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
@@ -161,15 +161,16 @@ def correct_with_reports(
     output, offset = _make_output_matrix(past, len(x.mean)), jnp.ravel(past.offset)
     expected, present, noise = output @ x.mean + offset, ~jnp.isnan(values), _factor_each(past.noise)
     gain, unexpected = _compute_gain(x, output, past, present), jnp.where(present, values - expected, 0.0)
-    # Joseph's form, sums of squares; the errors mu themselves enter the bound (Young, Cauchy).
-    keep = jnp.eye(len(x.mean)) - gain @ output
-    kept = join_columns(Columns(keep @ x.root, x.variances), noise.through(gain))
+    slopes = jnp.asarray(output @ x.root)
+    after = correct_by_gain(x, slopes, noise, gain, unexpected)
+    # The errors mu themselves enter the bound (Young, Cauchy).
     spill = None
     if state.spill is not None:
+        keep = jnp.eye(len(x.mean)) - gain @ output
         push = _cauchy_bound(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
         spill = symmetric(_bound_sum(propagate_by_mode(keep, state.spill, 0.0), push))
-    law = PredictedReports(expected, join_columns(Columns(output @ x.root, x.variances), noise).covariance)
-    return ReportsBelief(from_columns(x.mean + gain @ unexpected, kept), past, spill), law
+    law = PredictedReports(expected, join_columns(Columns(slopes, x.variances), noise).covariance)
+    return ReportsBelief(after, past, spill), law
 
 
 def _compute_gain(

@@ -13,7 +13,6 @@ from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import fail, instance, repeat_per_step
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.lapack import spectral_radius
-from heliograph.numerics.linalg import psd_solve, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (
@@ -27,7 +26,7 @@ from heliograph.relays.design import (
     split_gains,
     start_moments,
 )
-from heliograph.relays.second_moments import Propagated, gain_mask, propagate_slots
+from heliograph.relays.second_moments import Propagated, correct_moments, gain_mask, propagate_slots, regression_gain
 
 CONVERGED = 1e-13  # relative change of the moments over a period
 PERIODS = 100_000
@@ -147,16 +146,11 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         both = jnp.concatenate([at_slot.transition, at_slot.output])
         return jnp.asarray(propagate_by_mode(both, spread, at_slot.noise))
 
-    def corrected(z: jax.Array, gain: jax.Array) -> jax.Array:
-        """Joseph's form: affine in the covariance of the state and of what is received."""
-        close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
-        return jnp.asarray(propagate_by_mode(close, z, 0.0))
-
     # Riccati recursion of the receiver, held constant under differentiation.
     def best(spread: jax.Array, at_slot: RelaySide) -> tuple[jax.Array, jax.Array]:
         z = predict(spread, at_slot)
-        gain = psd_solve(z[d:, d:], z[d:, :d]).T  # zero in a slot in which nobody transmits to the receiver
-        return symmetrize(corrected(z, gain)), gain
+        gain = regression_gain(z[:d, d:], z[d:, d:])  # zero in a slot in which nobody transmits to the receiver
+        return correct_moments(z, gain), gain
 
     held = jax.lax.stop_gradient(side)
     converged = _solve_steady(
@@ -168,7 +162,7 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
     # With these gains the fixed point is one linear solve.
     def given(spread: jax.Array, row: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
         at_slot, gain = row
-        after = corrected(predict(spread, at_slot), gain)
+        after = correct_moments(predict(spread, at_slot), gain)
         return after, after
 
     def period(spread: jax.Array) -> tuple[jax.Array, jax.Array]:

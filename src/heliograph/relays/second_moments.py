@@ -115,6 +115,11 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
     return jnp.where(jnp.diagonal(predicted)[d:] > known**2 + spread, 1.0, 0.0)
 
 
+def regression_gain(cross: Float[jax.Array, "n m"], received: Float[jax.Array, "m m"]) -> Float[jax.Array, "n m"]:
+    """K = Cov(e, i) Cov(i)^-1, which minimises tr Cov(e - K i); zero for what other innovations determine."""
+    return psd_solve(received, cross.T).T
+
+
 def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[jax.Array, "Fn R"]:
     """Return K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
 
@@ -131,7 +136,7 @@ def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[ja
             1.0 - says
         )  # what says nothing: solve with 1
         cross = predicted[(1 + f) * n : (2 + f) * n, d:][:, rows] * says
-        gain = gain.at[f * n : (f + 1) * n, rows].set(psd_solve(inner, cross.T).T)
+        gain = gain.at[f * n : (f + 1) * n, rows].set(regression_gain(cross, inner))
         start += length
     return gain
 

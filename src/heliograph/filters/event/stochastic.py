@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import Columns, eliminate, join_columns
+from heliograph.factors.columns import Columns, eliminate, join_columns, zero_covariance
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate, merge_groups, safe_log
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
-from heliograph.filters.gaussian.signal import Signal, signal_of
+from heliograph.filters.gaussian.signal import Signal, factor_spread, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.multiple_model import correct_in_every_mode, replicate
 from heliograph.filters.modes.patterns import SideInformation, append_flag
@@ -24,7 +24,6 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import Periodic, StochasticTrigger
-from heliograph.numerics.density import log_density
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -162,8 +161,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         (gain, spread), mean, total = link, signal.mean, signal.covariance
         # Of y.
         silent = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)
-        y = from_columns(mean, join_columns(Columns(signal.slopes, signal.prior.variances), signal.noise))
-        quiet, _ = condition_on_observation(y, y.root, reference - mean, eliminate(self._inverse_weight()))
+        y = _law_of_signal(signal)
+        _, quiet = self._observe_silence(y, y.root, zero_covariance(len(mean)), mean, reference)
         d = quiet.mean - mean
         shift = -silent * d / (1 - silent)
         about = (total - silent * (quiet.covariance + jnp.outer(d, d))) / (1 - silent) - total
@@ -177,12 +176,21 @@ class StochasticEventFilter(AbstractSizedFilter):
         self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
     ) -> jax.Array:
         """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z with this innovation."""
-        total, inverse = signal.covariance, self._inverse_weight()
-        back = psd_solve(covariance, gain @ total)
-        left = symmetrize(total - total @ gain.T @ back) + inverse
-        off = reference - signal.mean - value @ back
-        log_silent = log_density(off, left, jnp.abs(reference)) + self._log_silence_normaliser()
+        y = _law_of_signal(signal)
+        slopes = gain @ y.root
+        noise = factor_spread(covariance - Columns(slopes, y.variances).covariance)
+        y, _ = condition_on_observation(y, slopes, value, noise)
+        log_silent, _ = self._observe_silence(y, y.root, zero_covariance(len(y.mean)), y.mean, reference)
         return jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_silent, 0.0)), FLOOR))
+
+    def _observe_silence(
+        self, x: Gaussian, slopes: jax.Array, noise: Columns, expected: jax.Array, reference: jax.Array
+    ) -> tuple[jax.Array, Gaussian]:
+        """Condition x on silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise; log P(silent) too."""
+        noise = join_columns(noise, eliminate(self._inverse_weight()))
+        after, innovations = condition_on_observation(x, slopes, reference - expected, noise)
+        size = jnp.abs(reference) + jnp.abs(expected)
+        return innovations.log_density(jnp.ones(len(size), bool), size) + self._log_silence_normaliser(), after
 
     def _inverse_weight(self) -> jax.Array:
         """Return W^-1, the noise with which silence is a measurement."""
@@ -202,11 +210,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         if isinstance(self.trigger, Periodic):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
             return jnp.where(due, -jnp.inf, 0.0), prior
-        value = reference - signal.mean
-        noise = join_columns(signal.noise, eliminate(self._inverse_weight()))
-        after, innovations = condition_on_observation(prior, signal.slopes, value, noise)
-        size = jnp.abs(reference) + jnp.abs(signal.mean)
-        return innovations.log_density(jnp.ones(len(value), bool), size) + self._log_silence_normaliser(), after
+        return self._observe_silence(prior, signal.slopes, signal.noise, signal.mean, reference)
 
     @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
@@ -216,6 +220,11 @@ class StochasticEventFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the Gaussian's, around the update."""
         return smoother_step_by_transform(self, step, first(self.plant))
+
+
+def _law_of_signal(signal: Signal) -> Gaussian:
+    """Return the law of y itself, before z."""
+    return from_columns(signal.mean, join_columns(Columns(signal.slopes, signal.prior.variances), signal.noise))
 
 
 def _sum_of_one_gaussian(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> GaussianSum:

@@ -7,8 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, join_columns
-from heliograph.factors.gaussian import Gaussian, from_columns
+from heliograph.factors.gaussian import Gaussian, correct_by_gain
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -20,7 +19,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter_of
-from heliograph.filters.gaussian.signal import Signal, innovation_covariance, make_received_noise, signal_of
+from heliograph.filters.gaussian.signal import innovation_covariance, make_received_noise, signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation
@@ -115,7 +114,8 @@ class ClockFilter(AbstractSizedFilter):
         # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
         gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
         gain = gain * self._mask_estimated(observed)[:, None]
-        after = _correct_by_gain(signal, channel, gain, jnp.where(present, z - expected, 0.0))
+        slopes, noise = jnp.asarray(channel.mean_gain) @ signal.slopes, make_received_noise(signal, channel)
+        after = correct_by_gain(prior, slopes, noise, gain, jnp.where(present, z - expected, 0.0))
         belief = ClockBelief(after, state.inputs, silence, observed)
         return belief, gaussian_innovation(z, expected, total)
 
@@ -171,15 +171,6 @@ def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:
     is_used = values > RANK * values[-1]
     explained = jnp.sum(jnp.where(is_used, (vectors.T @ r) ** 2 / jnp.where(is_used, values, 1.0), 0.0))
     return jnp.where(lengths[column] > 0, 1 - explained, 0.0)
-
-
-def _correct_by_gain(signal: Signal, channel: SecondOrder, gain: jax.Array, innovation: jax.Array) -> Gaussian:
-    """Correct the mean to m + K e with any gain: the error is then (L - K slopes) xi - K v."""
-    prior, slopes = signal.prior, jnp.asarray(channel.mean_gain) @ signal.slopes
-    left = Columns(prior.root - gain @ slopes, prior.variances)
-    return from_columns(
-        prior.mean + gain @ innovation, join_columns(left, make_received_noise(signal, channel).through(gain))
-    )
 
 
 @believes
