@@ -6,6 +6,10 @@ from .availability import (
 from .bags.output import (
     Pose as Pose,
 )
+from .computed import (
+    Covariance as Covariance,
+    Yaw as Yaw,
+)
 from .event_table import (
     EventTable as EventTable,
 )
@@ -21,9 +25,10 @@ from .json_field import (
     Level as Level,
     Source as Source,
     Stamp as Stamp,
-    Yaw as Yaw,
-    chirpstack as chirpstack,
     json_field as json_field,
+)
+from .lorawan import (
+    chirpstack as chirpstack,
     the_things_stack as the_things_stack,
 )
 from .messages import (

@@ -2,18 +2,17 @@
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.files.availability import Available
+from heliograph.files.computed import Computed, Covariance, ZeroIfAbsent
 from heliograph.files.fields import TimeUnit, at, name_of
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike
-
-COUNT_BITS = 16  # of a LoRaWAN frame
 
 
 @readable
@@ -59,29 +58,6 @@ class Field:
 
 @readable
 @dataclass(frozen=True)
-class Yaw:
-    """Heading of a quaternion, atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)), in radians: a value in place of a path.
-
-    Args:
-        path: dotted path of the quaternion, which has the fields x, y, z and w.
-    """
-
-    path: str
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """Return the paths of x, y, z and w."""
-        return tuple(f"{self.path}.{part}" if self.path else part for part in "xyzw")
-
-    @staticmethod
-    def of(x: Any, y: Any, z: Any, w: Any) -> Any:
-        """Return the heading, of numbers or of arrays; NaN where a part is missing or all are 0."""
-        size = x * x + y * y + z * z + w * w
-        return np.where(size > 0, np.arctan2(2 * (w * z + x * y), size - 2 * (y * y + z * z)), np.nan)
-
-
-@readable
-@dataclass(frozen=True)
 class Stamp:
     """Time of a measurement in a message.
 
@@ -114,8 +90,8 @@ class Count:
 
 
 Name = TypeAliasType("Name", str | Level | Field)
-Path = TypeAliasType("Path", str | Yaw)
-Paths = TypeAliasType("Paths", str | Yaw | Sequence[str | Yaw])
+Path = TypeAliasType("Path", str | Computed)
+Paths = TypeAliasType("Paths", str | Computed | Sequence[str | Computed])
 Texts = TypeAliasType("Texts", str | Sequence[str] | None)
 Time = TypeAliasType("Time", str | Stamp | None)
 Counted = TypeAliasType("Counted", str | Count | None)
@@ -133,7 +109,8 @@ class Source:
     """One event of a node in each message of a topic, as `json_field` describes it.
 
     Attributes:
-        paths: dotted path of each value in the message, or the `Yaw` of a quaternion.
+        paths: dotted path of each value in the message, or what is computed of several, such as the `Yaw` of a
+            quaternion.
         node: name of the node, or "inputs"; or the `Level` or `Field` that names it.
         outputs: name of each value among the node's outputs or the plant's inputs; empty for all of them.
         scale: factor of each value.
@@ -165,7 +142,7 @@ class Source:
     @property
     def fields(self) -> list[str]:
         """Return the dotted paths of all fields that a message needs."""
-        values = [part for path in self.paths for part in (path.parts if isinstance(path, Yaw) else (path,))]
+        values = [part for path in self.paths for part in ((path,) if isinstance(path, str) else path.parts)]
         given = (self.node, self.plant, self.time, self.sequence)
         return [*values, *(part.path for part in given if isinstance(part, Field | Stamp | Count)), *self.where]
 
@@ -204,9 +181,10 @@ def json_field(
 
     Args:
         path: dotted path of the value, or the `Yaw` of a quaternion, or several, which are then one measurement.
+            What is told of values (`hg.model.told`) stands after these, such as a `Covariance`.
         node: name of a node of the network, or "inputs"; or the `Level` of the topic or the `Field` that names it.
         output: name of the output or input, one for each path; None for all of the node's, in their order.
-        scale: factor, of all values or of each. Shape () or (values,) (default 1).
+        scale: factor, of all values but covariances, or of each. Shape () or (values,) (default 1).
         offset: added after scaling, to all values or to each. Shape () or (values,) (default 0).
         time: dotted path of the time, or its `Stamp`; None for the moment of arrival.
         time_unit: unit of a time that is a number (default "s").
@@ -222,7 +200,7 @@ def json_field(
         ValueError: no path, as many outputs as paths expected and others given, numbers that are not finite, another
             unit of time, a step that is not positive.
     """
-    paths = _paths(path)
+    paths = read_paths(path)
     outputs = () if output is None else _texts("output", output)
     if not paths or (outputs and len(outputs) != len(paths)):
         raise fail("json_field, output", f"{max(len(paths), 1)} names, one for each path", show_value(output))
@@ -239,7 +217,8 @@ def json_field(
     if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.offset)):
         raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
     factors, shifts = (
-        _broadcast_to_paths(name, value, len(paths)) for name, value in (("scale", scale), ("offset", offset))
+        _broadcast_to_paths(name, value, paths, neutral)
+        for name, value, neutral in (("scale", scale, 1.0), ("offset", offset, 0.0))
     )
     return Source(
         paths, whose, outputs, factors, shifts, stamp, time_unit, count,
@@ -248,100 +227,12 @@ def json_field(
     )  # fmt: skip
 
 
-class _Uplinks(NamedTuple):
-    """Uplinks of a LoRaWAN server: their topic, and the paths of the values, time, count of frames, device."""
-
-    topic: str
-    values: str
-    time: str
-    frames: str
-    device: str
-
-    def sources(self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float) -> "dict[str, Source]":
-        """Return the source of its topic, a plant for each device."""
-        source = json_field(
-            _below(self.values, path),
-            node,
-            output,
-            scale=scale,
-            offset=offset,
-            time=self.time,
-            sequence=Count(self.frames, COUNT_BITS),
-            plant=self.device,
-        )
-        return {self.topic: source}
-
-
-THE_THINGS_STACK = _Uplinks(
-    "v3/+/devices/+/up",
-    "uplink_message.decoded_payload",
-    "received_at",
-    "uplink_message.f_cnt",
-    "end_device_ids.device_id",
-)
-CHIRPSTACK = _Uplinks("application/+/device/+/event/up", "object", "time", "fCnt", "deviceInfo.devEui")
-
-
-def the_things_stack(
-    path: "Paths",
-    node: "Name",
-    output: "Texts" = None,
-    *,
-    scale: float = 1.0,
-    offset: float = 0.0,
-) -> "dict[str, Source]":
-    """Return the sources of uplinks of The Things Stack v3, a plant for each device: `sources = {**this, ...}`.
-
-    The time is that of the reception, the count that of the frames: absent at 0, and from 0 again after 65,535 frames
-    and after a device has joined again. An uplink without the field measured nothing.
-
-    Args:
-        path: dotted path within the decoded payload, or several, as of `json_field`.
-        node: name of a node of the network; or the `Field` that names it.
-        output: name of the output, one for each path; None for all of the node's.
-        scale: factor of the values (default 1).
-        offset: added after scaling (default 0).
-
-    Raises:
-        ValueError: what `json_field` refuses.
-    """
-    return THE_THINGS_STACK.sources(path, node, output, scale, offset)
-
-
-def chirpstack(
-    path: "Paths",
-    node: "Name",
-    output: "Texts" = None,
-    *,
-    scale: float = 1.0,
-    offset: float = 0.0,
-) -> "dict[str, Source]":
-    """Return the sources of uplinks of ChirpStack v4, a plant for each device: `sources = {**this, ...}`.
-
-    Time, count and what is absent are as in `the_things_stack`.
-
-    Args:
-        path: dotted path within the decoded object, or several, as of `json_field`.
-        node: name of a node of the network; or the `Field` that names it.
-        output: name of the output, one for each path; None for all of the node's.
-        scale: factor of the values (default 1).
-        offset: added after scaling (default 0).
-
-    Raises:
-        ValueError: what `json_field` refuses.
-    """
-    return CHIRPSTACK.sources(path, node, output, scale, offset)
-
-
-def _below(prefix: str, path: Paths) -> Paths:
-    """Return paths within a part of the message."""
-    return [Yaw(f"{prefix}.{one.path}") if isinstance(one, Yaw) else f"{prefix}.{one}" for one in _paths(path)]
-
-
-def _paths(value: object) -> tuple[str | Yaw, ...]:
-    items = [value] if isinstance(value, str | Yaw) else value
-    if not isinstance(items, Sequence) or not all(isinstance(path, str | Yaw) for path in items):
-        raise fail("json_field, path", "a dotted path, hg.files.Yaw, or a list of these", show_value(value))
+def read_paths(value: object) -> tuple[str | Computed, ...]:
+    """Return one path or several, checked."""
+    items = [value] if isinstance(value, str | Computed) else value
+    if not isinstance(items, Sequence) or not all(isinstance(path, str | Computed) for path in items):
+        expected = "a dotted path, hg.files.Yaw or Covariance, or a list of these"
+        raise fail("json_field, path", expected, show_value(value))
     return tuple(items)
 
 
@@ -381,8 +272,9 @@ def _texts(name: str, value: object) -> tuple[str, ...]:
     return tuple(items)
 
 
-def _broadcast_to_paths(name: str, value: ArrayLike, count: int) -> tuple[float, ...]:
-    """Return one number for each path."""
+def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], neutral: float) -> tuple[float, ...]:
+    """Return one number for each path; one number is of the values, and what is told of these stays as it is."""
+    count = len(paths)
     try:
         values = np.atleast_1d(np.asarray(value, dtype=object))
     except (TypeError, ValueError):  # a set of arrays, a key
@@ -390,4 +282,6 @@ def _broadcast_to_paths(name: str, value: ArrayLike, count: int) -> tuple[float,
     if values.ndim != 1 or len(values) not in (1, count):
         raise fail(f"json_field, {name}", f"1 number, or {count}", show_value(value))
     numbers = [float(scalar(f"json_field, {name}", single)) for single in values]
-    return tuple(numbers * (count if len(numbers) == 1 else 1))
+    if len(numbers) == count:
+        return tuple(numbers)
+    return tuple(neutral if isinstance(path, Covariance | ZeroIfAbsent) else numbers[0] for path in paths)

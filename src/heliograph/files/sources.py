@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.availability import LastWords
+from heliograph.files.computed import Computed, ZeroIfAbsent
 from heliograph.files.fields import MissingFieldError, at, count, matches, nanoseconds, number
-from heliograph.files.json_field import Field, Source, Yaw
+from heliograph.files.json_field import Field, Source
 from heliograph.files.senders import SeveralSenders
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
@@ -152,7 +153,7 @@ class Sources:
             asked = self._asked.setdefault(topic, set())
             for source, *_ in self.of(topic):
                 names = [name.path for name in (source.plant, source.node) if isinstance(name, Field)]
-                paths = [path.path if isinstance(path, Yaw) else path for path in source.paths]
+                paths = [path if isinstance(path, str) else path.path for path in source.paths]
                 asked |= {path.split(".")[0] for path in (*names, *paths, *source.where)}
         return self._asked[topic]
 
@@ -365,10 +366,14 @@ def _more(count: int) -> str:
     return "" if count <= LISTED else f" and {count - LISTED} more"
 
 
-def _read_value(message: object, path: str | Yaw, where: str, quoted: bool) -> float:
-    """Return the number at a path, or the heading of a quaternion; NaN for what did not arrive."""
-    if isinstance(path, Yaw):
-        return float(Yaw.of(*(_read_value(message, part, where, quoted) for part in path.parts)))
+def _read_value(message: object, path: str | Computed, where: str, quoted: bool) -> float:
+    """Return the number at a path, or what is computed of several; NaN for what did not arrive."""
+    if isinstance(path, ZeroIfAbsent):
+        within, _, name = path.path.rpartition(".")
+        whole = at(message, within, where)
+        return 0.0 if isinstance(whole, Mapping) and name not in whole else _read_value(whole, name, where, quoted)
+    if not isinstance(path, str):
+        return float(path.of(*(_read_value(message, part, where, quoted) for part in path.parts)))
     value = at(message, path, where)
     if type(value) is float:  # names its place only where there may be something to say
         return value if np.isfinite(value) else np.nan

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from heliograph.files.computed import Computed
 from heliograph.files.event_table import NONE, EventTable
-from heliograph.files.json_field import Source, Yaw
+from heliograph.files.json_field import Source
 from heliograph.files.sources import SECOND, Sources
 
 if TYPE_CHECKING:
@@ -207,8 +208,8 @@ def _list_paths(source: Source) -> list[str]:
     return [*values, *stamp, *([] if source.sequence is None else [source.sequence.path])]
 
 
-def _parts(path: str | Yaw) -> tuple[str, ...]:
-    return path.parts if isinstance(path, Yaw) else (path,)
+def _parts(path: str | Computed) -> tuple[str, ...]:
+    return (path,) if isinstance(path, str) else path.parts
 
 
 def _convert_columns(
@@ -224,7 +225,8 @@ def _convert_columns(
     values = np.full((len(rows), outputs), np.nan)
     for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
         numbers = [columns[part].astype(np.float64) for part in _parts(path)]
-        value = Yaw.of(*(np.where(np.isfinite(n), n, np.nan) for n in numbers)) if isinstance(path, Yaw) else numbers[0]
+        parts = [np.where(np.isfinite(n), n, np.nan) for n in numbers]
+        value = parts[0] if isinstance(path, str) else path.of(*parts)
         values[:, column] = np.where(np.isfinite(value), scale * value + offset, np.nan)
     # Stamps and counts have to be what a message alone is asked for: set, and whole numbers.
     if source.time is not None:

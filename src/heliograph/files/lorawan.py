@@ -1,0 +1,117 @@
+"""Sources of uplinks of LoRaWAN servers: The Things Stack v3 and ChirpStack v4."""
+
+from typing import NamedTuple
+
+from heliograph.files.computed import Computed, Yaw, ZeroIfAbsent
+from heliograph.files.json_field import Count, Name, Paths, Source, Texts, json_field, read_paths
+from heliograph.numerics.check import fail, show_value
+
+COUNT_BITS = 16  # of a frame
+RADIO = ("rssi", "snr")  # what a gateway says of how it received an uplink
+
+
+class _Uplinks(NamedTuple):
+    """Uplinks of a LoRaWAN server: their topic, and the paths of values, time, count of frames, device, reception."""
+
+    topic: str
+    values: str
+    time: str
+    frames: str
+    device: str
+    reception: str
+
+    def sources(
+        self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float, radio: "Texts"
+    ) -> "dict[str, Source]":
+        """Return the source of its topic, a plant for each device."""
+        told = [] if radio is None else [radio] if isinstance(radio, str) else list(radio)
+        unknown = [name for name in told if name not in RADIO]
+        if unknown:
+            raise fail("radio of an uplink", f"some of {', '.join(RADIO)}", show_value(unknown[0]))
+        values = _below(self.values, path)
+        reception = [ZeroIfAbsent(f"{self.reception}.{name}") for name in told]
+        outputs = None if output is None else [*([output] if isinstance(output, str) else output), *told]
+        source = json_field(
+            [*values, *reception],
+            node,
+            outputs,
+            scale=scale,
+            offset=offset,
+            time=self.time,
+            sequence=Count(self.frames, COUNT_BITS),
+            plant=self.device,
+        )
+        return {self.topic: source}
+
+
+THE_THINGS_STACK = _Uplinks(
+    "v3/+/devices/+/up",
+    "uplink_message.decoded_payload",
+    "received_at",
+    "uplink_message.f_cnt",
+    "end_device_ids.device_id",
+    "uplink_message.rx_metadata.0",
+)
+CHIRPSTACK = _Uplinks("application/+/device/+/event/up", "object", "time", "fCnt", "deviceInfo.devEui", "rxInfo.0")
+
+
+def the_things_stack(
+    path: "Paths",
+    node: "Name",
+    output: "Texts" = None,
+    *,
+    scale: float = 1.0,
+    offset: float = 0.0,
+    radio: "Texts" = None,
+) -> "dict[str, Source]":
+    """Return the sources of uplinks of The Things Stack v3, a plant for each device: `sources = {**this, ...}`.
+
+    The time is that of the reception, the count that of the frames: absent at 0, and from 0 again after 65,535 frames
+    and after a device has joined again. An uplink without the field measured nothing.
+
+    Args:
+        path: dotted path within the decoded payload, or several, as of `json_field`.
+        node: name of a node of the network; or the `Field` that names it.
+        output: name of the output, one for each path; None for all of the node's.
+        scale: factor of the values (default 1).
+        offset: added after scaling (default 0).
+        radio: "rssi" (dBm), "snr" (dB) or both, as the first gateway in the message received it: numbers of these names
+            that are told of the values (`hg.model.told`). None for neither.
+
+    Raises:
+        ValueError: what `json_field` refuses.
+    """
+    return THE_THINGS_STACK.sources(path, node, output, scale, offset, radio)
+
+
+def chirpstack(
+    path: "Paths",
+    node: "Name",
+    output: "Texts" = None,
+    *,
+    scale: float = 1.0,
+    offset: float = 0.0,
+    radio: "Texts" = None,
+) -> "dict[str, Source]":
+    """Return the sources of uplinks of ChirpStack v4, a plant for each device: `sources = {**this, ...}`.
+
+    Time, count and what is absent are as in `the_things_stack`.
+
+    Args:
+        path: dotted path within the decoded object, or several, as of `json_field`.
+        node: name of a node of the network; or the `Field` that names it.
+        output: name of the output, one for each path; None for all of the node's.
+        scale: factor of the values (default 1).
+        offset: added after scaling (default 0).
+        radio: "rssi" (dBm), "snr" (dB) or both, as the first gateway in the message received it: numbers of these names
+            that are told of the values (`hg.model.told`). None for neither.
+
+    Raises:
+        ValueError: what `json_field` refuses.
+    """
+    return CHIRPSTACK.sources(path, node, output, scale, offset, radio)
+
+
+def _below(prefix: str, path: Paths) -> list[str | Computed]:
+    """Return paths within a part of the message."""
+    return [Yaw(f"{prefix}.{one.path}") if isinstance(one, Yaw) else f"{prefix}.{one}" for one in read_paths(path)]
