@@ -143,12 +143,12 @@ def _triangularise_row_by_row(columns: Columns) -> Columns:
         row = lax.index_in_dim(rows, j, keepdims=False)
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
-        share = _column_below_diagonal(
+        share = column_below_diagonal(
             j, outer(lax.dot(rows, weighted), lax.reshape(reciprocal_or_one(variances[j]), (1,)))
         )
         rows = rows - outer(share, row)
         lower.append(share)
-    return _assemble_factors(lower, variances, rows.dtype)
+    return assemble_factors(lower, variances, rows.dtype)
 
 
 def eliminate(covariance: jax.Array, least: float = 0.0) -> Columns:
@@ -167,10 +167,10 @@ def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> Colu
     for j in range(n):
         column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
         variances.append(_bound_below(column[j], least[j]))
-        share = _column_below_diagonal(j, outer(column, lax.reshape(reciprocal_or_zero(variances[j]), (1,))))
+        share = column_below_diagonal(j, outer(column, lax.reshape(reciprocal_or_zero(variances[j]), (1,))))
         rest = symmetric(rest - outer(share, column))
         lower.append(share)
-    return _assemble_factors(lower, variances, covariance.dtype)
+    return assemble_factors(lower, variances, covariance.dtype)
 
 
 def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
@@ -268,13 +268,13 @@ def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
     return jnp.where(pivot >= floor, pivot, floor)
 
 
-def _column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
+def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
     """Return column j of L without its diagonal: the entries below it, zeros above."""
     n = len(column)
     return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
 
 
-def _assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> Columns:
+def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> Columns:
     """Put L and d together from the columns below the diagonal and the entries of d."""
     n = len(variances)
     if not n:
@@ -297,7 +297,7 @@ def _triangularise_many(columns: Columns) -> Columns:
         weighted = weights * rows[j]
         d = rows[j] @ weighted
         share = jnp.where(np.arange(n) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
-        return rows - jnp.outer(share, rows[j]), *_insert_column(j, lower, share, variances, d)
+        return rows - jnp.outer(share, rows[j]), *insert_column(j, lower, share, variances, d)
 
     start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
@@ -313,14 +313,14 @@ def _eliminate_many(covariance: jax.Array, least: jax.Array) -> Columns:
         rest, lower, variances = carry
         d = _bound_below(rest[j, j], least[j])
         share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal_or_zero(d), 0.0)
-        return rest - jnp.outer(share, rest[j]), *_insert_column(j, lower, share, variances, d)
+        return rest - jnp.outer(share, rest[j]), *insert_column(j, lower, share, variances, d)
 
     start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
     return Columns(lower, variances)
 
 
-def _insert_column(
+def insert_column(
     j: jax.Array, lower: jax.Array, share: jax.Array, variances: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Insert column j of L below its diagonal and entry j of d, at a place that a loop counts."""

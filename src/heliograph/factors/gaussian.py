@@ -27,7 +27,8 @@ from heliograph.factors.columns import (
     unit_of,
     zero_covariance,
 )
-from heliograph.factors.scalar_update import measure_parts, measure_product, measure_scalar, revise_columns
+from heliograph.factors.repeated import immense, rounding_of_slopes, triangularise_noise
+from heliograph.factors.scalar_update import measure_parts, measure_product, revise_columns
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
@@ -202,16 +203,17 @@ def condition_on_observation(
     n, m = len(x.mean), len(innovation)
     present = ~jnp.isnan(innovation) if present is None else present
     # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
-    fresh = triangularise(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    fresh = triangularise_noise(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
     rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
     rows = jnp.where(present[:, None], rows, 0.0)
     whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
     rows, variance = decorrelate(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
+    least = rounding_of_slopes(n, fresh.matrix, whole)
     # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
     root, d = jnp.concatenate([x.root, rows[:, :n]]), x.variances
     news, values, totals = jnp.concatenate([x.mean, -rows[:, n]]), [], []
     for i in range(m):
-        root, d, gain, total = measure_scalar(root, d, root[n + i], variance[i])
+        root, d, gain, total = _measure_row(root, d, root[n + i], variance[i], least[i] if i else None)
         values.append(-news[n + i])
         totals.append(total)
         news = news + gain * values[i]
@@ -227,9 +229,10 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
     """
     n, rows = len(x.mean), decorrelate(noise.matrix, slopes)
     weights = jnp.asarray(noise.weights)
+    least = rounding_of_slopes(n, noise.matrix, slopes**2 @ x.variances + noise.matrix**2 @ weights)
 
     def measure_part(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return measure_scalar(root, d, root[n + i], weights[i])[:3]
+        return _measure_row(root, d, root[n + i], weights[i], least[i])[:3]
 
     *_, gains = measure_parts(measure_part, len(rows), jnp.concatenate([x.root, rows]), x.variances)
     entering = unit_lower(below_diagonal(gains[n:]))
@@ -346,6 +349,22 @@ def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
     """
     carried = Columns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
     return from_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))
+
+
+def _measure_row(
+    root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, least: jax.Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Measure f' xi + v as `measure_scalar`; slopes of a variance up to `least` are rounding and say nothing.
+
+    They are measured with a noise beside which they are nothing to the last digit.
+    """
+    product = d * f
+    power = f * product
+    if least is None:
+        return measure_product(root, d, f, (product, power), noise)
+    nothing = jnp.sum(power) <= least
+    root, d, gain, total = measure_product(root, d, f, (product, power), jnp.where(nothing, immense(noise), noise))
+    return root, d, gain, jnp.where(nothing, noise, total)
 
 
 def _stack_numbers(entries: list[jax.Array]) -> jax.Array:

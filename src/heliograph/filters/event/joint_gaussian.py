@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of, triangularise
+from heliograph.factors.columns import Columns, below_diagonal, join_columns, rounding_of
 from heliograph.factors.gaussian import (
     Gaussian,
     append_rows,
@@ -15,6 +15,7 @@ from heliograph.factors.gaussian import (
     sum_unexplained,
     take_leading,
 )
+from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.gaussian.belief import image_of, process_noise
 from heliograph.filters.gaussian.signal import gain_noise, signal_of
@@ -48,7 +49,7 @@ def augment(
         signal = signal_of(plant, sensor, transform, take_leading(both, n), start)
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
         return append_rows(
-            both, signal.mean, slopes, triangularise(join_columns(signal.noise, rounding_of(signal.size)))
+            both, signal.mean, slopes, triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
         )
 
     return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))

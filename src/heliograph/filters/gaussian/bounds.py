@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal_or_zero, triangularise
+from heliograph.factors.columns import Columns, decorrelate, join_columns, reciprocal_or_zero
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
+from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.gaussian.scalars import (
     trace_minimising_scalars,
     young_fixed_point_map,
@@ -103,7 +104,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     # Power of the prior error that the received components explain: columns Cov(x, y) N^-T of Cov y = N diag(s) N'.
     used = mask_received(channel, present)[:, None]
     signals = join_columns(Columns(signal.slopes, prior.variances), signal.noise)
-    factors = triangularise(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
+    factors = triangularise_noise(signals._replace(matrix=jnp.where(used, signals.matrix, 0.0)))
     explained = decorrelate(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
     share = reciprocal_or_zero(factors.weights)
     # The best beta, then the update with what is left of Omega as noise.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import Columns, join_columns, triangularise
+from heliograph.factors.columns import Columns, join_columns
 from heliograph.factors.gaussian import (
     Gaussian,
     append_rows,
@@ -17,6 +17,7 @@ from heliograph.factors.gaussian import (
     impose_moments_of_combination,
     take_leading,
 )
+from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.robust_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
 
@@ -61,7 +62,7 @@ def score_update(before: PredictedMeasurement, z: jax.Array, law: NoiseBranches)
     Source: Masreliez, Approximate non-Gaussian filtering with linear state and observation relations (1975).
     """
     n, m, present = len(before.prior.mean), len(before.signal), ~jnp.isnan(z)
-    both = append_rows(before.prior, before.signal, before.slopes, triangularise(before.noise))
+    both = append_rows(before.prior, before.signal, before.slopes, triangularise_noise(before.noise))
     weights, density = [], jnp.zeros_like(z[0])
     for i in range(m):
         row = both.root[n + i]

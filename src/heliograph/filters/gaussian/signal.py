@@ -15,10 +15,10 @@ from heliograph.factors.columns import (
     join_columns,
     rounding_of,
     square_root,
-    triangularise,
     unit_of,
 )
 from heliograph.factors.gaussian import Gaussian, Innovations, condition_on_observation
+from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
@@ -121,7 +121,7 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> Columns:
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: Columns) -> Columns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
-    plain = triangularise(join_columns(signal.noise.through(gain), link, rounding))
+    plain = triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
     return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
 
 

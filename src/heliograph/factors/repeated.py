@@ -1,0 +1,93 @@
+"""Measured components that repeat others, noise and all: what rounding leaves of them says nothing.
+
+Take away from such a component what those before it say: its slopes and its noise are differences of equal numbers,
+zero, of which rounding leaves some eps. Its own noise, the rounding of numbers, is as small, so that slopes of some eps
+would be information, and a noise of some eps would be correlated with those to come.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from heliograph.factors.columns import (
+    RANK,
+    UNITS,
+    Columns,
+    assemble_factors,
+    column_below_diagonal,
+    insert_column,
+    reciprocal_or_one,
+    triangularise,
+    unit_of,
+)
+from heliograph.numerics.linalg import WRITTEN, outer, scale
+from straightline import operation
+
+
+def triangularise_noise(noise: Columns) -> Columns:
+    """`triangularise` of the noises of m components, in which those that repeat others leave nothing but their own.
+
+    With w_i = W_i - sum_j L_ij w_j: an entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is zero, where components
+    follow that might be correlated with it.
+    """
+    if len(noise.matrix) < 3:
+        return triangularise(noise)
+    matrix, weights = jnp.asarray(noise.matrix), jnp.asarray(noise.weights)
+    return (_triangularise_in_loop if len(matrix) > WRITTEN else _triangularise_row_by_row)(matrix, weights)
+
+
+def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
+    """Variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding, of rows of variances `whole`.
+
+    UNITS n eps of each s_i, from which measuring takes what was known, and RANK of what is subtracted: a correlation of
+    noises is not known to more.
+    """
+    own = UNITS * n * unit_of(whole)
+    below = jnp.tril(lower, -1)
+    least: jax.Array = own**2 * whole + max(own, RANK) ** 2 * (below**2 @ whole)
+    return least
+
+
+def immense(variance: jax.Array) -> float:
+    """Return a variance beside which slopes say nothing: a power of two, whose reciprocal is exact."""
+    return float(2.0 ** (np.finfo(np.dtype(variance.dtype)).maxexp // 2))
+
+
+def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
+    """Numbers, and zero where they are no larger than `least`; NaN stays."""
+    return jnp.where(jnp.abs(numbers) <= least, 0.0, numbers)
+
+
+def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> Columns:
+    m, share, size = len(rows), max(UNITS * rows.shape[1] * unit_of(rows), RANK), jnp.abs(rows)
+    lower, variances = list[jax.Array](), list[jax.Array]()
+    for j in range(m):
+        row = lax.index_in_dim(rows, j, keepdims=False)
+        if 0 < j < m - 1:
+            row = _clear(row, share * lax.index_in_dim(size, j, keepdims=False))
+        weighted = scale(weights, row)
+        variances.append(lax.dot(row, weighted))
+        over = lax.reshape(reciprocal_or_one(variances[j]), (1,))
+        below = column_below_diagonal(j, outer(lax.dot(rows, weighted), over))
+        rows, size = rows - outer(below, row), size + outer(jnp.abs(below), jnp.abs(row))
+        lower.append(below)
+    return assemble_factors(lower, variances, rows.dtype)
+
+
+@operation(_triangularise_row_by_row)
+def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> Columns:
+    m, share = len(rows), max(UNITS * rows.shape[1] * unit_of(rows), RANK)
+
+    def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        rows, size, lower, variances = carry
+        row = _clear(rows[j], share * size[j])
+        weighted = weights * row
+        d = row @ weighted
+        below = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
+        rows, size = rows - outer(below, row), size + outer(jnp.abs(below), jnp.abs(row))
+        return rows, size, *insert_column(j, lower, below, variances, d)
+
+    start = rows, jnp.abs(rows), jnp.eye(m, dtype=rows.dtype), jnp.zeros(m, rows.dtype)
+    _, _, lower, variances = lax.fori_loop(0, m, body, start)
+    return Columns(lower, variances)
