@@ -145,6 +145,8 @@ def test_nees_is_taken_around_the_circle_where_angles_are_named():
     fused = hg.fusion.fuse(hg.fusion.EqualIntersection(), [hg.model.Estimate(np.array(m), covariance, "nominal")
                                                            for m in (truth[0], mean[0])], plant)  # fmt: skip
     assert np.abs(fused.mean[1]) == pytest.approx(np.pi)
+    judged = hg.consistency(hg.nees(truth, mean, covariance, [1]), 2)
+    assert (judged.mean, judged.expected) == (pytest.approx(around, rel=1e-12), 2)
     for wrong in ([2], [-1], [0.5], "x1", hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0)):
         with pytest.raises(ValueError, match=r"^angles: expected"):
             hg.nees(truth, mean, covariance, wrong)

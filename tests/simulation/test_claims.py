@@ -1,5 +1,7 @@
 """Claims in a network: a filter's own where it believes the world in which it stands, else nominal at most."""
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -161,6 +163,24 @@ def test_the_word_goes_wherever_the_claim_goes(tmp_path):
     assert hg.Stream(network.nodes["a"].filters["f"]).push([0.0]).claim == "nominal"
     hg.export_c(network.nodes["a"].filters["f"], tmp_path / "step.c")
     assert "Claim: nominal" in (tmp_path / "step.h").read_text()
+
+
+@pytest.mark.slow
+def test_the_word_goes_into_tables_timelines_single_precision_and_what_a_service_tells():
+    """A Kalman filter behind losses by silence that it takes for none."""
+    network = network_of(hg.dropout(LINK, 0.7), linear(LINK))
+    single = hg.monte_carlo(network, 4, 2, 0, precision="float32")
+    assert single.estimates["a"]["f"].claim == "nominal"
+    timeline = hg.Timeline(network, 5.0)
+    timeline.push("a", 0, 0.0, [0.5], 0.0)
+    assert timeline.estimates()["a"]["f"].claim == "nominal"
+    kept = hg.monte_carlo(network, 4, 2, 0, keep=hg.Statistics())
+    assert kept.to_pandas().loc["a", "f"]["claim"] == "nominal"
+    fleet = hg.serving.Fleet(hg.serving.NetworkProgram(network), hg.serving.Options(window=5.0, step=1.0))
+    service = hg.serving.Service(fleet, hg.serving.InMemoryStore())
+    body = {"plant": "p", "node": "a", "sequence": 0, "time": 0.0, "values": [0.5]}
+    told = [json.loads(output.body) for output in service.take([json.dumps(body).encode()])]
+    assert {message["estimates"]["a"]["f"]["claim"] for message in told if "estimates" in message} == {"nominal"}
 
 
 class World:

@@ -111,6 +111,19 @@ network = hg.Network(plant, {"n": node})
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("value", [0.0, 1.5])
+def test_a_recording_at_rest_has_a_page(tmp_path, monkeypatch, capsys, value):
+    """All innovations are zero, or become so: there is a page, and status 0."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.py").write_text(NET)
+    (tmp_path / "data.csv").write_text("time,y\n" + "".join(f"{i},{value}\n" for i in range(60)))
+    arguments = ["run", "net.py", "--measurements", "data.csv", "--out", "out.csv", "--report", "page"]
+    assert cli.main(arguments) == 0
+    assert (tmp_path / "page" / "report.html").is_file() and (tmp_path / "out.csv").is_file()
+    assert "expected innovations" not in capsys.readouterr().err
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [3, 120])
 def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys, rows):
     monkeypatch.chdir(tmp_path)

@@ -70,6 +70,17 @@ def test_the_way_of_an_unknown_heading_is_not_what_one_gaussian_says():
     assert float(node.run(np.ones((steps, 1))).means[-1, 0]) == said[2][0]  # the default
 
 
+def test_exact_moments_are_right_where_a_heading_is_unknown():
+    """60 m in one step, by the quadrature of degree 16: 8.1 +- 41.7 along and +- 42.4 across, to a tenth of a metre."""
+    plant = hg.Plant(lambda x, u: jnp.stack([60 * jnp.cos(x[2]), 60 * jnp.sin(x[2]), x[2]]), 1e-8 * np.eye(3),
+                     np.zeros(3), np.diag([1e-4, 1e-4, 4.0]), circular=["x2"])  # fmt: skip
+    sensor = hg.LinearSensor([[1.0, 0.0, 0.0]], 1.0)
+    f = hg.filters.gaussian_filter(plant, sensor, None, hg.filters.PolynomialMoments(16))
+    moved = f.run([[np.nan], [np.nan]])
+    np.testing.assert_allclose(moved.means[-1, :2], [60 * np.exp(-2), 0.0], atol=0.1)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(moved.covariances[-1])[:2]), [41.65, 42.42], atol=0.1)
+
+
 def test_what_is_known_well_enough_is_not():
     """Points of 4 states lie 2 deviations away: at 0.9 rad still before half a turn; of more than 9 states at less."""
     for network in (driving(0.9), driving(2.0, circular=())):

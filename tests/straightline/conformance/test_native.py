@@ -16,6 +16,9 @@ The cases are made of the table of rules, so that a new rule is covered by being
   are made in another order; lgamma, whose zeros XLA has to 4e-7 (`vectors/test_elementary.py` has its values).
 * The sign of a sum that is zero: XLA drops a known 0 that is added to -0, as native code does, and begins some sums
   with a 0 that others do not have (`ADDED`).
+* What XLA makes of two operations together, where native code agrees with JAX operation by operation: XLA takes a flag
+  times a number for a choice, so that False times NaN is 0, and an integer that is cast to an unsigned one and on to a
+  real number keeps its sign (`test_where_xla_rewrites_native_code_means_what_the_operations_say`).
 """
 
 import sys
@@ -23,10 +26,13 @@ import warnings
 from itertools import product
 from typing import Any
 
+import jax
 import jax.extend.core
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import straightline as sl
 from straightline.compiled import Compiled
 from straightline.lowering import IN_MEMORY, RULES, traced
 from straightline.nodes import Unsupported
@@ -228,3 +234,19 @@ def test_native_code_has_all_digits_where_xla_has_fourteen(name):
         exact = getattr(np, name)(case.arguments[0])
     compare(name, [case], by_lanes(case), [[exact]], "beside NumPy")
     assert not np.any(difference(by_lanes(case)[0], exact, 4.0))
+
+
+@pytest.mark.parametrize(
+    ("function", "right"),
+    [
+        (lambda x: (x > 0) * x, [1.5, -0.0, np.nan, 7.0]),
+        (lambda x: jnp.nan_to_num(x).astype(int).astype(jnp.uint64).astype(float), [1.0, 2.0**64 - 2, 0.0, 7.0]),
+    ],
+)
+def test_where_xla_rewrites_native_code_means_what_the_operations_say(function, right):
+    """As NumPy has them one after another: False times NaN is NaN, and -2 without a sign is 2^64 - 2."""
+    x = np.array([1.5, -2.0, np.nan, 7.0])
+    with jax.enable_x64(True):
+        result = sl.compile(function, x)(x[None])[0]
+    np.testing.assert_array_equal(result, right)
+    np.testing.assert_array_equal(np.signbit(result[:2]), np.signbit(right[:2]))
