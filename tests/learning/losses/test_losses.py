@@ -148,7 +148,31 @@ def test_the_law_that_predicts_best_is_chosen(learned):
     assert learned.best == "hidden"
     assert said["independent"] == 0 < said["markov"] < said["markov_4"] < said["hidden"]
     assert learned.held_out["hidden"].gain > 4 * learned.held_out["hidden"].gain_error
-    assert hg.learning.learn_losses(BURSTS, held_out=0).best == "hidden"
+
+
+def test_without_packets_held_out_the_hidden_mode_is_chosen_where_it_is_significant(bursts):
+    """Ten packets are too few to say that losses remember."""
+    assert hg.learning.learn_losses(bursts[:500], held_out=0).best == "hidden"
+    assert hg.learning.learn_losses(BURSTS, held_out=0).best == "independent"
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_independent_losses_are_called_independent(seed):
+    """By the field and by the channel alike: of these recordings a chain, a mode or a long chain predicts better."""
+    found = hg.learning.learn_losses((np.random.default_rng(seed).random(200) < 0.3).astype(float))
+    assert max(found.held_out, key=lambda name: found.held_out[name].log_likelihood) != "independent"
+    assert found.best == found.best_channel == "independent"
+    (loss,) = found.laws["independent"].shares().values()
+    assert repr(found.channel(hg.hop(1.0, 0.1))) == repr(hg.erasure(hg.hop(1.0, 0.1), 1 - loss.estimate))
+
+
+def test_a_drifting_rate_that_predicts_best_leaves_the_next_best_to_the_channel():
+    """Rates from 5 % to 60 % and back, slowly: `best` is a rate that no channel has."""
+    rate = 0.325 - 0.275 * np.cos(np.arange(3000) / 240)
+    found = hg.learning.learn_losses((np.random.default_rng(4).random(3000) < rate).astype(float))
+    assert found.best_channel in ("markov", "markov_4", "hidden")
+    assert found.channel(hg.hop(1.0, 0.1)) is not None
+    assert found.best in ("running", found.best_channel)
 
 
 def test_independent_losses_are_said_from_bursts():

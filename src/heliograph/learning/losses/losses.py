@@ -19,6 +19,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"
 
 LONG = 4  # packets back that the longer of the two chains looks
+LEVEL = 0.01  # probability that independent losses are said to have memory
 
 
 class HeldOutScores(NamedTuple):
@@ -94,7 +95,9 @@ class Losses:
         memory: tests of independence on all packets.
         held_out: scores of each law on the later packets, when fitted to the earlier ones alone; empty where one part
             is too short.
-        best: name of the law that predicts best, "hidden" where nothing was held out.
+        best: name of the law that predicts best of those whose likelihood ratio is significant; "independent" where
+            none is. Where nothing was held out, "hidden" if that is significant.
+        best_channel: the same among the laws that a channel can have, which are all but "running".
     """
 
     packets: int
@@ -103,16 +106,19 @@ class Losses:
     memory: LossMemory
     held_out: dict[str, HeldOutScores]
     best: str
+    best_channel: str
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link with the losses of the law that predicts best among those that a channel can have."""
-        able = [name for name in self.laws if name != RUNNING]
-        name = max(able, key=lambda law: self.held_out[law].log_likelihood) if self.held_out else self.best
-        return self.laws[name].channel(link)
+        """Return the link with the losses of the law `best_channel`."""
+        return self.laws[self.best_channel].channel(link)
 
 
 def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     """Fit four kinds of laws to losses, test for memory, and choose by how well the laws predict the later packets.
+
+    Losses are independent unless another law is significant: twice its gain of log-likelihood on all packets is above
+    the chi-square quantile of the numbers that it has more, at 1 % for the four other laws together, a quarter each. Of
+    these laws and "independent" the one is chosen under which the later packets are most likely.
 
     Args:
         fates: a stretch of 0 (arrived), 1 (lost) and NaN (unknown), or several in the order of time, as
@@ -129,9 +135,33 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     known = is_trial(np.concatenate(parts))
     cut = int(np.floor(known.sum() * (1 - share)))
     held_out_scores = _score_held_out(parts, known, cut) if 0 < cut < known.sum() else {}
-    best = max(held_out_scores, key=lambda name: held_out_scores[name].log_likelihood) if held_out_scores else HIDDEN
+    laws = _fit_laws(parts, True)
+    significant = _find_significant_laws(laws, parts)
+    best = _choose_law(significant, held_out_scores)
+    best_channel = _choose_law(significant - {RUNNING}, held_out_scores)
     lost = int(np.sum(np.concatenate(parts) == 1))
-    return Losses(int(known.sum()), lost, _fit_laws(parts, True), LossMemory.of(parts), held_out_scores, best)
+    return Losses(int(known.sum()), lost, laws, LossMemory.of(parts), held_out_scores, best, best_channel)
+
+
+def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
+    """Find the laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them together."""
+    level = LEVEL / (len(laws) - 1)
+    score = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
+    more = {name: len(law.shares()) - 1 for name, law in laws.items()}
+    return {
+        name
+        for name in laws
+        if name != INDEPENDENT and scipy.stats.chi2.sf(2 * (score[name] - score[INDEPENDENT]), more[name]) < level
+    }
+
+
+def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> str:
+    """Choose the law of the largest held-out likelihood of these and independent losses; "hidden" without scores."""
+    if not held_out:
+        return HIDDEN if HIDDEN in significant else INDEPENDENT
+    return max(
+        held_out, key=lambda name: held_out[name].log_likelihood if name in {INDEPENDENT, *significant} else -np.inf
+    )
 
 
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
