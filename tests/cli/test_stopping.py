@@ -5,7 +5,6 @@ import signal
 import pytest
 
 from heliograph import cli
-from heliograph.cli.stopping import GentleStop
 
 
 @pytest.fixture(autouse=True)
@@ -18,7 +17,7 @@ def interruptible():
 
 def test_a_second_signal_of_another_kind_leaves_the_exit_code_of_the_first():
     """Noted, then unwinding: SIGTERM and then SIGINT is 143, as SIGTERM alone."""
-    with GentleStop() as stop:
+    with cli.GentleStop() as stop:
         stop.begin()
         signal.raise_signal(signal.SIGTERM)
         assert stop.code == cli.TERMINATED
@@ -37,6 +36,6 @@ def test_an_interrupt_raised_again_for_a_swallowed_one_leaves_the_exit_code_of_t
             signal.raise_signal(signal.SIGINT)
         return 1
 
-    with GentleStop() as stop:
+    with cli.GentleStop() as stop:
         assert stop.unless_stopped(swallow_the_first) is None
         assert stop.code == cli.TERMINATED

@@ -5,4 +5,5 @@ from heliograph.cli.command import main as main
 from heliograph.cli.stopping import INTERRUPTED as INTERRUPTED
 from heliograph.cli.stopping import SIGNALLED as SIGNALLED
 from heliograph.cli.stopping import TERMINATED as TERMINATED
+from heliograph.cli.stopping import GentleStop as GentleStop
 from heliograph.numerics.process.extras import EXTRAS as EXTRAS
