@@ -20,7 +20,6 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.modes.patterns import append_flag
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -96,16 +95,15 @@ class ToldFilter(AbstractSizedFilter):
         after, innovation = filter.correct(state, values, k)
         # Numbers that give no law make the state none, so that the message is refused where it came in.
         after = _spoil(after, ~is_law & ~jnp.all(jnp.isnan(values)))
-        # What is told belongs to the innovation; given it, it adds nothing to the likelihood.
-        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
-        for number in numbers:
-            flag_innovation, covariance = append_flag(covariance, number)
-            value = jnp.append(value, flag_innovation)
-        order = np.argsort((*self.values, *self.numbers))
+        # What is told is no measurement: like what did not arrive it is NaN in the innovation, and counts for no test.
+        received, values_at = len(self.values) + len(self.numbers), np.array(self.values)
+        value = jnp.full(received, jnp.nan).at[values_at].set(innovation.value)
+        covariance = jnp.full((received, received), jnp.nan)
+        covariance = covariance.at[values_at[:, None], values_at].set(innovation.covariance)
         weight = innovation.weight
         if weight is not None:
-            weight = jnp.concatenate([weight, jnp.where(jnp.isnan(numbers), jnp.nan, 1.0)])[order]
-        return after, Innovation(value[order], covariance[order][:, order], innovation.log_likelihood, weight)
+            weight = jnp.full(received, jnp.nan).at[values_at].set(weight)
+        return after, Innovation(value, covariance, innovation.log_likelihood, weight)
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
