@@ -19,13 +19,13 @@ import jax
 import numpy as np
 
 import heliograph as hg
-from heliograph.engine.choice import chosen
+from heliograph.engine.choice import choose_code
 from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
-from heliograph.learning.likelihood.maximise import NEAR, Evaluated, maximise
-from heliograph.learning.likelihood.objective import Evaluation, Form, Objective, objectives, one_recording
+from heliograph.learning.likelihood.objective import Evaluation, Form, Objective, evaluate_recording, make_objectives
 from heliograph.learning.likelihood.surface import DIFFERENCE
 from heliograph.learning.likelihood.transforms import unlink
+from heliograph.learning.likelihood.trust_region import NEAR, Evaluated, maximise
 from heliograph.learning.parameters import Parameters
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 
@@ -157,11 +157,11 @@ def fit_each(network: Build, z: np.ndarray, u: np.ndarray, form: Form) -> Fits:
     """
     description = describe(network)
     parameters = description.parameters
-    objective = next(item for item in objectives(description) if item.form == form)
+    objective = next(item for item in make_objectives(description) if item.form == form)
 
     def outcome(x: np.ndarray, data: np.ndarray) -> Evaluation:
         with jax.enable_x64(True):
-            choice = chosen(one_recording, (objective, x, data, u), [False, True, True, False])
+            choice = choose_code(evaluate_recording, (objective, x, data, u), [False, True, True, False])
             if choice.code is None:
                 return to_numpy(_by_xla(objective, x, data, u))
             return choice.results()
@@ -191,7 +191,7 @@ def fit_each(network: Build, z: np.ndarray, u: np.ndarray, form: Form) -> Fits:
 
 @quickly_compiled
 def _by_xla(objective: Objective, x: jax.Array, z: jax.Array, u: jax.Array) -> Evaluation:
-    return jax.vmap(lambda point, item: one_recording(objective, point, item, u))(x, z)
+    return jax.vmap(lambda point, item: evaluate_recording(objective, point, item, u))(x, z)
 
 
 @cache

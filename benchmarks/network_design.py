@@ -13,7 +13,7 @@ from alone import milliseconds, show
 import heliograph as hg
 from heliograph.planning import Error
 from heliograph.planning.budget import make_unlimited
-from heliograph.planning.paths.design import power_task
+from heliograph.planning.paths.design import make_power_task
 
 SENSORS, STARTS, REPEATS = 20, 30, 20
 ERROR_LIMIT, CONVEX_LIMIT, STARTS_LIMIT = 1.0, 2000.0, 10_000.0
@@ -41,7 +41,7 @@ def measure() -> dict[str, Any]:
     few = hg.planning.independent_paths(TRANSITION, PROCESS, ROWS[:6], NOISES[:6], 1.02, ALPHA[:6, 0])
     free, even = np.ones(6, dtype=bool), np.full((1, 6), 1 / 3)
     criterion = Error().criterion(("x0", "x1", "x2"))
-    problem = power_task(few, criterion, make_unlimited(1, 6), free, np.zeros((1, 6)), 1, 0).problem
+    problem = make_power_task(few, criterion, make_unlimited(1, 6), free, np.zeros((1, 6)), 1, 0).problem
     network = relayed()
     values = {
         "error and gradient, 6 sensors": milliseconds(lambda: problem.sensitivity(even), 10 * REPEATS),

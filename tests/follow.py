@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen, compute_once
+from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.model import Estimate, Innovation
 from heliograph.numerics.float64 import compile_in_float64
@@ -121,7 +121,7 @@ _scan_by_xla = compile_in_float64(_scan)
 def _followed(items: AbstractFilter, z: Any, u: Any) -> Followed:
     """`_scan` of stacked filters: by native code, or by XLA where that does not support them."""
     with jax.enable_x64(True):
-        choice = chosen(_every_row, (items, z, u), [True] * 3)
+        choice = choose_code(_every_row, (items, z, u), [True] * 3)
         return choice.results() if choice.code is not None else _followed_by_xla(items, z, u)
 
 

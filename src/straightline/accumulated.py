@@ -10,10 +10,10 @@ from jaxtyping import PyTree
 
 from straightline.compiled import addresses, aligned, memory_of, threads
 from straightline.folding import DTYPES
-from straightline.llvm.module import written
+from straightline.llvm.module import write_module
 from straightline.lowering import like
 from straightline.machine import Tiers, features, narrow
-from straightline.program import Program, Summed, folded, lower, row_length
+from straightline.program import Program, Summed, fold_rows, lower, row_length
 
 PARTS = 64  # sums of their own, which computers of any number of cores share out
 
@@ -28,7 +28,7 @@ class Accumulated:
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
-        self.code = written(program, differs, None, features()[2], summed=summed)
+        self.code = write_module(program, differs, None, features()[2], summed=summed)
         self.common, self.operations = self.code.common, self.code.operations
         self.width = self.code.width
         self.blocks = Tiers(self.code.blocks, (narrow(self.width), self.width))
@@ -147,7 +147,7 @@ class Begun:
 
     def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Return the sums (..., batch) of several sums, of each summed result."""
-        return [folded(_add_in_order(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
+        return [fold_rows(_add_in_order(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
 
     def _outputs(self) -> list[tuple[Any, bool]]:
         return list(zip(self.program.code.outputs, self.program.summed.outputs, strict=True))

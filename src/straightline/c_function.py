@@ -9,9 +9,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
-from straightline.c_lowering import lowered_for_c
+from straightline.c_lowering import lower_for_c
 from straightline.c_source import CSource, Place, Real, c_type
-from straightline.lowering import code_line, scalars, traced, type_of
+from straightline.lowering import code_line, scalars, trace_function, type_of
 from straightline.nodes import Node, Type, Unsupported
 
 RANDOM = ("random_", "threefry")
@@ -93,12 +93,12 @@ def to_c(
         ValueError: a name that C does not take; numbers beyond single precision.
     """
     _check_name(name)
-    program, tree = traced(function, *examples)
+    program, tree = trace_function(function, *examples)
     equations = list(_yield_equations(program.jaxpr))
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
             raise Unsupported(equation.primitive.name, code_line(equation))
-    graph, buffers, outputs = lowered_for_c(program, finite, symmetric)
+    graph, buffers, outputs = lower_for_c(program, finite, symmetric)
     real: Real = "float" if single else "double"
     read, written = _name_arrays(function, examples, tree, names)
     # Arguments without axes are passed by value.

@@ -83,7 +83,7 @@ class CLowering(Lowering):
         return InMemory.whole(Buffer("table", type_of(array), array.shape, self.graph.top, array))
 
 
-def lowered_for_c(
+def lower_for_c(
     program: ClosedJaxpr, finite: Collection[int], symmetric: Collection[int]
 ) -> tuple[FiniteGraph, list[Buffer], list[np.ndarray]]:
     """Return a traced program's graph, a buffer for each argument and the nodes of each result.

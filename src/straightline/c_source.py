@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from straightline.nodes import REAL, Block, Buffer, Check, Guard, Loop, Node, Store, Type, Unsupported
-from straightline.program import needed
+from straightline.program import list_needed
 
 Real = Literal["double", "float"]
 
@@ -168,7 +168,7 @@ class CSource:
 
     def __init__(self, roots: Iterable[Node], places: Mapping[Buffer, Place], real: Real, prefix: str):
         self.places, self.real, self.prefix = places, real, prefix
-        self.needed = needed(roots)
+        self.needed = list_needed(roots)
         self.names: dict[Node, str] = {}
         self.arrays: dict[Buffer, str] = {}
         self.tables: dict[tuple[str, bytes], tuple[str, str]] = {}

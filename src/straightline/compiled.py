@@ -15,8 +15,8 @@ from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
 from straightline.limits import ALONE, LITTLE, LONGEST
-from straightline.llvm.module import LINE, Code, written
-from straightline.machine import Machine, Tiers, features, generated, narrow
+from straightline.llvm.module import LINE, Code, write_module
+from straightline.machine import Machine, Tiers, features, generate, narrow
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower
 
@@ -36,7 +36,7 @@ class Compiled:
         self.types = [DTYPES[b.type] for b in program.inputs]
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
-        self.code: Code = written(program, self.differs, width, features()[2])
+        self.code: Code = write_module(program, self.differs, width, features()[2])
         self.width = self.code.width
         self.operations, self.divisions = self.code.operations, self.code.divisions
         self.blocks = Tiers(self.code.blocks, (width or narrow(self.width), self.width))
@@ -148,9 +148,9 @@ class Alone:
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
-        self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
+        self.code = write_module(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
         level = int(self.code.operations <= ALONE)
-        self.machine, self.tree, self._in_place = generated(self.code.blocks, level, 1), program.tree, in_place
+        self.machine, self.tree, self._in_place = generate(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._place([])
 

@@ -15,12 +15,12 @@ from jaxtyping import PyTree
 from straightline.folding import DTYPES
 from straightline.memory import InMemory
 from straightline.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Unsupported
-from straightline.program import Program, needed
-from straightline.rules.random_bits import hashed
+from straightline.program import Program, list_needed
+from straightline.rules.random_bits import hash_words
 
 lax = jax.lax
 OPERATIONS: dict[str, Callable[..., jax.Array]] = {
-    "threefry": hashed,
+    "threefry": hash_words,
     "select": lax.select, "not": lax.bitwise_not, "and": lax.bitwise_and, "or": lax.bitwise_or, "xor": lax.bitwise_xor,
     "shift_right": lax.shift_right_logical, "shift_right_signed": lax.shift_right_arithmetic,
     "round_away": partial(lax.round, rounding_method=lax.RoundingMethod.AWAY_FROM_ZERO),
@@ -42,7 +42,7 @@ class _Evaluation:
         nodes = [n for x in program.outputs if not isinstance(x, InMemory) for n in x.ravel().tolist()]
         if not all(isinstance(n, Node) for n in nodes):
             raise Unsupported("keys of random numbers as results")
-        self.needed = needed([*nodes, *(x.buffer for x in program.outputs if isinstance(x, InMemory))])
+        self.needed = list_needed([*nodes, *(x.buffer for x in program.outputs if isinstance(x, InMemory))])
         self.values: dict[Node, jax.Array] = {}
         self.memory: Memory = {}
 

@@ -228,7 +228,7 @@ def _halved(example: Any) -> Any:
     return like(example.shape, HALVED[kind]) if kind in HALVED else example
 
 
-def traced(function: Callable[..., PyTree], *examples: PyTree, single: bool = False) -> tuple[ClosedJaxpr, Any]:
+def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: bool = False) -> tuple[ClosedJaxpr, Any]:
     """Trace a function of one run, in double precision or in single; return its program and its result's structure.
 
     What a result has beside arrays, as a filter its model's functions, is part of the structure.

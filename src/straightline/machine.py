@@ -85,7 +85,7 @@ def _hasty() -> ThreadPoolExecutor:
 
 
 @refusing("a program")
-def generated(source: Source, level: int, width: int) -> Machine:
+def generate(source: Source, level: int, width: int) -> Machine:
     """Generate code outside of the main thread, and wait for it.
 
     Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
@@ -141,7 +141,7 @@ class Tiers:
     def _first(self, executions: float) -> Machine:
         if self._machine is None:
             level = self._level(executions)
-            self._machine = generated(self._source, level, self._widths[level])
+            self._machine = generate(self._source, level, self._widths[level])
         return self._machine
 
     def _of(self, blocks: float) -> float:

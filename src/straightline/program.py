@@ -1,7 +1,7 @@
 """Lowered programs: inputs, outputs, what these need, what differs between runs, fused products, and sums over runs.
 
 Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, W the
-most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning (`folded`).
+most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning (`fold_rows`).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 from straightline.folding import DTYPES
 from straightline.graph import Graph
 from straightline.limits import LONGEST, TABLE
-from straightline.lowering import Lowering, Value, array_of, keys_of, traced, type_of
+from straightline.lowering import Lowering, Value, array_of, keys_of, trace_function, type_of
 from straightline.memory import InMemory
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store
 from straightline.rules import (  # noqa: F401  (they fill the rules)
@@ -62,7 +62,7 @@ def lower(
     single: bool = False,
 ) -> Program:
     """Lower a function of one run, for arguments of these shapes, to at most so many operations."""
-    return lower_traced(*traced(function, *examples, single=single), most, known, single)
+    return lower_traced(*trace_function(function, *examples, single=single), most, known, single)
 
 
 def lower_traced(
@@ -102,7 +102,7 @@ def _find_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, nu
     return array_of([graph.constant(x, kind) if m else graph.load(view.buffer, i) for m, x, i in entries], view.shape)
 
 
-def needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
+def list_needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
     """Return the nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
     results: dict[Any, None] = {}
     waiting: list[Any] = list(roots)
@@ -193,7 +193,7 @@ def uses(node: Any) -> Sequence[Node]:
     return []
 
 
-def in_order(items: Iterable[Any]) -> list[Any]:
+def sort_items(items: Iterable[Any]) -> list[Any]:
     """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
 
     def position(x: Any) -> int:
@@ -206,7 +206,7 @@ def in_order(items: Iterable[Any]) -> list[Any]:
     return sorted(items, key=position)
 
 
-def varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
+def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return which nodes, buffers, loops and guards of these, in order, differ if these input buffers do."""
 
     @cache
@@ -234,10 +234,10 @@ def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
     Runs read what they share after it is computed, when of an array that a loop carries in memory the last turn is
     left: where they need it within a turn, each has its own.
     """
-    spread = varying(items, inputs)
+    spread = find_varying(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
     while within := (carried and _read_within(crossing(items, spread)) & carried - spread):
-        spread = varying(items, [*inputs, *within, *(carried & spread)])
+        spread = find_varying(items, [*inputs, *within, *(carried & spread)])
     return spread
 
 
@@ -299,7 +299,7 @@ def row_length(width: int, batches: int) -> int:
     return batches + width - 1
 
 
-def folded(sums: np.ndarray, batches: int) -> np.ndarray:
+def fold_rows(sums: np.ndarray, batches: int) -> np.ndarray:
     """Return sums (..., batch) from rows (..., `row_length`)."""
     totals = sums[..., :batches].copy()
     for start in range(batches, sums.shape[-1], batches):

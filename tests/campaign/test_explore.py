@@ -10,7 +10,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign import explore, load_campaign, open_results
-from heliograph.campaign.explore import Detail, details
+from heliograph.campaign.explore import Detail, list_details
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import Score, read_summary
 from tests.campaign.example import CAMPAIGN, NETWORK, write
@@ -120,7 +120,7 @@ def test_single_states_add_up_to_the_scores(tmp_path):
         "LinearSensor([[1.0]]", "LinearSensor([[1.0, 0.0]]"))  # fmt: skip
     run_campaign(plan, tmp_path / "out", workers=0)
     scores, results = read_summary(tmp_path / "out" / "summary.csv"), open_results(tmp_path / "out")
-    result = details(tmp_path / "out" / "results.zarr", plan, [0, 1], [1, 3, 6])
+    result = list_details(tmp_path / "out" / "results.zarr", plan, [0, 1], [1, 3, 6])
     for score in scores:
         whole = [item for item in result if item.setting == score.setting and not item.step]
         assert sum(item.rmse**2 for item in whole) == pytest.approx(score.rmse**2, rel=1e-12)

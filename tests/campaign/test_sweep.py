@@ -4,7 +4,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign.failures import Failure
-from heliograph.campaign.page import campaign_figures, campaign_page
+from heliograph.campaign.page import draw_campaign_figures, write_campaign_page
 from heliograph.campaign.summary import read_summary
 from heliograph.report.progress import Countdown, format_remaining
 from tests.campaign.example import CAMPAIGN, write
@@ -81,7 +81,7 @@ def test_the_time_left():
 
 def test_figures(tmp_path, finished):
     campaign, scores = write(tmp_path), read_summary(finished / "summary.csv")
-    figures = campaign_figures(campaign, scores)
+    figures = draw_campaign_figures(campaign, scores)
     assert list(figures) == [
         "rmse against gain",
         "rmse against noise",
@@ -97,19 +97,19 @@ def test_figures(tmp_path, finished):
 
 def test_words_make_no_axis(tmp_path, finished):
     text = CAMPAIGN.partition("[grid]")[0] + '[grid]\ngain = [0.5]\nkind = ["one", "two"]\n'
-    figures = campaign_figures(write(tmp_path, text), read_summary(finished / "summary.csv")[:2])
+    figures = draw_campaign_figures(write(tmp_path, text), read_summary(finished / "summary.csv")[:2])
     assert list(figures) == ["rmse by setting", "nees_per_dimension by setting"]
     labels = [label.get_text() for label in figures["rmse by setting"].axes[0].get_yticklabels()]
     assert labels == ["gain = 0.5, kind = one", "gain = 0.5, kind = two"]
     six = text.replace('["one", "two"]', '["one", "two", "three", "four", "five", "six"]')
-    figures = campaign_figures(write(tmp_path, six), read_summary(finished / "summary.csv"))
+    figures = draw_campaign_figures(write(tmp_path, six), read_summary(finished / "summary.csv"))
     assert len(figures["nees_per_dimension by setting"].axes[0].get_yticklabels()) == 6
 
 
 @pytest.mark.slow
 def test_the_page_says_what_failed(tmp_path, finished, fits):
     entry = Failure(3, {"gain": 0.7}, 1, (64, 99), (5, 0, 0), "RuntimeError: <bad> luck", "", "heliograph sweep x")
-    html = campaign_page(write(tmp_path), read_summary(finished / "summary.csv"), [entry]).html()
+    html = write_campaign_page(write(tmp_path), read_summary(finished / "summary.csv"), [entry]).html()
     fits(html)
     for text in ("What failed", "RuntimeError: &lt;bad&gt; luck", "heliograph sweep x", "runs 64 to 99"):
         assert text in html

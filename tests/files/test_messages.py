@@ -285,7 +285,7 @@ def test_a_folder_of_bags_is_read_as_one(world, tmp_path):
 
 
 def test_a_stamp_with_an_offset_is_the_same_one_by_one(world, monkeypatch):
-    from heliograph.files.bags.layout import Decoder
+    from heliograph.files.bags.message_layout import Decoder
 
     network, _, drive, path = world
     field = hg.files.json_field("pose.pose.position.x", "gps", time=hg.files.Stamp("header.stamp", -0.05))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.fields import at, decode_json, matches, nanoseconds
+from heliograph.files.fields import at, convert_time, decode_json, match_topic
 from heliograph.files.sources import Sources, Unread
 
 json_field = hg.files.json_field
@@ -80,7 +80,7 @@ STAMP = SECONDS * 10**9 + 123_456_789
     ],
 )
 def test_times_keep_every_nanosecond(value, unit, expected):
-    assert nanoseconds(value, unit, "t") == expected
+    assert convert_time(value, unit, "t") == expected
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_times_keep_every_nanosecond(value, unit, expected):
 )
 def test_what_is_no_time_is_refused(value):
     with pytest.raises(ValueError, match=r"^t: expected "):
-        nanoseconds(value, "s", "t")
+        convert_time(value, "s", "t")
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_what_is_no_time_is_refused(value):
     ],
 )
 def test_wildcards_are_those_of_mqtt(topic, pattern, expected):
-    assert matches(topic, pattern) == expected
+    assert match_topic(topic, pattern) == expected
 
 
 def test_unknown_topics_are_counted_and_never_guessed():

@@ -5,8 +5,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.trust_region import maximise
 from tests.oracles.learning_links import likelihood
 
 STEPS = 400

@@ -6,7 +6,7 @@ from scipy import optimize
 
 import heliograph as hg
 from heliograph.learning.intervals import bartlett, block_sums, cosines, covariance_by_model, find_told_by_few, white
-from heliograph.learning.likelihood.maximise import maximise
+from heliograph.learning.likelihood.trust_region import maximise
 from heliograph.learning.unidentified import find_confounded, product_text, rank_of, sum_text
 
 RNG = np.random.default_rng(0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood.maximise import maximise, trust_region_step
+from heliograph.learning.likelihood.trust_region import maximise, trust_region_step
 
 NATS = 1e-3  # below another search
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"

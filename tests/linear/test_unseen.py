@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.known_losses import eigenspaces, fastest_unobserved_mode, is_excited_by_noise
+from heliograph.linear.known_losses import find_eigenspaces, find_fastest_unobserved_mode, is_excited_by_noise
 
 NONE = np.zeros((0, 2))
 INDEPENDENT = np.array([[0.3, 0.7]] * 2)
 
 
 def test_a_loss_hides_everything():
-    result = fastest_unobserved_mode(np.diag([1.5, 2.0]), INDEPENDENT, [NONE, np.array([[1.0, 1.0]])])
+    result = find_fastest_unobserved_mode(np.diag([1.5, 2.0]), INDEPENDENT, [NONE, np.array([[1.0, 1.0]])])
     np.testing.assert_allclose(result.growth, 0.3 * 4)
     assert result.modes == (0,)
     np.testing.assert_allclose(np.abs(result.vectors.ravel()), (0, 1), atol=1e-12)
@@ -18,7 +18,7 @@ def test_a_loss_hides_everything():
 
 def test_an_output_hides_what_it_does_not_see():
     """Mode 1 shows the first state only: the second is hidden in both, the faster first in one."""
-    result = fastest_unobserved_mode(np.diag([1.5, 1.1]), INDEPENDENT, [NONE, np.array([[1.0, 0.0]])])
+    result = find_fastest_unobserved_mode(np.diag([1.5, 1.1]), INDEPENDENT, [NONE, np.array([[1.0, 0.0]])])
     np.testing.assert_allclose(result.growth, 1.1**2)
     assert result.modes == (0, 1)
 
@@ -26,14 +26,14 @@ def test_an_output_hides_what_it_does_not_see():
 def test_one_eigenvalue_with_two_vectors_hides_in_each_output():
     """z = x1 or z = x2 arrives, never both: each vector is hidden half of the time, none always."""
     outputs = [np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]])]
-    result = fastest_unobserved_mode(1.3 * np.eye(2), np.full((2, 2), 0.5), outputs)
+    result = find_fastest_unobserved_mode(1.3 * np.eye(2), np.full((2, 2), 0.5), outputs)
     np.testing.assert_allclose(result.growth, 0.5 * 1.69)
     assert len(result.modes) == 1
 
 
 def test_bursts_hide_by_how_long_they_last():
     chain = np.array([[0.9, 0.1], [0.4, 0.6]])
-    result = fastest_unobserved_mode(np.array([[2.0]]), chain, [np.ones((1, 1)), np.zeros((0, 1))])
+    result = find_fastest_unobserved_mode(np.array([[2.0]]), chain, [np.ones((1, 1)), np.zeros((0, 1))])
     np.testing.assert_allclose(result.growth, 0.6 * 4)
 
 
@@ -42,16 +42,16 @@ def test_units_do_not_decide(scale):
     units = np.diag([scale, 1.0])
     matrix = units @ np.array([[1.2, 1.0], [0.0, 1.1]]) @ np.linalg.inv(units)
     output = np.array([[0.0, 1.0]])
-    result = fastest_unobserved_mode(matrix, np.ones((1, 1)), [output])
+    result = find_fastest_unobserved_mode(matrix, np.ones((1, 1)), [output])
     np.testing.assert_allclose(result.growth, 1.44)
 
 
 def test_eigenspaces_of_a_rotation_and_of_a_double_eigenvalue():
-    ((value, space),) = eigenspaces(np.array([[0.0, -2.0], [2.0, 0.0]]))
+    ((value, space),) = find_eigenspaces(np.array([[0.0, -2.0], [2.0, 0.0]]))
     assert abs(value - 2j) < 1e-12 and space.shape == (2, 1)
-    ((_, whole),) = eigenspaces(np.eye(3))
+    ((_, whole),) = find_eigenspaces(np.eye(3))
     assert whole.shape == (3, 3)
-    ((_, jordan),) = eigenspaces(np.array([[1.0, 1.0], [0.0, 1.0]]))
+    ((_, jordan),) = find_eigenspaces(np.array([[1.0, 1.0], [0.0, 1.0]]))
     np.testing.assert_allclose(np.abs(jordan.ravel()), (1, 0), atol=1e-7)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.simulation.plausible_step import plausible_step
+from heliograph.simulation.plausible_step import step_plausibly
 from heliograph.simulation.stepping import AllFilters
 from tests.live.worlds import FADING, PLANT, SENSOR, events, forgetful, moving
 
@@ -126,6 +126,6 @@ def test_the_step_without_implausible_data_is_the_same_code_as_that_with_all():
     network = hg.Network(plant, {"a": node})
     filters = AllFilters(network, judges=True)
     arguments = filters, filters.init(), [jnp.zeros((1, 1))], jnp.zeros(0), jnp.asarray(0)
-    texts = [str(eqx.filter_make_jaxpr(step)(*arguments)[0]) for step in (AllFilters.step, plausible_step)]
+    texts = [str(eqx.filter_make_jaxpr(step)(*arguments)[0]) for step in (AllFilters.step, step_plausibly)]
     written = [text.count(" atan ") for text in texts]
     assert written[0] == written[1] > 0, written

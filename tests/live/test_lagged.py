@@ -88,11 +88,11 @@ def test_filters_without_a_covariance_refuse_and_are_left_out():
 def test_a_moment_costs_the_rows_of_its_lag_and_not_of_the_window(monkeypatch):
     """Rows before the moment were read too, all of the window, and the engine was chosen anew for each moment."""
     lengths, engines = [], []
-    estimates, chosen = RowSmoother.estimates, row_smoother.chosen
+    estimates, chosen = RowSmoother.estimates, row_smoother.choose_code
     monkeypatch.setattr(
         RowSmoother, "estimates", lambda self, h, *span: lengths.append(span) or estimates(self, h, *span)
     )
-    monkeypatch.setattr(row_smoother, "chosen", lambda *arguments: engines.append(1) or chosen(*arguments))
+    monkeypatch.setattr(row_smoother, "choose_code", lambda *arguments: engines.append(1) or chosen(*arguments))
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})
     timeline = hg.Timeline(hg.Network(plant, {"a": node}), window=50.0)

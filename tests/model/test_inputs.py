@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.model.inputs import covariances_wrong, inputs_spoil
+from heliograph.model.inputs import do_inputs_spoil, find_wrong_covariances
 
 BACKWARDS, WRAPPED, HUGE = -1.0, 2.0**32 - 1, 1e30
 
@@ -172,8 +172,8 @@ def test_the_test_in_a_step_agrees_with_that_of_all_rows():
             for matrix in (sound, negative, skewed, np.full((n, n), np.nan)):
                 plant = hg.LinearPlant(np.eye(n), lambda u, m=matrix: jnp.asarray(m), np.zeros(n), 1.0, inputs=["s"])
                 with jax.enable_x64(True):
-                    spoilt = inputs_spoil(plant, ("s",), jnp.zeros(1), 0)
-                assert bool(spoilt) == covariances_wrong(matrix[None])[0]
+                    spoilt = do_inputs_spoil(plant, ("s",), jnp.zeros(1), 0)
+                assert bool(spoilt) == find_wrong_covariances(matrix[None])[0]
 
 
 STATE, START = np.zeros((3, 1)), ([0.0, 0.0], np.eye(2))

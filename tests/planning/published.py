@@ -5,7 +5,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.planning import Error
 from heliograph.planning.budget import make_unlimited
-from heliograph.planning.paths.design import power_task
+from heliograph.planning.paths.design import make_power_task
 
 A = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
 Q = np.diag([0.1, 0.05, 0.2])
@@ -47,4 +47,4 @@ def path_problem(paths, error, weight, free, powers):
     """The error of paths by the powers of the hops that are free, without limits; `weight` is a matrix."""
     weighted = Error(weight, error.worst, error.horizon, error.at_end, error.period)
     criterion = weighted.criterion(("x0", "x1", "x2"))
-    return power_task(paths, criterion, make_unlimited(error.steps, int(free.sum())), free, powers, 1, 0).problem
+    return make_power_task(paths, criterion, make_unlimited(error.steps, int(free.sum())), free, powers, 1, 0).problem

@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.report import examine
-from heliograph.report.held import held_value
+from heliograph.report.held import find_held_value
 
 PLANT = hg.LinearPlant([[1.0]], 0.01, [0.0], 1.0, states=["x"])
 SENSOR = hg.LinearSensor([[1.0]], 1.0, outputs=["y"])
@@ -83,11 +83,11 @@ def test_coarse_readings_of_what_rests_are_not_stuck():
     rng = np.random.default_rng(3)
     coarse = np.round(0.1 * rng.standard_normal(500) / 2) * 2
     coarse[250:] += 2
-    assert held_value(coarse, np.full(500, 0.01)) is None
+    assert find_held_value(coarse, np.full(500, 0.01)) is None
     fine = np.round(rng.standard_normal(5000), 1)
-    assert held_value(fine, np.full(5000, 1.0)) is None
+    assert find_held_value(fine, np.full(5000, 1.0)) is None
     fine[40:52] = 0.3
-    held = held_value(fine, np.full(5000, 1.0))
+    held = find_held_value(fine, np.full(5000, 1.0))
     assert held is not None and held.readings >= 12 and held.first_row <= 40
 
 

@@ -7,7 +7,7 @@ import pytest
 from sqlalchemy import text
 
 from heliograph.serving.service import Service
-from heliograph.serving.storage.database import engine_at
+from heliograph.serving.storage.database import open_database
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
 from tests.postgres import Postgres
@@ -69,7 +69,7 @@ def test_a_store_in_a_file_begins_from_one_in_postgresql(tmp_path, monkeypatch, 
 
 
 def test_parts_are_leased_in_postgresql(database):
-    test_sharing.shared(engine_at(database))
+    test_sharing.shared(open_database(database))
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_a_damaged_plant_is_refused_by_name_in_postgresql(database, how):
     begun.published(begun.take(sent[:half]))
     known = begun.store.load(["p0"])["p0"].body
     begun.store.close()
-    engine = engine_at(database)
+    engine = open_database(database)
     with engine.begin() as connection:
         connection.execute(text(f"update plants set {how} where name = 'p1'"))
     engine.dispose()

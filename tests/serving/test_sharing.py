@@ -22,7 +22,7 @@ import heliograph
 from heliograph.serving.brokers.transport import encode_name
 from heliograph.serving.service import Service
 from heliograph.serving.storage import leases
-from heliograph.serving.storage.database import engine_at
+from heliograph.serving.storage.database import open_database
 from heliograph.serving.storage.leases import Leases
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph_studies.live.server import Server
@@ -34,7 +34,7 @@ NETWORK = "from tests.serving.worlds import stepping\nnetwork = stepping()\n"
 
 
 def test_processes_share_evenly_and_take_over_what_nobody_renews(tmp_path):
-    shared(engine_at(str(tmp_path / "store.sqlite")))
+    shared(open_database(str(tmp_path / "store.sqlite")))
 
 
 def shared(engine: Engine) -> None:

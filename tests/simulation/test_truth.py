@@ -6,8 +6,8 @@ import pytest
 import heliograph as hg
 from heliograph.cli.run import run as command
 from heliograph.report import examine, run_summary
-from heliograph.report.outputs import errors_of, round_to
-from heliograph.report.pages.run import errors_table
+from heliograph.report.outputs import compare_with_truth, round_to
+from heliograph.report.pages.run import make_errors_table
 
 PLANT = hg.LinearPlant([[1.0, 0.2], [0.0, 0.9]], 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["place", "speed"])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3, outputs=["range"])
@@ -84,13 +84,13 @@ def test_the_report_shows_the_errors():
     single = hg.simulate(NETWORK, 40, 3)
     record = hg.run(NETWORK, single.measurements, truth=single.truth)
     health = examine(NETWORK, record, np.zeros((40, 0)))
-    (table,) = errors_table(record)
+    (table,) = make_errors_table(record)
     assert table.headers == ["filter", "claim", "RMSE of place", "RMSE of speed", "NEES"]
     rmse = record.rmse("a", "f")
     size = record.nees("a", "f").mean() / 2
     assert table.rows[0][:2] == ["a/f", "exact"]
     # The standard error of a mean square over twice the root, by numbers that are far enough apart to be independent.
-    (of,) = errors_of(record)
+    (of,) = compare_with_truth(record)
     assert of.rmse == rmse
     for shown, (state, error) in zip(table.rows[0][2:4], of.rmse_error.items(), strict=True):
         assert (
@@ -99,7 +99,7 @@ def test_the_report_shows_the_errors():
     assert table.rows[0][4] == round_to(size, of.nees_error) and 0.05 < of.nees_error / size < 0.5
     errors = run_summary(health)["errors"]["a"]["f"]
     assert errors == {"rmse": rmse, "nees": pytest.approx(size)}
-    assert errors_table(hg.run(NETWORK, single.measurements)) == []
+    assert make_errors_table(hg.run(NETWORK, single.measurements)) == []
 
 
 def test_the_command_says_how_far_off(tmp_path, capsys):
@@ -110,7 +110,7 @@ def test_the_command_says_how_far_off(tmp_path, capsys):
     command(f"{tmp_path}/net.py", measurements=tmp_path / "data.csv", out=tmp_path / "out.csv")
     record = hg.run(NETWORK, *recording)
     rmse = record.rmse("a", "f")
-    (of,) = errors_of(record)
+    (of,) = compare_with_truth(record)
     place, speed = (round_to(value, of.rmse_error[state]) for state, value in rmse.items())
     line = f"a/f: RMSE of place {place}, of speed {speed}; NEES per state "
     assert line in capsys.readouterr().out

@@ -9,7 +9,7 @@ from straightline import present
 from straightline.accumulated import Accumulated
 from straightline.lowering import scalars
 from straightline.machine import Machine
-from straightline.program import Summed, folded, lower, row_length
+from straightline.program import Summed, fold_rows, lower, row_length
 
 BATCHES, STEPS = 50, 4
 
@@ -45,7 +45,7 @@ def test_runs_are_added_to_their_batches(begun, count):
         runs, sums = np.arange(first, first + count), begun.zeros()
         collected = begun.add(runs, sums)
         squares, positions = expected(runs)
-        np.testing.assert_allclose(folded(sums[0], BATCHES), squares, rtol=1e-14)
+        np.testing.assert_allclose(fold_rows(sums[0], BATCHES), squares, rtol=1e-14)
         np.testing.assert_array_equal(collected[1], positions)
         assert collected[0] is None and collected[2] is None
     np.testing.assert_array_equal(begun.shared[2], [0.0, 2.0, 4.0])
@@ -56,7 +56,7 @@ def test_sums_go_on(begun):
     sums = begun.zeros()
     for start in range(0, 320, 32):
         begun.add(np.arange(start, start + 32), sums)
-    np.testing.assert_allclose(folded(sums[0], BATCHES), expected(np.arange(320))[0], rtol=1e-14)
+    np.testing.assert_allclose(fold_rows(sums[0], BATCHES), expected(np.arange(320))[0], rtol=1e-14)
 
 
 def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
@@ -81,7 +81,7 @@ def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
 
 def test_rows_are_folded_once():
     row = np.arange(row_length(16, BATCHES), dtype=float)
-    np.testing.assert_array_equal(folded(row, BATCHES), np.where(np.arange(50) < 15, 2 * row[:50] + 50, row[:50]))
+    np.testing.assert_array_equal(fold_rows(row, BATCHES), np.where(np.arange(50) < 15, 2 * row[:50] + 50, row[:50]))
 
 
 def test_a_sum_of_what_is_used_again():
@@ -98,7 +98,7 @@ def test_a_sum_of_what_is_used_again():
     squares, positions = expected(runs)
     before = np.cumsum(positions**2, axis=1) - positions**2
     np.testing.assert_allclose(code.add(runs, sums)[1], before, rtol=1e-14)
-    np.testing.assert_allclose(folded(sums[0], BATCHES), squares, rtol=1e-14)
+    np.testing.assert_allclose(fold_rows(sums[0], BATCHES), squares, rtol=1e-14)
 
 
 def test_what_has_arrived_is_never_requested():

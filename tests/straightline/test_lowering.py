@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from straightline.graph import Graph
-from straightline.lowering import Lowering, scalars, traced
+from straightline.lowering import Lowering, scalars, trace_function
 from straightline.nodes import Unsupported
-from straightline.program import lower, needed
+from straightline.program import list_needed, lower
 from tests.straightline.over_runs import over_runs
 
 
 def folded(function, *arguments):
     """The results of a function whose arguments are known: numbers of constants."""
-    program, tree = traced(function, *arguments)
+    program, tree = trace_function(function, *arguments)
     lowering = Lowering()
     with jax.enable_x64(True):
         results = lowering.inline(program, [lowering.known(np.asarray(x)) for x in jax.tree.leaves(arguments)])
@@ -77,7 +77,7 @@ def test_factors_and_triangular_systems():
 
 def test_equal_expressions_are_one_node_and_what_nothing_needs_is_dropped():
     program = lower(lambda x: (x[0] * x[1] + x[1] * x[0], jnp.sin(x[2]))[0], np.zeros(3))
-    nodes = needed(scalars(program.outputs[0]))
+    nodes = list_needed(scalars(program.outputs[0]))
     assert sorted(n.op for n in nodes if hasattr(n, "op")) == ["add", "load", "load", "mul"]
 
 

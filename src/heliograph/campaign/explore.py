@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 import zarr
 
-from heliograph.campaign.page import finding, pictures, score_table
+from heliograph.campaign.page import draw_pictures, make_score_table, summarise_best
 from heliograph.campaign.plan import BITWISE, Campaign
 from heliograph.campaign.store import (
     CLAIM,
@@ -51,7 +51,7 @@ class Detail:
     finite_runs: int
 
 
-def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]) -> list[Detail]:
+def list_details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]) -> list[Detail]:
     """Return the scores of every state of every filter in these settings: over all steps, then at each given step."""
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
@@ -141,7 +141,7 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
     campaign, scores = restore_campaign(folder / STORE), read_summary(folder / SUMMARY)
     if not scores:
         raise fail(f"results folder {folder}", "at least one score", "none yet")
-    text = explore_page(campaign, scores, partial(details, folder / STORE, campaign))
+    text = explore_page(campaign, scores, partial(list_details, folder / STORE, campaign))
     target.mkdir(parents=True, exist_ok=True)
     path = target / EXPLORE
     path.write_text(text, encoding="utf-8")
@@ -154,12 +154,12 @@ def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None 
     settings = len({score.setting for score in shown})
     page = Page(
         kicker="Explore a campaign",
-        title=finding(scores),
+        title=summarise_best(scores),
         lead=f"{Path(campaign.path).name}: {len(campaign.settings)} settings, {campaign.runs} runs each of "
         f"{campaign.horizon} steps; {_describe_cut(settings, campaign, shown, scores)} A case is a node in a setting.",
         sections=[
-            Section("Results", pictures(campaign, scores), STATIC),
-            Section("All scores", [score_table(campaign, scores)], STATIC),
+            Section("Results", draw_pictures(campaign, scores), STATIC),
+            Section("All scores", [make_score_table(campaign, scores)], STATIC),
             Section("What the columns say", [Points(MEANING)]),
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),

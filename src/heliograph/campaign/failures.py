@@ -41,7 +41,7 @@ def read_failures(out: Path) -> list[Failure]:
     return [Failure(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))] if path.is_file() else []
 
 
-def failure(campaign: Campaign, out: Path, job: Job, reply: Reply) -> Failure:
+def describe_failure(campaign: Campaign, out: Path, job: Job, reply: Reply) -> Failure:
     """Describe a job that failed, from its last reply."""
     chunks = campaign.chunks(job.setting)
     chunks = chunks if job.chunk is None else [chunks[job.chunk]]

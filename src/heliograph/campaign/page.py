@@ -31,25 +31,25 @@ LOGARITHMIC = 8.0  # ratio of the largest to the smallest value from which an ax
 def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
     """Write the report next to the store; return its path."""
     path = out / REPORT
-    path.write_text(campaign_page(campaign, scores, read_failures(out)).html(), encoding="utf-8")
+    path.write_text(write_campaign_page(campaign, scores, read_failures(out)).html(), encoding="utf-8")
     return path
 
 
-def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Failure]) -> Page:
+def write_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Failure]) -> Page:
     """Return the report of a campaign with its scores and failures."""
     name = Path(campaign.path).name
     there = sum({score.setting: score.runs for score in scores}.values())
     # Failures first, so that nobody reads the results without them.
     return Page(
         kicker="Heliograph campaign",
-        title=finding(scores),
+        title=summarise_best(scores),
         lead=f"{name}: {len(campaign.settings)} settings, {campaign.runs} runs each of {campaign.horizon} steps; "
         f"{there} of {len(campaign.settings) * campaign.runs} runs are there. {_describe_failures(failures)} A case "
         "is a node in a setting.",
         sections=[
             *([_list_failures(failures)] if failures else []),
-            Section("Results", pictures(campaign, scores)),
-            Section("All scores", [score_table(campaign, scores)]),
+            Section("Results", draw_pictures(campaign, scores)),
+            Section("All scores", [make_score_table(campaign, scores)]),
             _explain_reading(campaign),
             Section("The campaign", [Code(campaign.text.strip())]),
         ],
@@ -57,7 +57,7 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
     )
 
 
-def finding(scores: Sequence[Score]) -> str:
+def summarise_best(scores: Sequence[Score]) -> str:
     """Summarise which filter has the least error, and how often; of a single filter, the range of errors."""
     cases: dict[tuple[int, str], list[Score]] = {}
     for score in scores:
@@ -88,16 +88,16 @@ def _list_failures(failures: Sequence[Failure]) -> Section:
     return Section("What failed", [Points(points), Text([text]), Code(failures[0].command)])
 
 
-def pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
+def draw_pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
     """Return the figures of a campaign's scores."""
     caption = f"Bars: two standard errors to both sides. At most {PANELS} panels are drawn; {SUMMARY} has all."
     return [
         Picture(svg(figure), f"{name} of every filter.", caption if i == 0 else "")
-        for i, (name, figure) in enumerate(campaign_figures(campaign, scores).items())
+        for i, (name, figure) in enumerate(draw_campaign_figures(campaign, scores).items())
     ]
 
 
-def score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
+def make_score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
     """Return the first rows of the table of scores, with an explanation of its columns."""
     rows = [[str(score.setting), *score_row(campaign, score)] for score in scores[:ROWS]]
     more = f" The first {ROWS} rows of {len(scores)}." if len(scores) > ROWS else ""
@@ -135,13 +135,13 @@ RMSE = Quantity("RMSE", "rmse", "rmse_error")
 NEES = Quantity("NEES per dimension", "nees_per_dimension", "nees_error")
 
 
-def campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
+def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
     """Return figures by name: RMSE and NEES for each numeric parameter, or else by setting."""
     parameters = [name for name in campaign.parameters if _is_axis(campaign, name)][:PARAMETERS]
     figures = {}
     for quantity in (RMSE, NEES):
         for name in parameters:
-            figures[f"{quantity.value} against {name}"] = against(campaign, scores, name, quantity)
+            figures[f"{quantity.value} against {name}"] = plot_by_parameter(campaign, scores, name, quantity)
         if not parameters:
             figures[f"{quantity.value} by setting"] = plot_by_setting(campaign, scores, quantity)
     return figures
@@ -161,7 +161,7 @@ def _rest(setting: Setting, name: str) -> Setting:
 
 
 @matplotlib.rc_context(STYLE)
-def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: Quantity) -> Figure:
+def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: Quantity) -> Figure:
     """Plot a quantity against a parameter, a curve for each filter with error bars of two standard errors.
 
     There is one panel for each node and each choice of the other parameters.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing_extensions import TypeAliasType
 
 from heliograph.campaign.engines import Engine, start_engine
-from heliograph.campaign.failures import Failure, failure, write_failures
+from heliograph.campaign.failures import Failure, describe_failure, write_failures
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import (
     STORE,
@@ -129,7 +129,7 @@ def _compute_missing(
             failed = _compute_settings(engine, campaign, store, missing, already, progress)
     remove_partial(store)
     # Reports are written again after every call.
-    failures = [failure(campaign, out, job, reply) for job, reply in failed.items()]
+    failures = [describe_failure(campaign, out, job, reply) for job, reply in failed.items()]
     write_failures(out, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
     lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)

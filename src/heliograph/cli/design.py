@@ -40,13 +40,13 @@ def design(
 
         return design_results(designed)
 
-    designed = write_results(target, stages(file), lambda advance: work(file, advance), results)
+    designed = write_results(target, count_stages(file), lambda advance: compute_design(file, advance), results)
     best = designed.design
     print(visible(f"{target / 'report.html'}: error {best.error:.6g} at power {best.total:.6g}"))
     print(visible(best.certificate.words))
 
 
-def stages(file: "DesignFile") -> int:
+def count_stages(file: "DesignFile") -> int:
     """Return the approximate number of steps for the progress bar."""
     from heliograph.planning.comparisons import POINTS
 
@@ -54,7 +54,7 @@ def stages(file: "DesignFile") -> int:
     return 1 + rows + len(file.front or range(POINTS)) + 3 * len(file.network.nodes)
 
 
-def work(file: "DesignFile", advance: "Advance") -> "DesignResults":
+def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
     """Compute the design, the front around it, the value of changes, and the map."""
     import heliograph as hg
     from heliograph.files.design_file import write_designed_source

@@ -32,25 +32,27 @@ def export(
         holds several. The name may be that of a function that returns one.
     """
     from heliograph.disk.quoting import visible
-    from heliograph.export.c_files import PRECISIONS, check_place, cost, export_named
+    from heliograph.export.c_files import PRECISIONS, check_place, export_named, measure_cost
     from heliograph.export.text import claim_of
     from heliograph.files.network_file import load_network
 
     # Refuse a bad path before the network is loaded.
     check_place(out)
     loaded = load_network(network)
-    chosen = node_of(loaded, filter, node)
+    chosen = find_node(loaded, filter, node)
     subject = loaded.nodes[chosen].filters[filter]
     names = loaded.nodes[chosen].received_names[: subject.received]
     # Write the files, then compile and time them.
     written = export_named(subject, out, precision, names)
-    measured = cost(written.header, written.source, subject.received, len(subject.inputs), PRECISIONS[precision])
+    measured = measure_cost(
+        written.header, written.source, subject.received, len(subject.inputs), PRECISIONS[precision]
+    )
     claim = claim_of(subject, PRECISIONS[precision])
     print(visible(f"{written.header}, {written.source}: {chosen}/{filter} ({claim}), {precision} precision"))
-    print("\n".join(costs(written, measured)))
+    print("\n".join(describe_costs(written, measured)))
 
 
-def node_of(network: "Network", filter_name: str, node: str | None) -> str:
+def find_node(network: "Network", filter_name: str, node: str | None) -> str:
     """Return the node that has the filter."""
     from heliograph.numerics.check import fail
 
@@ -74,7 +76,7 @@ KINDS = {
 }
 
 
-def costs(written: "Exported", measured: "Cost") -> list[str]:
+def describe_costs(written: "Exported", measured: "Cost") -> list[str]:
     """Describe the cost of a step in two lines."""
     from heliograph.export.c_files import COMPILER
 

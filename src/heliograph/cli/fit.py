@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from heliograph.cli.app import number, path_option
-from heliograph.cli.reading import Measured, ReadingOptions, read_measured, single
+from heliograph.cli.reading import Measured, ReadingOptions, read_measured, take_only_plant
 from heliograph.cli.stopping import GentleStop
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def fit(
         def work(advance: "Advance") -> "Learned":
             return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop)
 
-        learned = write_results(out, 6, work, lambda learning: results(learning, out, network))
+        learned = write_results(out, 6, work, lambda learning: list_results(learning, out, network))
         print(learned.fit)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
@@ -89,7 +89,7 @@ def learn(
     from heliograph.files.fitted import NetworkAgain
     from heliograph.learning.held_out import compare_filters, transform_held_out
     from heliograph.learning.losses.losses import learn_losses
-    from heliograph.learning.senders import has_deciding_sender
+    from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
     from heliograph.report.pages.fit import Learned
 
@@ -146,7 +146,7 @@ def _read_data(
     from heliograph.numerics.check import fail
 
     module = load_module(reference)[1]
-    data = single(measurements, read_measured(measurements, reference, network, module, reading, advance))
+    data = take_only_plant(measurements, read_measured(measurements, reference, network, module, reading, advance))
     for line in data.warnings:
         print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
     for line in data.summary:
@@ -186,10 +186,10 @@ def _fit_with_progress(
     return fitted
 
 
-def results(learned: "Learned", out: Path, network: str) -> "Results":
+def list_results(learned: "Learned", out: Path, network: str) -> "Results":
     """Return the content of the results folder."""
     from heliograph.files.fitted import as_json, write_fitted
-    from heliograph.report.pages.fit import fit_figures, pages
+    from heliograph.report.pages.fit import draw_fit_figures, pages
     from heliograph.report.results import Results
 
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
@@ -198,7 +198,7 @@ def results(learned: "Learned", out: Path, network: str) -> "Results":
         write_fitted(content, network, learned.measurements, folder, out)
 
     summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison(learned)}
-    return Results(fit_figures(learned), pages(learned), summary, write)
+    return Results(draw_fit_figures(learned), pages(learned), summary, write)
 
 
 def _convert_comparison(learned: "Learned") -> "dict[str, Json]":

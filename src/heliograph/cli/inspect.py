@@ -28,7 +28,7 @@ def inspect(
         broker: mqtt://, nats:// or opc.tcp://.
     """
     from heliograph.disk.quoting import visible
-    from heliograph.files.inspection import suggestion
+    from heliograph.files.inspection import suggest_sources
     from heliograph.numerics.check import TINY, scalar
 
     scalar("--seconds", seconds, TINY, 86400)
@@ -42,7 +42,7 @@ def inspect(
     topics, broken = _collect_topics(recording, seconds)
     _print_table(topics)
     if topics:
-        print(suggestion(topics, names))
+        print(suggest_sources(topics, names))
     if broken:
         print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)
 

@@ -98,7 +98,7 @@ def read_measured(
     return measured
 
 
-def single(path: Path, measured: list[Measured]) -> Measured:
+def take_only_plant(path: Path, measured: list[Measured]) -> Measured:
     """Return the measured data of the only plant.
 
     Raises:

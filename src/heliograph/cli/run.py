@@ -263,10 +263,10 @@ def _describe_results(record: "Record", out: Path | None, report: Path | None) -
 
 def _describe_errors(record: "Record") -> list[str]:
     """Compare each filter with the truth, a line each: RMSE by state, and NEES, which is 1 where the claim holds."""
-    from heliograph.report.outputs import errors_of, round_to
+    from heliograph.report.outputs import compare_with_truth, round_to
 
     lines = []
-    for errors in errors_of(record):
+    for errors in compare_with_truth(record):
         rmse = ", ".join(
             f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()
         )
@@ -325,10 +325,10 @@ def _write_report(
         }
 
     def results_of(health: dict[str, Health]) -> Results:
-        from heliograph.report.pages.run import make_run_results, results_of_plants
+        from heliograph.report.pages.run import make_results_of_plants, make_run_results
 
         (first, *more) = health.values()
-        return results_of_plants(health, name) if more else make_run_results(first, name)
+        return make_results_of_plants(health, name) if more else make_run_results(first, name)
 
     count = len(plants) * sum(map(len, network.claims().values()))
     write_results(report, count, examined, results_of)

@@ -86,7 +86,7 @@ def reproduce(
 
     if method == "all" and changes:
         raise fail("--set", "one publication, whose settings these are", "all")
-    names = list(studies_of("publication")) if method == "all" else [method]
+    names = list(list_studies("publication")) if method == "all" else [method]
     run(names, out, collect_changes(changes, runs=runs, seed=seed), "publication", "" if method == "all" else method)
 
 
@@ -102,7 +102,7 @@ def run(
     from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results import NEEDS
 
-    known = studies_of(kind)
+    known = list_studies(kind)
     for name in names:
         if name not in known:
             expected = ", ".join(known) + (" or all" if kind == "publication" else "")
@@ -111,7 +111,9 @@ def run(
     check_installed([name for study in names for name in (*NEEDS, *read_needs(known[study].module))])
     target = folder("reproduce" if kind == "publication" else kind, out, names[0] if within is None else within)
     studies = {name: load(known[name]) for name in names}
-    settings = {name: set_of(name, study, values, kind) for name, study in studies.items()}  # all before any work
+    settings = {
+        name: change_settings(name, study, values, kind) for name, study in studies.items()
+    }  # all before any work
     import jax
 
     for name, study in studies.items():
@@ -120,7 +122,7 @@ def run(
         jax.clear_caches()  # type: ignore[no-untyped-call]
 
 
-def set_of(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
+def change_settings(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
     """A study's settings with other values; an option that it has no setting for is called by its name.
 
     Raises:
@@ -167,7 +169,7 @@ def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[st
     return values
 
 
-def studies_of(kind: str) -> dict[str, EntryPoint]:
+def list_studies(kind: str) -> dict[str, EntryPoint]:
     """Return the studies of a kind, "publication" or "example", of installed packages, without importing any."""
     offered: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
@@ -187,7 +189,7 @@ def load(entry: EntryPoint) -> Study:
 
 def print_list(kind: str) -> None:
     """Print the studies of a kind, with the first line of each docstring."""
-    known = studies_of(kind)
+    known = list_studies(kind)
     width = max(map(len, known), default=0)
     for name, entry in known.items():
         print(f"{name:{width}}  {first_line(entry.module)}")

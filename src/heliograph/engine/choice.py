@@ -71,25 +71,25 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", show_value(function))
-    return chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
+    return choose_code(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
 
 
-def refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
+def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """Return why native code does not take a function of these arguments, "" if it does or if XLA is forced."""
-    if setting() == "xla":
+    if read_setting() == "xla":
         return ""
     with jax.enable_x64(True):
         return _find_code(function, arguments, [False] * len(arguments)).why
 
 
-def chosen(
+def choose_code(
     function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
 ) -> Choice:
     """Return the code of a function of one run for arguments like these, compiled once; or why there is none.
 
     XLA computes a program of more than `most` operations, where it is said, unless native code is forced.
     """
-    engine = setting()
+    engine = read_setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
     choice = _find_code(function, arguments, differs, None if engine == "native" else most)
@@ -112,7 +112,7 @@ def compute_once(
         most: operations above which XLA computes; those that native code takes by default.
     """
     with jax.enable_x64(True):
-        choice = chosen(function, arguments, [False] * len(arguments), most)
+        choice = choose_code(function, arguments, [False] * len(arguments), most)
         if choice.code is None:
             return float64.to_numpy(by_xla(*arguments))
         return map_arrays(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
@@ -142,7 +142,7 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-def setting() -> str:
+def read_setting() -> str:
     """Return the forced engine, "" if none is."""
     engine = os.environ.get(SETTING, "")
     if engine not in ("", *ENGINES):
@@ -152,7 +152,7 @@ def setting() -> str:
 
 def try_native(make: Callable[[], Code]) -> Code | None:
     """Return native code, or None if XLA has to compute instead."""
-    engine = setting()
+    engine = read_setting()
     if engine == "xla":
         return None
     try:

@@ -12,8 +12,8 @@ import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
 from heliograph.disk.whole_file import check_output, whole_files
-from heliograph.export.program import RESERVED, Real, step_program
-from heliograph.export.text import CText, Form, c_text
+from heliograph.export.program import RESERVED, Real, write_step_program
+from heliograph.export.text import CText, Form, write_c_text
 from heliograph.factors.columns import use_precision
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
@@ -72,7 +72,7 @@ def export_named(filter: object, path: str | Path, precision: str, received: Seq
     source = check_place(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
-    text = text_of(checked, source.stem, PRECISIONS[precision], received)
+    text = make_text(checked, source.stem, PRECISIONS[precision], received)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -93,7 +93,7 @@ def check_place(path: str | Path) -> Path:
     return source
 
 
-def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
+def make_text(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
     """Return the text of both files of a filter."""
     names = name_received(filter) if received is None else received
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
@@ -102,8 +102,8 @@ def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[
         raise fail("single precision", expected, type(filter).__name__)
     try:
         with use_precision(np.float64 if real == "double" else np.float32):
-            program = step_program(filter, real, prefix)
-        return c_text(program, Form(prefix, real, names, kind))
+            program = write_step_program(filter, real, prefix)
+        return write_c_text(program, Form(prefix, real, names, kind))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision
 
@@ -126,7 +126,7 @@ class Cost(NamedTuple):
     nanoseconds: float | None
 
 
-def cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> Cost:
+def measure_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> Cost:
     """Compile and time a step, in a temporary folder."""
     compiler = shutil.which(COMPILER)
     if compiler is None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
-from heliograph.model.inputs import inputs_spoil
+from heliograph.model.inputs import do_inputs_spoil
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, to_c
@@ -49,7 +49,7 @@ class StepProgram(NamedTuple):
     counts: bool
 
 
-def step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram:
+def write_step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram:
     """Write `step` of a filter as a function of C, for numbers of this type.
 
     A measurement that differs from what was expected by less than `ROUNDING` of itself is used, however small its
@@ -74,11 +74,11 @@ def step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram
             & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
         )
         implausible = jnp.any(far) | (judgement.input > 0)
-        spoilt = inputs_spoil(filter, filter.inputs, u, k, precision)
+        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, precision)
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
 
     examples = leaves, z, u, k
-    named = [Member(name, np.asarray(leaf)) for name, leaf in zip(names_of(state), leaves, strict=True)]
+    named = [Member(name, np.asarray(leaf)) for name, leaf in zip(name_arrays(state), leaves, strict=True)]
     estimate = filter.estimate(state)
     named += [Member("estimate_mean", np.asarray(estimate.mean))]
     named += [Member("estimate_covariance", np.asarray(estimate.covariance))]
@@ -157,7 +157,7 @@ def no_c(operation: str, where: str) -> InputError:
     return fail("export", "operations that C has", f"{operation} at {where}")
 
 
-def names_of(state: PyTree) -> list[str]:
+def name_arrays(state: PyTree) -> list[str]:
     """Return names in C for the arrays of a state, from their field names; the Gaussian that it holds has no name."""
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:

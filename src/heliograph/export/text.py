@@ -39,7 +39,7 @@ class CText(NamedTuple):
     state_bytes: int
 
 
-def c_text(program: StepProgram, form: Form) -> CText:
+def write_c_text(program: StepProgram, form: Form) -> CText:
     """Write a step as C."""
     prefix, real = form.prefix, form.real
     kinds = {x.name.removeprefix("next_"): x.type for x in program.compute.results}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from typing_extensions import TypeAliasType
 
-from heliograph.files.fields import at, decode_json, matches
+from heliograph.files.fields import at, decode_json, match_topic
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.module import readable
 
@@ -100,7 +100,7 @@ class LastWords:
 
     def about(self, topic: str) -> list[Available]:
         """Return the conditions to which a message of a topic is a word."""
-        matching = [several for pattern, several in self._by_pattern.items() if matches(topic, pattern)]
+        matching = [several for pattern, several in self._by_pattern.items() if match_topic(topic, pattern)]
         return [condition for several in matching for condition in several]
 
     def hear(self, topic: str, payload: object, where: str) -> bool:

@@ -216,7 +216,7 @@ def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: i
     return int(np.sum(np.maximum(gaps - 1, 0)))
 
 
-def order_within(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
+def number_within(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return the number of each row among those that are equal to it, in their order, from 0."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")

@@ -13,7 +13,7 @@ from heliograph.files.event_columns import (
     counts_losses,
     fill_forward,
     judge,
-    order_within,
+    number_within,
 )
 from heliograph.files.recording import Recording
 from heliograph.files.sources import Reading
@@ -371,7 +371,7 @@ class EventTable:
             raise fail("events", "at least one", "none")
         events = events.of(np.lexsort((events.place, events.arrival)))
         uncounted = events.sequence < 0
-        events.sequence[uncounted] = order_within(events.node[uncounted], events.time[uncounted])
+        events.sequence[uncounted] = number_within(events.node[uncounted], events.time[uncounted])
         # Moments to the nearest step from the first.
         if self.step is None:
             return events

@@ -72,7 +72,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
         raise fail(name, "JSON", show_value(text)) from None
 
 
-def matches(topic: str, pattern: str) -> bool:
+def match_topic(topic: str, pattern: str) -> bool:
     """Return whether a topic matches a pattern with the wildcards of MQTT: + for one word, # for all that follow."""
     if topic == pattern:
         return True
@@ -115,7 +115,7 @@ def _getter(path: str) -> "attrgetter[Any]":
     return attrgetter(path)
 
 
-def number(value: Any, name: str, quoted: bool = False) -> float:
+def convert_number(value: Any, name: str, quoted: bool = False) -> float:
     """Convert a value to a number; NaN for null and for what is not finite. A number may be `quoted` on request."""
     if value is None or value == "":
         return np.nan
@@ -140,7 +140,7 @@ def parse_number(text: str) -> int | float | str:
         return text
 
 
-def nanoseconds(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> int:
+def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> int:
     """Convert a time to nanoseconds since 1970, or to a step if that is its unit.
 
     Raises:
@@ -178,7 +178,7 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> 
 
 def parse_arrival(value: Any, name: str) -> int:
     """Convert what a log says of an arrival, a date or seconds, also as a text, to nanoseconds since 1970."""
-    return nanoseconds(value, "s", name, quoted=True)
+    return convert_time(value, "s", name, quoted=True)
 
 
 def count(value: Any, name: str, quoted: bool = False) -> int:
@@ -190,7 +190,7 @@ def count(value: Any, name: str, quoted: bool = False) -> int:
     return check_63_bits(name, value)
 
 
-def name_of(value: Any, name: str) -> str:
+def convert_name(value: Any, name: str) -> str:
     """Convert the name of a plant or a node: a text, or a whole number."""
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         return str(int(value))

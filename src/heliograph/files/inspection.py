@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.bags.bag import OFTEN, Progress, fields_of, open_bag
-from heliograph.files.bags.mcap_chunks import messages_of as bag_messages
-from heliograph.files.fields import TimeUnit, decode_json, nanoseconds, parse_arrival
-from heliograph.files.message_files import is_message_file, message_name, messages_of, payload_of
+from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag
+from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
+from heliograph.files.fields import TimeUnit, convert_time, decode_json, parse_arrival
+from heliograph.files.message_files import decode_payload, is_message_file, message_name, read_message_file
 from heliograph.numerics.check import InputError, fail, show_error
 from heliograph.numerics.times.dates import UNITS, looks_like_date
 
@@ -110,7 +110,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
     # Types first, then each message's times, of which a header is read without decoding the rest.
     with open_bag(path) as (reader, cut):
         for connection in reader.connections:
-            fields = list(fields_of(reader, connection.msgtype))
+            fields = list(list_fields(reader, connection.msgtype))
             numbers = [name for name, kind in fields if kind not in NO_NUMBERS and not name.startswith("header.")]
             stamped = any(name == f"{STAMP}.sec" for name, _ in fields) and reader.is2
             topics.setdefault(connection.topic, Topic(connection.msgtype, numbers, STAMP if stamped else None))
@@ -150,7 +150,7 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
         unit = "s" if isinstance(value, str) and looks_like_date(value) else _unit(value)
         if unit is not None:
             with suppress(InputError):
-                time = nanoseconds(value, unit, path)
+                time = convert_time(value, unit, path)
                 moments, late = topic.dates.setdefault(path, (array("q"), array("d")))
                 moments.append(time)
                 if arrival is not None:
@@ -173,7 +173,7 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
         ValueError: no such file, or one that cannot be read at all.
     """
     topics, broken = dict[str, Topic](), ""
-    for message in messages_of(path):
+    for message in read_message_file(path):
         if isinstance(message, InputError):
             broken = broken or str(message)
             continue
@@ -185,13 +185,13 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
             note(topics, name, message.content, came)
             continue
         try:
-            _note_message(topics, name, payload_of(message), "JSON" if is_message_file(path) else "row", came)
+            _note_message(topics, name, decode_payload(message), "JSON" if is_message_file(path) else "row", came)
         except InputError:
             _note_message(topics, name, None, "no JSON", came)
     return topics, broken
 
 
-def suggestion(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) -> str:
+def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) -> str:
     """Return sources to paste into a network's file: a line for each topic that has numbers.
 
     Args:

@@ -9,7 +9,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.files.availability import Available
 from heliograph.files.computed import Computed, Covariance, ZeroIfAbsent
-from heliograph.files.fields import TimeUnit, at, name_of
+from heliograph.files.fields import TimeUnit, at, convert_name
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike
@@ -52,7 +52,7 @@ class Field:
 
     def of(self, topic: str, message: object, where: str) -> str:
         """Return the name for a message of a topic."""
-        name = name_of(at(message, self.path, where), f"{where}, field {self.path!r}")
+        name = convert_name(at(message, self.path, where), f"{where}, field {self.path!r}")
         return (self.names or {}).get(name, name)
 
 

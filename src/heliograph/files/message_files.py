@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from heliograph.files.fields import decode_json, parse_number
-from heliograph.files.table import check_separators, csv_header, csv_lines, kind_of, open_text
+from heliograph.files.table import check_separators, csv_lines, kind_of, open_text, read_csv_header
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.dates import instant
 
@@ -53,11 +53,11 @@ def table_has_topics(path: Path) -> bool:
     """Return whether a table is a log of messages: it has a column `topic`."""
     kind = kind_of(path)
     if kind == ".parquet" and path.is_file():
-        return TOPIC in parquet_names(path)
-    return kind == ".csv" and path.is_file() and TOPIC in csv_header(path)
+        return TOPIC in read_parquet_names(path)
+    return kind == ".csv" and path.is_file() and TOPIC in read_csv_header(path)
 
 
-def parquet_names(path: Path) -> list[str]:
+def read_parquet_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file; none of a file that is none."""
     import pyarrow.parquet as pq
 
@@ -67,7 +67,7 @@ def parquet_names(path: Path) -> list[str]:
         return []
 
 
-def messages_of(path: Path) -> Iterator[FileMessage | InputError]:
+def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file, or why one cannot be read, in the order of the file.
 
     Raises:
@@ -89,7 +89,7 @@ def log_line(text: str) -> tuple[str, str, str | None] | None:
     return None if match is None else (match["topic"], match["payload"], match["arrival"])
 
 
-def of_log(content: object) -> tuple[str, str, Any, bool] | None:
+def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
     """Return topic, payload, arrival and whether it was stored of a message of a log in JSON; None for any other."""
     if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
         return None
@@ -158,7 +158,7 @@ def _convert_line(where: str, line: str) -> FileMessage | InputError:
 
 
 def _convert_object(where: str, content: object) -> FileMessage:
-    logged = of_log(content)
+    logged = read_log_entry(content)
     if logged is None:
         return FileMessage(where, None, content, content.get("arrival") if isinstance(content, dict) else None)
     topic, payload, arrival, stored = logged
@@ -220,7 +220,7 @@ def _cell(cell: str) -> float | int | str | None:
     return parse_number(cell) if cell else None
 
 
-def payload_of(message: FileMessage) -> object:
+def decode_payload(message: FileMessage) -> object:
     """Decode the payload of a message of a log.
 
     Raises:

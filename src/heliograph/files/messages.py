@@ -8,10 +8,10 @@ from heliograph.files.event_table import EventTable
 from heliograph.files.fields import parse_arrival
 from heliograph.files.message_files import (
     FileMessage,
+    decode_payload,
     is_message_file,
     message_name,
-    messages_of,
-    payload_of,
+    read_message_file,
     table_has_topics,
 )
 from heliograph.files.own_messages import OwnMessages, holds_events, is_own
@@ -88,7 +88,7 @@ def is_mapped(path: Path, sources: object) -> bool:
 def _read_own_table(path: Path, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
     """Read a table of events in our own form."""
     own = OwnMessages(network, path, ignore_unknown)
-    for message in messages_of(path):
+    for message in read_message_file(path):
         own.add(message, strict)
     return own.events()
 
@@ -97,7 +97,7 @@ def _map_messages(path: Path, network: Network, sources: Sources | None, strict:
     """Read messages by their topics, and those in our own form among them."""
     events = None if sources is None else EventTable(network, sources.step)
     own = OwnMessages(network, path, False)
-    for message in messages_of(path):
+    for message in read_message_file(path):
         if isinstance(message, InputError) or (message.topic is None and is_own(message.content)):
             own.add(message, strict)
             continue
@@ -122,7 +122,7 @@ def _append_message(path: Path, message: FileMessage, sources: Sources, events: 
         if sources.hear(topic, message.content, message.where):
             return
         # The payload of a topic that nobody asks for may be anything.
-        content = payload_of(message) if sources.of(topic) else None
+        content = decode_payload(message) if sources.of(topic) else None
         came = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
         for reading in sources.read(topic, content, message.where):
             if isinstance(reading, Unread):

@@ -8,10 +8,10 @@ import numpy as np
 
 from heliograph.files.event_columns import counts_losses
 from heliograph.files.event_table import EventTable
-from heliograph.files.fields import name_of
-from heliograph.files.message_files import FileMessage, parquet_names
+from heliograph.files.fields import convert_name
+from heliograph.files.message_files import FileMessage, read_parquet_names
 from heliograph.files.sources import Reading
-from heliograph.files.table import csv_header, kind_of
+from heliograph.files.table import kind_of, read_csv_header
 from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
@@ -29,7 +29,7 @@ def holds_events(path: str | Path) -> bool:
     path = Path(path)
     if not path.is_file() or kind_of(path) not in (".csv", ".parquet"):
         return False
-    return {NODE, SEQUENCE} <= set(parquet_names(path) if kind_of(path) == ".parquet" else csv_header(path))
+    return {NODE, SEQUENCE} <= set(read_parquet_names(path) if kind_of(path) == ".parquet" else read_csv_header(path))
 
 
 def is_own(content: object) -> bool:
@@ -106,7 +106,7 @@ class OwnMessages:
         arrival = time
         if ARRIVAL in row and (row[ARRIVAL] is not None or "line" not in where):
             arrival, _ = self._read_moment(row[ARRIVAL], f"{where}, column {ARRIVAL!r}")
-        plant = "" if row.get(PLANT) is None else name_of(row[PLANT], f"{where}, column {PLANT!r}")
+        plant = "" if row.get(PLANT) is None else convert_name(row[PLANT], f"{where}, column {PLANT!r}")
         if self._table is None:
             self._table = EventTable(self.network, numbers=not dated)
         try:

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.files.table import TIME, columns_of, read_back_name, write_table
 from heliograph.model.estimate import Estimate, is_sound
-from heliograph.model.inputs import time_step_fault
+from heliograph.model.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import fail, flag, instance
 from heliograph.numerics.module import readable
@@ -146,7 +146,7 @@ def _make_recording(columns: Mapping[str, np.ndarray], network: Network, source:
     for i, name in enumerate(inputs):
         fill = name == TIME_STEP and name not in columns
         u[:, i] = seconds_between(time) if fill else _complete(columns, find((name,)), source)
-        if name == TIME_STEP and (fault := time_step_fault(u[:, i])):
+        if name == TIME_STEP and (fault := find_time_step_fault(u[:, i])):
             raise fail(f"{source}, row {fault.row + 1}, column {name!r}", fault.expected, fault.came)
     if not any(name in columns for name in true.values()):
         return Recording(measurements, u, time)

@@ -9,9 +9,9 @@ import numpy as np
 
 from heliograph.files.availability import LastWords
 from heliograph.files.computed import Computed, ZeroIfAbsent
-from heliograph.files.fields import MissingFieldError, at, count, matches, nanoseconds, number
+from heliograph.files.fields import MissingFieldError, at, convert_number, convert_time, count, match_topic
 from heliograph.files.json_field import Field, Source
-from heliograph.files.senders import SeveralSenders
+from heliograph.files.several_senders import SeveralSenders
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
@@ -160,7 +160,7 @@ class Sources:
     def of(self, topic: str) -> list[Mapped]:
         """Return the sources of a topic, each with the places of its values in the node's measurement."""
         if topic not in self._known:
-            matching = [items for pattern, items in self._table.items() if matches(topic, pattern)]
+            matching = [items for pattern, items in self._table.items() if match_topic(topic, pattern)]
             self._known[topic] = [source for items in matching for source in items]
         return self._known[topic]
 
@@ -358,7 +358,7 @@ def _read_time(source: Source, message: object, where: str) -> int | None:
     if source.time is None:
         return None
     stamp, name = source.time, f"{where}, field {source.time.path!r}"
-    time = nanoseconds(at(message, stamp.path, where), source.time_unit, name, source.quoted)
+    time = convert_time(at(message, stamp.path, where), source.time_unit, name, source.quoted)
     return time + round(stamp.offset * SECOND)
 
 
@@ -377,7 +377,7 @@ def _read_value(message: object, path: str | Computed, where: str, quoted: bool)
     value = at(message, path, where)
     if type(value) is float:  # names its place only where there may be something to say
         return value if np.isfinite(value) else np.nan
-    return number(value, f"{where}, field {path!r}", quoted)
+    return convert_number(value, f"{where}, field {path!r}", quoted)
 
 
 def _near(name: str, names: Sequence[str] | Mapping[str, object]) -> str:

@@ -207,7 +207,7 @@ def csv_lines(path: Path) -> Iterator[Iterator[list[str]]]:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
 
 
-def csv_header(path: Path) -> list[str]:
+def read_csv_header(path: Path) -> list[str]:
     """Return the names of the columns of a CSV file; none of a file that is none."""
     try:
         with csv_lines(path) as lines:

@@ -16,7 +16,7 @@ from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
 from heliograph.filters.vector import check_vector
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.inputs import check_time_step, inputs_spoil
+from heliograph.model.inputs import check_time_step, do_inputs_spoil
 from heliograph.model.over_time import steps_covered
 from heliograph.model.premises.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
@@ -313,7 +313,7 @@ def step_with_judgement(
     after, innovation = filter.correct(prior, z, k)
     estimate = filter.after_step(after, k)
     estimates = filter.estimate(state), filter.estimate(prior), estimate
-    spoilt = inputs_spoil(filter, filter.inputs, u, k)
+    spoilt = do_inputs_spoil(filter, filter.inputs, u, k)
     judgement = judge_step(filter.claim, (state, prior, after), estimates, innovation, z, filter.of_atoms, spoilt)
     return after, estimate, judgement, innovation
 

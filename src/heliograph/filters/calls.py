@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.model.inputs import check_inputs, inputs_spoil
+from heliograph.model.inputs import check_inputs, do_inputs_spoil
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, PyTree
@@ -52,7 +52,7 @@ def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *da
 def _judge_inputs_too(function: Callable[..., R]) -> Callable[..., tuple[R, Array]]:
     @compile_on_call
     def call(filter: Any, state: PyTree, *data: PyTree) -> tuple[R, Array]:
-        return function(filter, state, *data), inputs_spoil(filter, filter.inputs, *data[-2:])
+        return function(filter, state, *data), do_inputs_spoil(filter, filter.inputs, *data[-2:])
 
     return call
 

@@ -13,7 +13,7 @@ from heliograph.engine.choice import compute_once
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
 from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_spacing
-from heliograph.model.row_times import common_dates, judge_dates
+from heliograph.model.unequal_steps import common_dates, judge_dates
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable

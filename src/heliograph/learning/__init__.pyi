@@ -48,6 +48,6 @@ from .solution import (
 from .tell_apart import (
     samples_to_tell as samples_to_tell,
 )
-from .senders import (
+from .sender_fit import (
     SenderFit as SenderFit,
 )

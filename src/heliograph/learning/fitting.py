@@ -11,12 +11,12 @@ from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identify_by_recording
 from heliograph.learning.intervals import LEVEL, METHODS, Method
 from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood.maximise import Maximum
-from heliograph.learning.likelihood.objective import Form, objectives
-from heliograph.learning.likelihood.search import AWAY, SPREAD, Search
+from heliograph.learning.likelihood.multistart import AWAY, SPREAD, Search
+from heliograph.learning.likelihood.objective import Form, make_objectives
 from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.trust_region import Maximum
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
-from heliograph.learning.senders import SenderFit, fit_sender, has_deciding_sender
+from heliograph.learning.sender_fit import SenderFit, fit_sender, has_deciding_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_progress, check_seed, fail, scalar, show_value
 from heliograph.numerics.module import readable
@@ -190,7 +190,7 @@ def fit(
         return replace(fit_sender(description, recording, inputs, starts, check_seed("seed", seed)), delays=delays)
     data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
-    surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
+    surfaces = [Surface(objective, data) for objective in make_objectives(description, truth is not False)]
     points = _choose_starts(surfaces[0], starts, check_seed("seed", seed))
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     solutions, ends, stopped = _search_forms(surfaces, points, seed, identified.ridges, progress or (lambda line: None))

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import quantile
 from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.objective import Objective, joint_world, objectives
+from heliograph.learning.likelihood.objective import Objective, join_world, make_objectives
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
 from heliograph.learning.unidentified import WEAK, Confounded, Rank, find_confounded, product_text, rank_of, sum_text
@@ -80,7 +80,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
         ValueError: as `fit`.
     """
     description = describe(network)
-    objective = objectives(description)[-1]
+    objective = make_objectives(description)[-1]
     count = len(description.start.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
@@ -227,13 +227,13 @@ KINDS = ("mean gain", "gain variance", "noise")
 def describe_routes(solution: "Solution") -> list[str]:
     """Sentences on the identified mean gain, gain variance and noise of each output, the sensor's noise included."""
     description = solution.surface.objective.description
-    _, sensor, channel = joint_world(description.start)
+    _, sensor, channel = join_world(description.start)
     if isinstance(channel, OverTime) or isinstance(sensor, OverTime) or channel.remembers or channel.past:
         return []
 
     # mean gain, gain variance, and M R M' + spread of the constant part, of each output
     def totals(x: Array) -> jax.Array:
-        world = joint_world(description.at(description.parameters.values(x)))
+        world = join_world(description.at(description.parameters.values(x)))
         sensor_now, link = first(world[1]), first(world[2])
         moments, r = second_order(link), jnp.asarray(sensor_now.noise.covariance)
         mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]

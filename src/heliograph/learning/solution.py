@@ -19,8 +19,8 @@ from heliograph.learning.intervals import (
     quantile,
     sandwich,
 )
+from heliograph.learning.likelihood.multistart import FURTHER, Top
 from heliograph.learning.likelihood.objective import Form
-from heliograph.learning.likelihood.search import FURTHER, Top
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.likelihood.transforms import link, unlink, unlink_slope
 from heliograph.learning.parameters import Entry, Parameters

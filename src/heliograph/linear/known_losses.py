@@ -172,7 +172,7 @@ class UnobservedGrowth(NamedTuple):
     vectors: Float[np.ndarray, "n d"]
 
 
-def eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
+def find_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
     """Return each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d)."""
     results: list[tuple[complex, np.ndarray]] = []
     size = max(float(np.linalg.norm(matrix, 2)), 1e-300)
@@ -184,7 +184,7 @@ def eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndar
     return results
 
 
-def fastest_unobserved_mode(
+def find_fastest_unobserved_mode(
     matrix: Float[np.ndarray, "n n"], chain: Float[np.ndarray, "modes modes"], outputs: Sequence[np.ndarray]
 ) -> UnobservedGrowth:
     """Find the largest growth over eigenvalues and sets of modes that do not observe them.
@@ -193,7 +193,7 @@ def fastest_unobserved_mode(
     """
     results = [
         UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
-        for value, space in eigenspaces(matrix)
+        for value, space in find_eigenspaces(matrix)
         for modes, vectors in _find_unobserving_modes(space, outputs)
     ]
     nothing = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))

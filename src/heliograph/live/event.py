@@ -58,7 +58,7 @@ def check_63_bits(name: str, value: object) -> int:
     return int(value)
 
 
-def moment(name: str, value: object) -> float:
+def check_moment(name: str, value: object) -> float:
     """Check a time: a finite number, since times are counted from an origin."""
     if not is_whole(value) and not isinstance(value, float | np.floating):
         raise fail(name, "a finite number", show_value(value))
@@ -67,7 +67,7 @@ def moment(name: str, value: object) -> float:
     return float(value)
 
 
-def numbers(name: str, value: ArrayLike, size: int, alone: int | None = None) -> Float[np.ndarray, " numbers"]:
+def check_numbers(name: str, value: ArrayLike, size: int, alone: int | None = None) -> Float[np.ndarray, " numbers"]:
     """Copy `size` real numbers, or so many as come `alone`, NaN where one did not arrive; one need not be a list."""
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:

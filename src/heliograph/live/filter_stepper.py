@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import setting, try_native
+from heliograph.engine.choice import read_setting, try_native
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.trees.static import Static
@@ -123,7 +123,7 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
     """Compile native code with arguments (numbers, state, z, u, k), flattened; None if XLA has to step the filter."""
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
-    return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, setting())
+    return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_setting())
 
 
 @lru_cache

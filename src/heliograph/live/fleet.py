@@ -13,7 +13,7 @@ from heliograph.live.network_program import NetworkProgram
 from heliograph.live.plant import PlantState, Withdrawn
 from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
-from heliograph.live.senders import LossChain, SenderStatus, sender_status
+from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_status
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
@@ -315,7 +315,7 @@ class Fleet:
             name: int(link.latest) if link is not None and link.latest >= 0 else None for name, link in links.items()
         }
         return {
-            name: sender_status(*items, last[name], int(np.ceil(final)) - 1, now)
+            name: make_sender_status(*items, last[name], int(np.ceil(final)) - 1, now)
             for name, items in self.deciding.items()
         }
 

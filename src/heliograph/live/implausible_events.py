@@ -13,7 +13,7 @@ from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.model.estimate import Estimate
-from heliograph.model.faults import function_fault
+from heliograph.model.faults import find_function_fault
 from heliograph.numerics.types import Float
 from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import Network
@@ -122,7 +122,7 @@ class Judges:
                 covariance = known[place.covariance : place.covariance + n * n].reshape(n, n)
                 estimate = Estimate(mean, covariance, place.claim)
                 begun = before.key[1] != BEFORE
-                said = function_fault(filter, estimate if begun else filter.estimate(filter.init()),
+                said = find_function_fault(filter, estimate if begun else filter.estimate(filter.init()),
                                       *pool.led(before.slot, row.slot))  # fmt: skip
                 self._faults[place.node, place.filter] = tried + 1, said
             if said:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.factors.columns import unit_lower
-from heliograph.live.stored.layout import LOWER, VARIANCES, factorise, split_by_path
+from heliograph.live.stored.old_layout import LOWER, VARIANCES, factorise, split_by_path
 from heliograph.numerics.types import Float, PyTree
 
 Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row state"]]
@@ -64,7 +64,7 @@ def convert_to_factors(
     return rows
 
 
-def states_after(step: Step, start: Float[np.ndarray, " state"], state: Float[np.ndarray, " state"], at: int,
+def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[np.ndarray, " state"], at: int,
                  count: int, places: Sequence[Factors] = ()) -> Float[np.ndarray, " state"]:  # fmt: skip
     """Return the state after `count` silent steps from one after step number `at`, in bounded work.
 

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from heliograph.live.long_gap import LONG, TAIL, factors_in, states_after
+from heliograph.live.long_gap import LONG, TAIL, factors_in, pass_long_gap
 from heliograph.live.network_program import NetworkProgram
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
@@ -113,7 +113,7 @@ class Pool:
 
         flat = self.step_rows.state
         places = factors_in(flat.tree(np.arange(float(flat.size))))
-        after = states_after(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
+        after = pass_long_gap(step, self.step_rows.start, row[self.state].copy(), at, to - at, places)
         self.table[slot, self.state], self.table[slot, self.at.start] = after, to
 
     def history(self, slots: Sequence[int]) -> RowHistory:

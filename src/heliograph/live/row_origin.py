@@ -8,7 +8,7 @@ from heliograph.model.estimate import Estimate, lower_unsound_claim
 from heliograph.model.origin import Origin
 
 
-def row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
+def make_row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
     """Return where forecasts from the row in a slot start; the pool stays as it is.
 
     Args:

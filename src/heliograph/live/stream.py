@@ -11,12 +11,12 @@ from scipy.stats import chi2
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import NativeFilterStepper, XlaFilterStepper, compile_native_step, compile_xla_step
-from heliograph.live.senders import LossChain, SenderStatus, sender_status
-from heliograph.live.stored.layout import can_read, describe_old_layout, relocate_parts, split_by_path
+from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_status
+from heliograph.live.stored.old_layout import can_read, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim
-from heliograph.model.faults import function_fault
+from heliograph.model.faults import find_function_fault
 from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.model.origin import Origin
@@ -161,7 +161,7 @@ class Stream:
     def _name_faulty_function(self, u: np.ndarray) -> str:
         """Name the function of the filter's model that returned no number, after a semicolon; "" where none did."""
         before = self.filter.estimate(self._placed.state.unflatten(self._stepper.state))
-        fault = function_fault(self.filter, before, u, self.steps)
+        fault = find_function_fault(self.filter, before, u, self.steps)
         return f"; {fault}" if fault else ""
 
     def sender(self) -> SenderStatus:
@@ -173,7 +173,7 @@ class Stream:
         if (sender := _sender_of(self.filter)) is None:
             raise fail("filter of a stream", "one of event_filter, whose sender decides", type(self.filter).__name__)
         last, now = None if self._last < 0 else self._last, self.steps - 1
-        return sender_status(sender.trigger, LossChain.of_channel(sender.channel), last, now, now)
+        return make_sender_status(sender.trigger, LossChain.of_channel(sender.channel), last, now, now)
 
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""

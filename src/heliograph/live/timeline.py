@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, moment, numbers
+from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.implausible_events import FleetAngles, Judges
 from heliograph.live.network_program import shared_program
 from heliograph.live.plant import LinkCounts
-from heliograph.live.row_origin import estimates_by_name, row_origin
+from heliograph.live.row_origin import estimates_by_name, make_row_origin
 from heliograph.live.rows import BEFORE, HeldRow
-from heliograph.live.senders import SenderStatus
+from heliograph.live.sender_status import SenderStatus
 from heliograph.live.stored.migration import DESCRIPTION, SAME, Carrier, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same, pack, unpack
@@ -193,7 +193,7 @@ class Timeline:
 
     def advance(self, now: float) -> None:
         """Advance the time: what is older than the window becomes final."""
-        self._fleet.advance(self._plant, moment("now", now))
+        self._fleet.advance(self._plant, check_moment("now", now))
         self._finalise()
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
@@ -206,7 +206,7 @@ class Timeline:
     @property
     def origin(self) -> Origin:
         """Return the filters' states at `now`, from which `hg.forecast` predicts; late events are taken as before."""
-        return row_origin(self._fleet, *self._slot_now())
+        return make_row_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
         """Return the slot of the row at `now`, which is looked ahead to where there is none, and its time."""
@@ -235,7 +235,7 @@ class Timeline:
 
     def lagged(self, lag: float) -> dict[str, dict[str, Estimate]]:
         """Return smoothed estimates at `now` - `lag` given all events held, by node and filter."""
-        if not 0 <= moment("lag", lag) <= self.window:
+        if not 0 <= check_moment("lag", lag) <= self.window:
             raise fail("lag", f"a number from 0 to the window, {self.window:g}", lag)
         by_steps, rows = self._lanes.dt is None, self._plant.rows
         time = np.ceil(min(self.now, self._fleet.end_step) - lag) if by_steps else self.now - lag
@@ -334,10 +334,10 @@ class Timeline:
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))
         index, size = sizes[node]
-        at = moment(f"{name}, time", time)
+        at = check_moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
-        came = max(self._plant.confirmed, at) if arrival is None else moment(f"{name}, arrival", arrival)
-        given = numbers(name, values, size, self._fleet.values_of(node))
+        came = max(self._plant.confirmed, at) if arrival is None else check_moment(f"{name}, arrival", arrival)
+        given = check_numbers(name, values, size, self._fleet.values_of(node))
         known = self._fleet.with_losses(node, given.tolist())
         return Known(index, check_63_bits(f"{name}, sequence", sequence), at, known, came)
 

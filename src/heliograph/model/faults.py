@@ -14,7 +14,7 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.types import Float, PyTree
 
 
-def function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, " inputs"], step: int) -> str:
+def find_function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, " inputs"], step: int) -> str:
     """Name the function of a filter's model that returned no finite number, and for what; "" where none is found.
 
     The functions are tried at the mean before the step and one deviation from it in each state, as filters do.

@@ -32,7 +32,7 @@ class Fault(NamedTuple):
     came: str
 
 
-def time_step_fault(dt: Float[np.ndarray, " steps"]) -> Fault | None:
+def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> Fault | None:
     """Return the first time step that is none: one that goes backwards, a counter that wrapped, one beyond 2^53."""
     bad = ~np.asarray(_is_time_step(dt))
     if not bad.any():
@@ -57,7 +57,7 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
     """
     if TIME_STEP not in names or isinstance(u, jax.core.Tracer):
         return
-    fault = time_step_fault(np.atleast_2d(np.asarray(u))[:, list(names).index(TIME_STEP)])
+    fault = find_time_step_fault(np.atleast_2d(np.asarray(u))[:, list(names).index(TIME_STEP)])
     if fault is not None:
         where = f"input {TIME_STEP!r}" + (f", row {fault.row + 1}" if np.ndim(u) > 1 else "")
         raise fail(where, fault.expected, fault.came)
@@ -127,7 +127,7 @@ def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step
     """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
     for name, function in _list_functions(first(plant)).items():
         values = np.concatenate(list(_evaluate_in_parts(plant, function, u, step)))
-        wrong = covariances_wrong(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))
+        wrong = find_wrong_covariances(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
             given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
@@ -153,7 +153,7 @@ def _shorten(value: np.ndarray) -> str:
     return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
 
 
-def covariances_wrong(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
+def find_wrong_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
     """Return which matrices (steps, n, n) are no covariances, by the tolerances of `check.covariance`."""
     finite = np.isfinite(values).all(axis=(1, 2))
     safe = np.where(finite[:, None, None], values, 0.0)
@@ -165,7 +165,7 @@ def covariances_wrong(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
     return wrong
 
 
-def inputs_spoil(
+def do_inputs_spoil(
     model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array | int, precision: type | None = None
 ) -> jax.Array:
     """Test in a compiled step whether the time step is none or a plant's function of the inputs returns what is none.

@@ -183,7 +183,7 @@ class SendOnDelta(AbstractThreshold):
         region: Region = "box",
         losses: Losses = "unknown",
     ):
-        self.delta, self.region = threshold(delta), one_of("region", region, Region)
+        self.delta, self.region = check_threshold(delta), one_of("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.reference = one_of("reference", reference, Literal["sent", "acknowledged"])
         self.losses = one_of("losses", losses, Losses)
@@ -211,7 +211,7 @@ class SendOnPredictionError(AbstractThreshold):
     def __init__(
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
-        self.delta, self.region = threshold(delta), one_of("region", region, Region)
+        self.delta, self.region = check_threshold(delta), one_of("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.losses, self.reference = one_of("losses", losses, Losses), "prediction"
 
@@ -299,7 +299,7 @@ class Periodic(AbstractTrigger):
         return SendReason.SCHEDULE
 
 
-def threshold(delta: ArrayLike) -> Float[Array, "..."]:
+def check_threshold(delta: ArrayLike) -> Float[Array, "..."]:
     """Return a delta, which is positive, or one for each component."""
     report_domain("delta", delta, POSITIVE)
     checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))

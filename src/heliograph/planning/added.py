@@ -21,7 +21,7 @@ from heliograph.factors.roots import observe_information, roots_of
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Bool, Float
-from heliograph.planning.budget import PowerLimits, check_budget, make_unlimited, power_limits
+from heliograph.planning.budget import PowerLimits, check_budget, make_power_limits, make_unlimited
 from heliograph.planning.moments import check_constant_noise, check_design_plant, measurement_moment, steady_moment
 from heliograph.planning.network_of_design import add_best_filter
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
@@ -167,7 +167,7 @@ def design_added(problem: DesignProblem, network: Network) -> PowerDesign:
     sent = links.present**2 * links.unit
     limits = make_unlimited(1, int(free.sum()))
     if problem.budget is not None:
-        limits = power_limits(check_budget(problem.budget), names, free, sent[None])
+        limits = make_power_limits(check_budget(problem.budget), names, free, sent[None])
     moves, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
     criterion = error.criterion(network.states)
     task = SumTask(

@@ -131,7 +131,7 @@ def make_unlimited(steps: int, count: int) -> PowerLimits:
     return PowerLimits(np.full((steps, count), np.inf), np.full(count, np.inf), np.inf)
 
 
-def power_limits(
+def make_power_limits(
     budget: Budget, names: Sequence[str], free: Bool[np.ndarray, "hop"], powers: Float[np.ndarray, "time hop"]
 ) -> PowerLimits:
     """Return the limits that the budget leaves to the free transmitters, while the others send their `powers`.

@@ -7,12 +7,12 @@ from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.added import adds_up, design_added
-from heliograph.planning.budget import check_budget, make_unlimited, power_limits
+from heliograph.planning.budget import check_budget, make_power_limits, make_unlimited
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, steady_moment
 from heliograph.planning.network_of_design import BEST, COVERED
 from heliograph.planning.numbers.design import design_numbers
-from heliograph.planning.paths.design import design_paths, power_task
+from heliograph.planning.paths.design import design_paths, make_power_task
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.paths.networks import paths_of
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
@@ -120,9 +120,9 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     if problem.budget is None:
         limits = make_unlimited(error.steps, int(chosen.sum()))
     else:
-        limits = power_limits(check_budget(problem.budget), paths.names, chosen, fixed)
+        limits = make_power_limits(check_budget(problem.budget), paths.names, chosen, fixed)
     criterion = error.criterion(states)
-    task = power_task(paths, criterion, limits, chosen, fixed, starts, seed)
+    task = make_power_task(paths, criterion, limits, chosen, fixed, starts, seed)
     present = task.problem.exact(fixed[:, chosen]) if isinstance(network, Network) else float("nan")
     return design_paths(problem, task, target, present)
 

@@ -16,7 +16,7 @@ from heliograph.numerics.module import same
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
-from heliograph.planning.paths.model import check_at_least
+from heliograph.planning.paths.model import require_at_least
 from heliograph.planning.transmitters import allocate, transmitter_names
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -91,7 +91,7 @@ def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict
     if unknown := sorted(set(given) - known):
         raise fail("powers of a network", f"names of transmitters {sorted(known)}", unknown)
     return {
-        name: check_at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))
+        name: require_at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))
         for name, power in given.items()
     }
 

@@ -19,7 +19,7 @@ from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.relays.second_moments import (
+from heliograph.relays.error_moments import (
     Propagated,
     correct_moments,
     initial_error_moments,

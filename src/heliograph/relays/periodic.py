@@ -14,7 +14,7 @@ from heliograph.numerics.check import fail, instance, repeat_per_step
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.relays.descent import bfgs
+from heliograph.relays.bfgs import bfgs
 from heliograph.relays.design import (
     GainsByFilter,
     RelayDesign,
@@ -26,7 +26,7 @@ from heliograph.relays.design import (
     split_gains,
     start_moments,
 )
-from heliograph.relays.second_moments import Propagated, correct_moments, gain_mask, propagate_slots, regression_gain
+from heliograph.relays.error_moments import Propagated, correct_moments, gain_mask, propagate_slots, regression_gain
 
 CONVERGED = 1e-13  # relative change of the moments over a period
 PERIODS = 100_000

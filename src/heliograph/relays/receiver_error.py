@@ -11,7 +11,7 @@ from heliograph.model.relays import RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, check_count, fail, instance, repeat_per_step
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
-from heliograph.relays.descent import bfgs
+from heliograph.relays.bfgs import bfgs
 from heliograph.relays.design import (
     RelayDesign,
     given_design,
@@ -21,7 +21,7 @@ from heliograph.relays.design import (
     split_gains,
     start_moments,
 )
-from heliograph.relays.second_moments import (
+from heliograph.relays.error_moments import (
     best_gain,
     correct_moments,
     gain_hessian,

@@ -51,7 +51,7 @@ def stacked_panels(count: int, height: float, margin: float, sharex: bool = True
     return figure, list(figure.subplots(count, 1, squeeze=False, sharex=sharex)[:, 0])
 
 
-def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
+def place_legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
     """Place the legend of `axes` above all panels."""
     handles, names = axes.get_legend_handles_labels()
     legend = axes.get_legend()

@@ -15,7 +15,7 @@ from heliograph.numerics.check import InputError, array, fail, instance
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.forecasts import Forecasts
-from heliograph.report.outputs import OutputHealth, listeners, outputs_of, weighs
+from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -208,14 +208,14 @@ def examine(
     u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
-    for listener in listeners(network, record):
+    for listener in list_listeners(network, record):
         node, name, filter, z = listener[:4]
         advance(f"testing {node}/{name}")
         white = test = None
         if filter.claim != "none" and filter.received:
             white = whitened_innovations(z, filter, u)
-            outputs += outputs_of(network, listener, record, u)
-            test = _test_innovations(about_mean(white) if weighs(filter) else white)
+            outputs += judge_outputs_of_filter(network, listener, record, u)
+            test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
         lost = np.any(record.estimates[node][name].claims == "none")
         claim = "none" if lost else filter.claim
         declared = None if test is None else _judge_declared(filter, z, u)
@@ -284,7 +284,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     return links
 
 
-def about_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
     """Innovations less their mean: those that count of a law with outliers to one side have one, and no memory by it.
 
     Their median tells of a bias.

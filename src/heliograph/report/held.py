@@ -31,7 +31,7 @@ class HeldValue(NamedTuple):
         return f"{self.readings} equal values in a row ({self.value:g}) from row {self.first_row + 1}"
 
 
-def held_value(values: Float[np.ndarray, " time"], variance: Float[np.ndarray, " time"]) -> HeldValue | None:
+def find_held_value(values: Float[np.ndarray, " time"], variance: Float[np.ndarray, " time"]) -> HeldValue | None:
     """Find the longest run of equal values, if chance makes one as long less than once in 10,000 recordings.
 
     A reading of resolution q whose innovation has variance S equals the one before it with probability at most

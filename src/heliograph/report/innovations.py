@@ -35,7 +35,7 @@ def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
 
 
 @matplotlib.rc_context(LOOK)
-def innovations_figure(health: Health, tested: Sequence[FilterHealth]) -> Figure:
+def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     """Draw the innovations of each filter over time, in claimed deviations, with lines at two of them."""
     figure, grid = stacked_panels(len(tested), 1.5, 0.6)
     names = _name_components(health)
@@ -64,7 +64,7 @@ def _name_components(health: Health) -> dict[str, list[str]]:
     return names | {Network.FUSED: [f"{link.node}: {link.component}" for link in health.links]}
 
 
-def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Section:
+def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Section:
     """Return the tests of each filter's innovations, their pictures, and what they say of each output."""
     table = _make_tests_table(health)
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."

@@ -11,7 +11,7 @@ from heliograph.simulation.node import Node
 DRAWS = 20_000  # the median of this many is known to 1 % of a deviation
 
 
-def law_medians(
+def find_law_medians(
     network: Network, node: str, variance: Float[np.ndarray, " received"]
 ) -> Float[np.ndarray, " received"]:
     """Return the median of an innovation under the node's own law, by received number; 0 where the law is symmetric.
@@ -26,7 +26,7 @@ def law_medians(
     """
     if node == Network.FUSED:
         sizes = np.cumsum([0, *(network.nodes[name].received for name in network.names)])
-        return np.concatenate([law_medians(network, name, variance[a:b])
+        return np.concatenate([find_law_medians(network, name, variance[a:b])
                                for name, a, b in zip(network.names, sizes[:-1], sizes[1:], strict=True)])  # fmt: skip
     receiver = network.nodes[node]
     if not isinstance(receiver, Node):

@@ -13,8 +13,8 @@ from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.shares import average_correlated
-from heliograph.report.held import HeldValue, held_value
-from heliograph.report.medians import law_medians
+from heliograph.report.held import HeldValue, find_held_value
+from heliograph.report.medians import find_law_medians
 from heliograph.report.results import Json
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
@@ -37,7 +37,7 @@ class Errors(NamedTuple):
     nees_error: float
 
 
-def errors_of(record: Record) -> list[Errors]:
+def compare_with_truth(record: Record) -> list[Errors]:
     """Compare each filter with the truth, the fused ones first; nothing without one."""
     if record.truth is None:
         return []
@@ -125,7 +125,7 @@ class Listener(NamedTuple):
     blames: bool = True
 
 
-def listeners(network: Network, record: Record) -> Iterator[Listener]:
+def list_listeners(network: Network, record: Record) -> Iterator[Listener]:
     """Yield every filter with its measurements: those of the nodes, then central ones."""
     received, relied_on = record.measurements, _find_relied_on(network)
     for node, z in received.items():
@@ -162,7 +162,9 @@ def weighs(filter: AbstractFilter) -> bool:
     return innovation.weight is not None
 
 
-def outputs_of(network: Network, listener: Listener, record: Record, inputs: np.ndarray) -> list[OutputHealth]:
+def judge_outputs_of_filter(
+    network: Network, listener: Listener, record: Record, inputs: np.ndarray
+) -> list[OutputHealth]:
     """Judge each output by the innovations of one filter that claims a covariance.
 
     A median that the node's law of noise has itself, since it is not symmetric, is no bias.
@@ -173,7 +175,7 @@ def outputs_of(network: Network, listener: Listener, record: Record, inputs: np.
         outcome = listener.filter.run(listener.measurements, inputs)
         variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
         innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
-    medians = law_medians(network, listener.node, _median_over_time(np.asarray(innovations.variance)))
+    medians = find_law_medians(network, listener.node, _median_over_time(np.asarray(innovations.variance)))
     # What is told, such as a gain or a flag, is known: its innovations are 0, of variance 0.
     variance = np.asarray(innovations.variance)
     judges = ~(np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0))
@@ -207,7 +209,9 @@ def judge_outputs(
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
         size = average_correlated(used[:, i]) if np.any(~np.isnan(used[:, i])) else (np.nan, np.nan)
-        judged.append(OutputJudgement(name, i in outliers, summary, *size, held_value(received[:, i], variance[:, i])))
+        judged.append(
+            OutputJudgement(name, i in outliers, summary, *size, find_held_value(received[:, i], variance[:, i]))
+        )
     return judged
 
 
@@ -241,11 +245,11 @@ class RecentOutputs:
 
 def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Summarise the innovations of all filters that weigh what arrives in a recording, by output."""
-    chosen = (x for x in listeners(network, record) if x.name in record.weighed.get(x.node, {}))
-    return [output for x in chosen for output in outputs_of(network, x, record, np.zeros(0))]
+    chosen = (x for x in list_listeners(network, record) if x.name in record.weighed.get(x.node, {}))
+    return [output for x in chosen for output in judge_outputs_of_filter(network, x, record, np.zeros(0))]
 
 
-def output_numbers(health: OutputHealth) -> dict[str, Json]:
+def summarise_output(health: OutputHealth) -> dict[str, Json]:
     """Return the numbers of one output for a summary; None where there are none."""
     judged, summary = health.judged, health.judged.summary
     values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
@@ -262,9 +266,9 @@ def output_numbers(health: OutputHealth) -> dict[str, Json]:
     return counted | {name: None if np.isnan(value) else value for name, value in values.items()}
 
 
-def output_row(health: OutputHealth) -> dict[str, Json]:
+def make_output_row(health: OutputHealth) -> dict[str, Json]:
     """Return the numbers of one output with its names, and in words."""
     judged = health.judged
     words = str(judged.summary) + ("; to blame" if judged.to_blame else "")
     named: dict[str, Json] = {"node": health.node, "filter": health.filter, "output": judged.output, "words": words}
-    return named | output_numbers(health)
+    return named | summarise_output(health)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
-from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, legend_above
+from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, place_legend_above
 from heliograph.simulation.results.record import Record
 
 # Names that two coordinates of a plane have, without what stands before them: "x" and "y", "position_x" and ...
@@ -28,7 +28,7 @@ def coordinates_of(states: Sequence[str]) -> tuple[int, int] | None:
 
 
 @matplotlib.rc_context(STYLE)
-def map_figure(record: Record, node: str, names: Sequence[str]) -> Figure:
+def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure:
     """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true one."""
     places = coordinates_of(record.states)
     assert places is not None  # only then is a map drawn
@@ -47,7 +47,7 @@ def map_figure(record: Record, node: str, names: Sequence[str]) -> Figure:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(label_with_unit(record.states[i], record.units))
     axes.set_ylabel(label_with_unit(record.states[j], record.units))
-    legend_above(figure, axes)
+    place_legend_above(figure, axes)
     return figure
 
 

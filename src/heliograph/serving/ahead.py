@@ -7,7 +7,7 @@ import numpy as np
 
 import heliograph
 from heliograph.live.fleet import Fleet
-from heliograph.live.row_origin import row_origin
+from heliograph.live.row_origin import make_row_origin
 from heliograph.live.rows import HeldRow
 from heliograph.model.origin import Origin
 from heliograph.numerics.check import fail, show_value
@@ -61,7 +61,7 @@ class ForecastPublisher:
     def forecasts(self, row: HeldRow) -> list[tuple[float, dict[str, dict[str, object]]]]:
         """Return the time of each horizon behind a row, and what each filter says; nothing behind the last step."""
         now = float(row.key[0])
-        start = ForecastStart(row_origin(self._fleet, row.slot, now))
+        start = ForecastStart(make_row_origin(self._fleet, row.slot, now))
         if not self._continuous and start.origin.step + max(self.horizons) - 1 > self._fleet.end_step:
             return []
         found = heliograph.forecast(start, self.horizons, inputs="held")

@@ -178,13 +178,13 @@ async def _watch_services(settings: ServiceSettings) -> AsyncIterator[Look]:
         yield lambda service: service
         return
     from heliograph.files.sources import Sources
-    from heliograph.serving.observation.page import parse_page_address, shown
+    from heliograph.serving.observation.page import parse_page_address, serve_page
     from heliograph.serving.observation.watch import watch_of
 
     table = settings.sources
     uncounted = set() if table is None else Sources(table, settings.network).uncounted
     watch = watch_of(settings.network, settings.name, uncounted)
-    async with shown(watch, parse_page_address(settings.page, hosts=settings.hosts)):
+    async with serve_page(watch, parse_page_address(settings.page, hosts=settings.hosts)):
         yield watch.wrap
 
 
@@ -248,7 +248,7 @@ def _say(what: str) -> None:
 
 async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, look: Look, parts: int) -> None:
     """Serve the parts that this process leases, as one of several."""
-    from heliograph.serving.storage.database import engine_at
+    from heliograph.serving.storage.database import open_database
     from heliograph.serving.storage.leases import Leases
     from heliograph.serving.storage.owner import name_of_process
     from heliograph.serving.storage.store import Store
@@ -273,7 +273,7 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, look
 
     # Lease parts under a name that is unique to this process.
     name = settings.process or name_of_process()
-    engine = engine_at(store_name)
+    engine = open_database(store_name)
     try:
         await keep_sharing(Leases(engine, name, parts), serve)
     finally:

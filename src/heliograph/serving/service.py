@@ -25,7 +25,7 @@ from heliograph.serving.exchange import Exchange
 from heliograph.serving.intake import Using, plant_of
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.output import Output
-from heliograph.serving.silence import Silence, dead_by_plant
+from heliograph.serving.silence import Silence, find_dead_senders
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 
 LARGE, MILLION = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
@@ -182,7 +182,7 @@ class Service:
 
     def dead_by_plant(self) -> dict[str, list[str]]:
         """Return the dead senders of each plant in memory that has one."""
-        return dead_by_plant(self.fleet, self.plants)
+        return find_dead_senders(self.fleet, self.plants)
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""

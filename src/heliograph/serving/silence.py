@@ -89,7 +89,7 @@ class Silence:
         return tuple(name for name, status in self.fleet.senders(plant).items() if status.dead)
 
 
-def dead_by_plant(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
+def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
     """Return the dead senders of each plant that has one."""
     dead = {
         name: [node for node, status in fleet.senders(plant).items() if status.dead]

@@ -12,7 +12,7 @@ from heliograph.linear.known_losses import (
     KnownLossSystem,
     UnobservedGrowth,
     certify_radius,
-    fastest_unobserved_mode,
+    find_fastest_unobserved_mode,
     find_gains,
     is_excited_by_noise,
 )
@@ -101,7 +101,7 @@ def certify_boundedness(network: Network) -> Boundedness:
             bound = known.system.bound(gains).sum(axis=0) if known.exact else None
             return Boundedness("certified", _describe_certificate(a, radius), radius, 0.0, known.gains(gains), bound)
     # Not certified: is there an unstable mode that losses hide?
-    unseen = fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
+    unseen = find_fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
     verdict, reason = _judge_unseen(network, links, growing, known, unseen, radius)
     return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
 

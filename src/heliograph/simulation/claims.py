@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim
-from heliograph.model.premises.agreement import differences, join_premises, part_of
+from heliograph.model.premises.agreement import join_premises, list_differences, part_of
 from heliograph.model.premises.premise import Kept, Premise
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 
@@ -59,7 +59,7 @@ def nominal(filter: AbstractFilter) -> AbstractFilter:
     return twin
 
 
-def standing_in(own: Premise, filter: AbstractFilter) -> AbstractFilter:
+def judge_filter(own: Premise, filter: AbstractFilter) -> AbstractFilter:
     """Return the filter as it stands in a world: with its claim where it believes it, else `nominal`.
 
     Args:
@@ -70,13 +70,13 @@ def standing_in(own: Premise, filter: AbstractFilter) -> AbstractFilter:
     return filter if is_weak or not parts_apart(own, filter) else nominal(filter)
 
 
-def nodes_standing(network: HasNodes) -> dict[str, Node | ReceivingNode]:
+def judge_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     """Return the nodes with their filters as they stand in them."""
     results = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
             own = premise_at(network, name)
-            results[name] = _replace_filters(node, {f: standing_in(own, filter) for f, filter in node.filters.items()})
+            results[name] = _replace_filters(node, {f: judge_filter(own, filter) for f, filter in node.filters.items()})
     return results
 
 
@@ -94,7 +94,7 @@ def judge_fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
     own = premise_of_all(network)
-    return {name: standing_in(own, f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
+    return {name: judge_filter(own, f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
 
 
 def nominal_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
@@ -121,7 +121,7 @@ def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilt
 
 def parts_apart(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
     """Return the parts in which a filter believes another world than its own."""
-    return (UNSAID,) if filter.premise is None else differences(filter.premise, own)
+    return (UNSAID,) if filter.premise is None else list_differences(filter.premise, own)
 
 
 def premise_at(network: HasNodes, name: str) -> Premise:
@@ -151,7 +151,7 @@ def premise_of_all(network: HasNodes) -> Premise:
     return join_premises([premise_at(network, name) for name in nodes]) if nodes else Premise(network.plant)
 
 
-def beliefs(network: HasNodes) -> Iterator[Belief]:
+def list_other_beliefs(network: HasNodes) -> Iterator[Belief]:
     """Yield the filters that believe another world than that in which they stand, node after node, fused ones last.
 
     Args:

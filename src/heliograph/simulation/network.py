@@ -30,11 +30,11 @@ from heliograph.simulation.centres.centre import along_estimates, claim_of_infor
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.claims import (
     Belief,
-    beliefs,
     judge_fused_standing,
+    judge_nodes,
+    list_other_beliefs,
     lower_claim,
     nodes_alike,
-    nodes_standing,
     nominal_fused,
     nominal_nodes,
 )
@@ -126,7 +126,7 @@ class Network(Module):
         self.rows = FrozenMapping(
             {name: range(end - self.nodes[name].received, end) for name, end in zip(self.names, ends, strict=True)}
         )
-        self.nodes = nodes_alike(nodes_standing(self))
+        self.nodes = nodes_alike(judge_nodes(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
@@ -340,7 +340,7 @@ class Network(Module):
 
     def beliefs(self) -> tuple[Belief, ...]:
         """Return filters that believe another world than that in which they stand, node after node, fused ones last."""
-        return tuple(beliefs(self))
+        return tuple(list_other_beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
         """Return the network that claims "nominal" at most, as where digits are lost that nothing bounds."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import INPUT, Judgement
-from heliograph.model.faults import function_fault
+from heliograph.model.faults import find_function_fault
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
@@ -45,7 +45,7 @@ def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, j
 _step: Callable[..., Stepped] = eqx.filter_jit(AllFilters.step, inline=True)  # type: ignore[call-overload]
 
 
-def plausible_step(
+def step_plausibly(
     filters: AllFilters,
     states: PyTree,
     z: Sequence[jax.Array],
@@ -126,7 +126,7 @@ def _reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
     return {k: said for k in _find_flagged(votes, "reason") if (said := Judgement.why_values(votes[k]))}
 
 
-def doubts(
+def describe_doubts(
     network: Network,
     outputs: Mapping[str, PyTree],
     refused: Mapping[str, Mapping[int, str]],
@@ -179,7 +179,7 @@ class _Faults:
         else:
             kind, f, i = self.network.places[node, name]
             before = jax.tree.map(lambda leaf: leaf[row - 1, f, i], self.outputs["estimates"][kind])
-        fault = function_fault(filter, before, self.u[row], row)
+        fault = find_function_fault(filter, before, self.u[row], row)
         return f"; {fault}" if fault else ""
 
 

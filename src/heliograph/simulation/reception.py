@@ -23,9 +23,9 @@ from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_names
-from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.random_keys import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.side_by_side import map_all
 from heliograph.simulation.shared_fading import deliver, memory_places, start
 
@@ -294,7 +294,7 @@ def _receive_sum(
     return jnp.sum(jnp.stack(parts), axis=0) if parts else nobody
 
 
-def medium_of(network: Network) -> AbstractMedium:
+def make_reception(network: Network) -> AbstractMedium:
     """Build the transmission from the plant to the nodes of a network."""
     # Relays in slots.
     if network.relays is not None:

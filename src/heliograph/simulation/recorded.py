@@ -13,7 +13,7 @@ from heliograph.engine.choice import compute_once
 from heliograph.model.estimate import Estimate
 from heliograph.model.origin import Origin, last_input, usual_spacing
 from heliograph.model.plant import TIME_STEP
-from heliograph.model.row_times import common_dates, warn_of_unequal_steps
+from heliograph.model.unequal_steps import common_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.times.row_times import check_times
@@ -21,19 +21,19 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
-from heliograph.simulation.description.wide_angles import beyond_a_turn, wide_in_rows
+from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.plausible_step import (
     Judges,
     any_implausible,
-    doubts,
+    describe_doubts,
     find_refused_rows,
     forbidden_rows,
-    plausible_step,
+    step_plausibly,
 )
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
-from heliograph.simulation.smoothed import Smoother, add_truth, record_of, select_smoothed_part
+from heliograph.simulation.smoothed import Smoother, add_truth, make_record, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters, initial_states
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
@@ -103,7 +103,7 @@ def run(
     for name, node in network.nodes.items():
         z[name] = _drop_beyond_limits(name, node, z[name])
         _warn_of_forbidden(name, node, z[name])
-    for line in beyond_a_turn(network, z):
+    for line in warn_beyond_a_turn(network, z):
         warnings.warn(line, stacklevel=2)
     # Filters, on what a recording without implausible data has.
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
@@ -114,11 +114,11 @@ def run(
         )
         outputs = _filter_plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
     state = outputs.pop("state")
-    record = record_of(network, smoothing, outputs, clock)
+    record = make_record(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
-    for line in (*wide_in_rows(network, record), *_describe_left_out(network, record)):
+    for line in (*warn_wide_in_rows(network, record), *_describe_left_out(network, record)):
         warnings.warn(line, stacklevel=2)
     origin = _make_origin(network, record, state, u)
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)
@@ -205,7 +205,7 @@ def _filter_plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) ->
     # Usually nothing is implausible.
     outputs = _filter_rows(*rest, grouped(), False)
     if not any_implausible(outputs):
-        said = doubts(network, outputs, {}, rest[2])
+        said = describe_doubts(network, outputs, {}, rest[2])
     else:
         # Find all rows that are, then filter again without them.
         outputs = first_time = _filter_rows(*rest, grouped(), True)
@@ -217,7 +217,7 @@ def _filter_plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) ->
                 z[name][list(rows)] = np.nan
             again = _filter_rows(*rest, grouped(), False)
             outputs = _filter_rows(*rest, grouped(), True) if any_implausible(again) else again
-        said = doubts(network, first_time, refused, rest[2])
+        said = describe_doubts(network, first_time, refused, rest[2])
     for line in said:
         warnings.warn(line, stacklevel=3)
     return {name: values for name, values in outputs.items() if not name.startswith("judged")}
@@ -245,7 +245,7 @@ def _collect_central_states(
 
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k, drawn = row
-        return plausible_step(filters, states, z_k, u_k, k, drawn)[0], states[1]
+        return step_plausibly(filters, states, z_k, u_k, k, drawn)[0], states[1]
 
     before: PyTree = jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
     return before
@@ -293,7 +293,7 @@ def _scan(
 
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         (k, u_k, z_k, drawn), row_counts = row
-        step = plausible_step if without else AllFilters.step
+        step = step_plausibly if without else AllFilters.step
         after, results = step(filters, states, z_k, u_k, k, drawn)
         if row_counts is not None:
             after = jax.tree.map(lambda new, old: jnp.where(row_counts, new, old), after, states)

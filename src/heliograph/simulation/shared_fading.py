@@ -17,7 +17,7 @@ from heliograph.random_affine.chain import unique_memories
 from heliograph.random_affine.delay import signal_size
 from heliograph.random_affine.memory import draw_with_shared_memories, drop_names, init_with_shared_memories, memories
 from heliograph.random_affine.moments.route import apply
-from heliograph.simulation.draws import (
+from heliograph.simulation.random_keys import (
     CHANNEL,
     CHANNEL_START,
     MEMORY,

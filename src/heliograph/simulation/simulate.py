@@ -18,28 +18,28 @@ from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import Precision, check_precision, inputs_of, key_of
-from heliograph.simulation.centres.mesh import meshes_of
+from heliograph.simulation.centres.mesh import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.reception import medium_of
+from heliograph.simulation.reception import make_reception
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.by_run import each_run, read_by, trajectories
+from heliograph.simulation.runs.by_run import each_run, read_by, simulate_trajectories
 from heliograph.simulation.runs.lanes import (
     LANES,
     RunLanes,
     Shared,
     added,
+    advance_in_chunks,
     batch_counts,
-    in_chunks,
     is_shared,
     one_processor,
 )
-from heliograph.simulation.runs.memory import Needed, check_memory, out_of_memory, size_of
-from heliograph.simulation.runs.native import natively
+from heliograph.simulation.runs.memory import Needed, check_memory, explain_out_of_memory, size_of
+from heliograph.simulation.runs.native import simulate_natively
 from heliograph.simulation.smoothed import Recorded, Smoother, finish, reduce_run, select_smoothed_part
-from heliograph.simulation.stepping import AllFilters, plan, plans
+from heliograph.simulation.stepping import AllFilters, has_plan, plan
 from heliograph.simulation.world import World
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
@@ -105,19 +105,21 @@ def monte_carlo(
         network = network.with_nominal_claims()
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
-    if one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
-        with out_of_memory(runs, horizon):
-            by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing, precision)
+    if one_processor() and not any(mesh.is_long for mesh in build_meshes(network).values()):
+        with explain_out_of_memory(runs, horizon):
+            by_native_code = simulate_natively(
+                network, u, base, reducer, first_run, runs, chunk, progress, smoothing, precision
+            )
         if by_native_code is not None:
             return _warn_of_nan(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
-    world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
+    world = World(network.plant, make_reception(network), plan(filters, u) if has_plan(filters) else filters)
     later, stop = smoothing and smoothing.smoother(filters), np.asarray(first_run + runs)
     job = _Job(world, later, u, base, stop, reducer, precision)
     if one_processor():
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
-    with out_of_memory(runs, horizon):
+    with explain_out_of_memory(runs, horizon):
         recorded = _run_chunks(job, first_run, runs, chunk, progress)
     return _warn_of_nan(finish(reducer, recorded, network, smoothing), network)
 
@@ -168,7 +170,7 @@ def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Prog
             first_run,
             one_by_one=bool(job.world.filters.meshes),  # weights are solved for many estimates at once
         )
-        parts = in_chunks(lanes.advance, lanes.count, lanes.wide, (runs, chunk), progress)
+        parts = advance_in_chunks(lanes.advance, lanes.count, lanes.wide, (runs, chunk), progress)
     collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *parts)  # without padding
     total = lanes.total()
     sums, common = (
@@ -216,7 +218,7 @@ def _simulate_block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], 
     def summed(leaf: jax.Array) -> PyTree:
         if len(leaf) < len(runs):
             return Shared(leaf[0].astype(float))
-        return by_batch(jnp.where(valid, jnp.moveaxis(leaf, 0, -1).astype(float), 0.0), start)
+        return group_by_batch(jnp.where(valid, jnp.moveaxis(leaf, 0, -1).astype(float), 0.0), start)
 
     sums, ever = jax.tree.map(summed, (recorded.sums, recorded.ever))
     collected = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), recorded.collected)
@@ -255,7 +257,7 @@ def _estimate_memory(job: _Job, runs: int, chunk: int) -> Needed:
     )
 
 
-def by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
+def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
     """Return values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none."""
     runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
     row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)
@@ -272,7 +274,7 @@ def _single(leaf: PyTree) -> PyTree:
 
 def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
-    return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
+    return simulate_trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
 def _each_reduced(reducer: AbstractReducer[Any], later: Smoother | None, outputs: PyTree) -> OfStep:

@@ -187,7 +187,7 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
         warn_if_inconsistent(f"{FUSED}/{name}", np.asarray(sums))
 
 
-def record_of(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, time: np.ndarray) -> Record:
+def make_record(network: Network, smoothing: SmoothedPart | None, outputs: PyTree, time: np.ndarray) -> Record:
     """Return the record of a recording, with its smoothed part."""
     if smoothing is None:
         return trajectories_record(network, {"truth": None, **outputs}, time)

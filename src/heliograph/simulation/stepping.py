@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen, compile_on_call, compute_once, map_arrays
+from heliograph.engine.choice import choose_code, compile_on_call, compute_once, map_arrays
 from heliograph.filters.base import AbstractFilter, make_sizes
 from heliograph.filters.linear.plan import LinearStep
 from heliograph.filters.smoother_step import gaussian_of
@@ -30,7 +30,7 @@ from heliograph.simulation.centres.centre import (
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
 from heliograph.simulation.centres.fusions import Reporting, StackedFusions, centres_of, fusions_of, sources_of
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
-from heliograph.simulation.centres.mesh import Mesh, meshes_of
+from heliograph.simulation.centres.mesh import Mesh, build_meshes
 from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -89,7 +89,7 @@ class AllFilters(Module):
         # Central filters, fusions, informed centres, centres with reports.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
-        self.reporting, self.meshes = _make_reporting(network), meshes_of(network)
+        self.reporting, self.meshes = _make_reporting(network), build_meshes(network)
         self.tests = make_fused_innovations(network, self.alike) if tests else {}
         # Permutation of the groups' measurements into the order of the nodes.
         grouped = [name for names in network.groups for name in names]
@@ -278,7 +278,7 @@ def _plan_alike(alike: StackedFilters, u: Array) -> StackedFilters:
     """Plan filters that differ in numbers alone by one program, by native code where it supports the filter."""
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):
-        choice = chosen(_plan_filter, arguments, (True, False, False))
+        choice = choose_code(_plan_filter, arguments, (True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
     planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
@@ -297,7 +297,7 @@ def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count:
     return map_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
 
 
-def plans(filters: AllFilters) -> bool:
+def has_plan(filters: AllFilters) -> bool:
     """Test whether some filter has anything to precompute."""
     return any(
         type(filter).planned is not AbstractFilter.planned

@@ -13,9 +13,9 @@ from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.delay import Delayed
 from heliograph.random_affine.moments.route import apply
-from heliograph.simulation.draws import CHANNEL, CHANNEL_START, checksum, draw_key
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
+from heliograph.simulation.random_keys import CHANNEL, CHANNEL_START, checksum, draw_key
 from heliograph.simulation.results.record import Record
 
 Arrival = tuple[str, int, float, np.ndarray, float]  # node, sequence, time, values, arrival

@@ -9,7 +9,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
+from heliograph.simulation.random_keys import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.reception import AbstractMedium
 from heliograph.simulation.stepping import AllFilters
 from straightline import present

@@ -61,7 +61,7 @@ class Units(NamedTuple):
     inputs: Float[np.ndarray, " u"]
 
 
-def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
+def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
     """Return the filter with estimate S xhat from Q z and U u, where `filter` has xhat from z and u.
 
     Raises:
@@ -71,19 +71,19 @@ def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
     # x -> S x: mean S m, covariance S P S; plant, sensor and channel in the new units.
     match filter:
         case GaussianFilter() | OpenLoop():
-            plant, mean = rescaled_plant(filter.plant, units), s * filter.initial_mean
+            plant, mean = rescale_plant(filter.plant, units), s * filter.initial_mean
             covariance = np.outer(s, s) * filter.initial_covariance
             moved = replace(filter, plant=plant, initial_mean=mean, initial_covariance=covariance)
             if isinstance(moved, OpenLoop):
                 return moved
-            return replace(moved, sensor=rescaled_sensor(moved.sensor, units), channel=_channel(moved.channel, units))
+            return replace(moved, sensor=rescale_sensor(moved.sensor, units), channel=_channel(moved.channel, units))
         case LinearFilter():
-            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
             return replace(filter, plant=plant, sensor=sensor, channel=_channel(filter.channel, units))
         case MixtureFilter():
             return replace(
                 filter,
-                plant=rescaled_plant(filter.plant, units),
+                plant=rescale_plant(filter.plant, units),
                 components=_rescale_combinations(filter.components, units),
             )
         case PolynomialFilter(inner=LinearSystemFilter()):
@@ -92,18 +92,18 @@ def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
             inner = _rescale_system(filter.inner, filter.degree, units)
             return PolynomialFilter(inner, filter.degree, filter.endless, _rescale_centre(filter.centre, units))
         case ModalFilter() | UncertainModalFilter():
-            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
             return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
         case AdditiveModalFilter():
-            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
             return replace(
                 filter, plant=plant, sensor=sensor, terms=tuple(_rescale_by_mode(t, units) for t in filter.terms)
             )
         case SideInformationFilter(flagged=False) | MultipleModelFilter():
-            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            plant, sensor = rescale_plant(filter.plant, units), rescale_sensor(filter.sensor, units)
             return replace(filter, plant=plant, sensor=sensor, channel=_rescale_by_mode(filter.channel, units))
         case PredictionFilter():
-            return PredictionFilter(_gaussian(rescaled(filter.base, units)))
+            return PredictionFilter(_gaussian(rescale_filter(filter.base, units)))
         case SequentialFilter():
             return replace(filter, filters=tuple(_gaussian(f) for f in _rescale_in_turn(filter, units)))
         case _:
@@ -123,7 +123,7 @@ def _rescale_in_turn(filter: SequentialFilter, units: Units) -> list[AbstractFil
         node_units = units._replace(
             outputs=units.outputs[said : said + p], received=units.received[received : received + m]
         )
-        parts.append(rescaled(single, node_units))
+        parts.append(rescale_filter(single, node_units))
         received, said = received + m, said + p
     return parts
 
@@ -134,7 +134,7 @@ def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNois
     return Shaped(np.diag(factors), law)
 
 
-def rescaled_plant(plant: AnyPlant, units: Units) -> AnyPlant:
+def rescale_plant(plant: AnyPlant, units: Units) -> AnyPlant:
     """Return the plant of S x, with inputs U u."""
     rescaled: AnyPlant = at_each_step(lambda step: _rescale_plant(step, units), plant)
     return rescaled
@@ -157,7 +157,7 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
     return Plant(InUnits(plant.transition, s, (s, u)), noise, center, law, **names)
 
 
-def rescaled_sensor(sensor: AnySensor, units: Units) -> AnySensor:
+def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
     """Return the sensor that measures R y of S x."""
     rescaled: AnySensor = at_each_step(lambda step: _rescale_sensor(step, units), sensor)
     return rescaled
@@ -171,11 +171,11 @@ def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
 
 
 def _channel(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
-    rescaled: SecondOrder | OverTime = at_each_step(lambda step: rescaled_channel(step, units), channel)
+    rescaled: SecondOrder | OverTime = at_each_step(lambda step: rescale_channel(step, units), channel)
     return rescaled
 
 
-def rescaled_channel(channel: SecondOrder, units: Units) -> SecondOrder:
+def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the description of z = Q G R^-1 y + Q n."""
     q, (_, factor) = units.received, _scale_channel(units)
 

@@ -24,7 +24,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
 from heliograph.simulation.simulate import monte_carlo
-from heliograph.testing.rescaling import Units, rescaled, rescaled_channel, rescaled_plant, rescaled_sensor
+from heliograph.testing.rescaling import Units, rescale_channel, rescale_filter, rescale_plant, rescale_sensor
 
 DECADES = 9  # factors from 1e-9 to 1e9
 DIGITS = 1e-8  # of each component's own scale
@@ -117,7 +117,7 @@ def _compare_runs(
     """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed."""
     nodes = {name: _rescale_node(name, node, units[name]) for name, node in _list_nodes(network).items()}
     fused = {name: _rescale_fusion(name, fusion, units[Network.FUSED]) for name, fusion in network.fused.items()}
-    scaled = Network(rescaled_plant(network.plant, units[Network.FUSED]), nodes, fused)
+    scaled = Network(rescale_plant(network.plant, units[Network.FUSED]), nodes, fused)
     shared = units[Network.FUSED].inputs
     estimates = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
     worst = 0.0
@@ -160,10 +160,10 @@ def _rescale_node(name: str, node: Node, units: Units) -> Node:
     channel = first(node.channel)
     for affine in [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]:
         turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
-        off = _measure_difference(rescaled_channel(second_order(affine), units), second_order(turned))
+        off = _measure_difference(rescale_channel(second_order(affine), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
-    filters = {f: rescaled(filter, units) for f, filter in node.filters.items()}
-    return Node(rescaled_sensor(node.sensor, units), _change_units(node.channel, units), filters)
+    filters = {f: rescale_filter(filter, units) for f, filter in node.filters.items()}
+    return Node(rescale_sensor(node.sensor, units), _change_units(node.channel, units), filters)
 
 
 def _change_units(channel: Channel, units: Units) -> Channel:
@@ -191,7 +191,7 @@ def _ends(quadratic: QuadraticMap) -> np.ndarray:
 
 def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
     if isinstance(fusion, AbstractFilter):
-        return rescaled(fusion, units)
+        return rescale_filter(fusion, units)
     if fusion.quantizer is not None:
         raise fail(f"fusion {name!r} to rescale", "one without quantizers, whose cells are in units", "quantizers")
     return fusion

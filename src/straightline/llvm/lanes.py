@@ -46,7 +46,7 @@ FLUSH = 0x8040  # of the control word of x86: results and arguments that are sub
 X86 = ("x86_64", "amd64", "i386", "i686")
 
 
-def flushing(width: int) -> str:
+def write_flush(width: int) -> str:
     """Write `i32 @hg_flush()`, from which on subnormal numbers are zeros, and `void @hg_restore(i32)` of what it gave.
 
     An operation on them takes x86 a hundred times as long, and single precision has them at 1e-38, as XLA knows, whose

@@ -11,7 +11,7 @@ import numpy as np
 
 from straightline.folding import DTYPES
 from straightline.limits import LONGEST, TABLE
-from straightline.llvm.lanes import WIDTH, flushing, gather, lane_numbers, types
+from straightline.llvm.lanes import WIDTH, gather, lane_numbers, types, write_flush
 from straightline.llvm.operations import BITS
 from straightline.llvm.prefetch import Rows, longest, share
 from straightline.llvm.text import Slots, Writer, loops_of, turns_of
@@ -24,10 +24,10 @@ from straightline.program import (
     Summed,
     crossing,
     find_differing,
-    in_order,
-    needed,
+    list_needed,
     products_of,
     row_length,
+    sort_items,
     uses,
 )
 from straightline.rules.loops import copied
@@ -125,7 +125,7 @@ def _store_in_memory(lowering: Lowering, value: Value) -> InMemory:
 
 
 @refusing("the text of a program")
-def written(
+def write_module(
     program: Program,
     differing: Iterable[bool],
     width: int | None,
@@ -145,7 +145,7 @@ def written(
     """
     outputs = output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
-    items = in_order(needed(outputs))
+    items = sort_items(list_needed(outputs))
     counts = Counter([x.op for x in items if isinstance(x, Node)])
     operations = counts.total() - counts["constant"]
     if operations > LONGEST:
@@ -187,7 +187,7 @@ def written(
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
     once = None
     if roots:
-        writer = Writer(True, needed(roots), products, set(), slots)
+        writer = Writer(True, list_needed(roots), products, set(), slots)
         writer.turning, writer.flushes = turning, flushes
         once = _finish_source(_write_shared(writer, program, pointers, in_shared), writer, [])
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
@@ -230,7 +230,7 @@ def _finish_source(text: str, writer: Writer, movers: Sequence[Callable[[int], s
     work = sum(count * turns[block] for block, count in counts.items())
     helpers: list[Callable[[int], str]] = [*movers, *(partial(gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
-        helpers.append(flushing)
+        helpers.append(write_flush)
     called = writer.called - {"threefry"}
     if called:
         helpers.append(partial(functions, called))

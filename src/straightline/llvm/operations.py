@@ -182,7 +182,7 @@ def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
     return emit(f"{'sext' if source[0] == 'i' else 'zext'} {operand_type} {name} to {result_type}")
 
 
-def fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
+def write_fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
     """Emit a b + c, c - a b or a b - c, rounded once, from the names of a, b, c."""
     reals = vector(node.type)
     a, b, c = names

@@ -43,7 +43,7 @@ def share(bytes: int, width: int, loop: Loop) -> int:
     return lines if lines * PATIENCE <= operations else 0
 
 
-def requests(rows: Rows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:
+def write_requests(rows: Rows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:
     """Write what one turn asks for.
 
     Args:

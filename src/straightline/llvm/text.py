@@ -8,8 +8,8 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from straightline.llvm.lanes import WIDTH, gather_name
-from straightline.llvm.operations import BITS, CALLED, LLVM, called, fused, operation, splat, vector
-from straightline.llvm.prefetch import Rows, requests
+from straightline.llvm.operations import BITS, CALLED, LLVM, called, operation, splat, vector, write_fused
+from straightline.llvm.prefetch import Rows, write_requests
 from straightline.nodes import REAL, Block, Buffer, Check, Guard, Loop, Node, Store, Type
 from straightline.program import fusable
 
@@ -131,7 +131,7 @@ class Writer:
         if product is not None:
             rest = node.args[0] if node.args[1] is product else node.args[1]
             names = [self.operand(n) for n in (*product.args, rest)]
-            return fused(node, product, names, self.add)
+            return write_fused(node, product, names, self.add)
         if node.op in CALLED:
             self.called.add(called(node))
         return operation(node, [self.operand(a) for a in node.args], self.add)
@@ -290,7 +290,7 @@ class Writer:
         if loop.counter is not None and loop.counter in self.mine:
             self._keep(loop.counter, self.operand(loop.counter))
         for rows in self.asked if loop is self.asking else ():
-            self.lines += [f"  {line}" for line in requests(rows, loop.length or 1, counter, WIDTH, self.add)]
+            self.lines += [f"  {line}" for line in write_requests(rows, loop.length or 1, counter, WIDTH, self.add)]
         # Counted: body, then the latch. Conditional: the check is inside the body.
         if loop.condition is None:
             self.block(loop.body)

@@ -11,8 +11,8 @@ from straightline.memory import contiguous
 from straightline.nodes import Unsupported
 from straightline.rules.elementwise import select
 from straightline.rules.loops import in_memory
-from straightline.rules.places import clamped, fill_of, fills, inside, narrowed, places_of
-from straightline.rules.shapes import chosen
+from straightline.rules.places import clamp_place, fill_of, fills, inside, narrowed, places_of
+from straightline.rules.shapes import select_array
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -73,7 +73,7 @@ def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indi
         which = indices[(*_row(entry, numbers), column)]
         if which.op != "constant":
             here = [np.array(case[entry], dtype=object) for case in cases]
-            selected[entry] = chosen(lowering.graph, which, here)[()]
+            selected[entry] = select_array(lowering.graph, which, here)[()]
     return selected
 
 
@@ -95,7 +95,7 @@ def _gather_from_memory(
         if start.op == "constant":
             loaded[entry] = x.ravel()[starts[entry]]
         else:
-            first: Any = clamped(lowering, start, last)
+            first: Any = clamp_place(lowering, start, last)
             loaded[entry] = lowering.graph.load(buffer, int(starts[entry]), (stride,), (first,))
     return loaded
 

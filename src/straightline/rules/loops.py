@@ -18,7 +18,7 @@ from straightline.rules.elementwise import select
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 
-def repeated(
+def repeat_turns(
     lowering: Lowering, length: int, carry: Sequence[np.ndarray], turn: Turn, backwards: bool = False
 ) -> tuple[list[np.ndarray], list[InMemory]]:
     """Repeat `turn` for `length` turns; return the carry after them, and the stacked results in memory.
@@ -152,7 +152,9 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
         hold(lowering, [(x, nodes[k]) for k, x in held.items()])
         return [nodes[k] for k in moving], nodes[carried:]
 
-    finals, stacked = repeated(lowering, length, [lowering.nodes(carry[k]) for k in moving], turn, params["reverse"])
+    finals, stacked = repeat_turns(
+        lowering, length, [lowering.nodes(carry[k]) for k in moving], turn, params["reverse"]
+    )
     after: dict[int, Value] = dict(zip(moving, finals, strict=True)) | {k: x.after() for k, x in held.items()}
     return [*(after.get(k, carry[k]) for k in range(carried)), *stacked]
 
@@ -246,7 +248,7 @@ def in_memory(lowering: Lowering, value: Value) -> InMemory:
 
 def copied(lowering: Lowering, x: InMemory) -> InMemory:
     """Copy a long array to new memory."""
-    return repeated(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
+    return repeat_turns(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
 
 
 def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -14,7 +14,7 @@ from straightline.memory import contiguous
 from straightline.nodes import Node, Unsupported
 
 
-def clamped(lowering: Lowering, start: Node, last: int) -> Node | int:
+def clamp_place(lowering: Lowering, start: Node, last: int) -> Node | int:
     """Clamp a place between 0 and the last one."""
     if last == 0:
         return 0

@@ -29,7 +29,7 @@ def threefry(graph: Graph, key: Key, high: Node, low: Node) -> Node:
     """Hash a counter's two words, the first word above the second; a constant if all words are."""
     words = (key.first, key.second, high, low)
     if all(word.op == "constant" for word in words):
-        return graph.constant(hashed(*(int(word.value) for word in words)), "u64")
+        return graph.constant(hash_words(*(int(word.value) for word in words)), "u64")
     return graph.node("threefry", "u64", *words)
 
 
@@ -135,7 +135,7 @@ RULES |= {
 }  # fmt: skip
 
 
-def hashed(first: Word, second: Word, high: Word, low: Word) -> Word:
+def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
     """Hash words: 20 rounds of addition, rotation and exclusive or; key words are added every four rounds."""
     keys = (first, second, first ^ second ^ PARITY)
     x, y, mask = (high + first) & 0xFFFFFFFF, (low + second) & 0xFFFFFFFF, 0xFFFFFFFF

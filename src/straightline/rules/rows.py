@@ -17,7 +17,7 @@ from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array
 from straightline.memory import InMemory
 from straightline.nodes import Node, Type
 from straightline.rules.elementwise import ELEMENTWISE
-from straightline.rules.loops import Turn, in_memory, repeated
+from straightline.rules.loops import Turn, in_memory, repeat_turns
 from straightline.rules.matrices import total, write_product
 
 OF_ENTRIES = (
@@ -61,7 +61,7 @@ def _apply_by_row(name: str) -> Rule:
             rows = [row_of(lowering, x, row, ndim) for x in items]
             return [], list(lowering.equation(row_equation, rows))
 
-        return list(repeated(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
+        return list(repeat_turns(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
 
     return rule
 
@@ -130,7 +130,9 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
     count = (b if in_left is None else a).shape[0]
     return (
-        _accumulate_turns(lowering, equation, count, turn) if summed else list(repeated(lowering, count, [], turn)[1])
+        _accumulate_turns(lowering, equation, count, turn)
+        if summed
+        else list(repeat_turns(lowering, count, [], turn)[1])
     )
 
 
@@ -166,7 +168,7 @@ def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: 
         return [np.asarray(RULES["reduce_sum"](lowering, pair, [np.stack([carry[0], *turn(row, [])[1]])])[0])], []
 
     start = RULES["reduce_sum"](lowering, pair, [np.empty(0, dtype=object)])[0]
-    return list(repeated(lowering, count, [start], add)[0])
+    return list(repeat_turns(lowering, count, [start], add)[0])
 
 
 def _find_few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -241,14 +243,14 @@ def _reduction(name: str) -> Rule:
 
         # Rows stay apart, or are accumulated from the neutral element.
         if 0 not in axes:
-            return list(repeated(lowering, x.shape[0], [], lambda row_index, _: ([], [reduced(row_index)]))[1])
+            return list(repeat_turns(lowering, x.shape[0], [], lambda row_index, _: ([], [reduced(row_index)]))[1])
         nothing = np.empty((0, *shape), dtype=object)
         start = RULES[name](lowering, pair, [nothing])[0]
 
         def turn(row_index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             return [np.asarray(RULES[name](lowering, pair, [np.stack([carry[0], reduced(row_index)])])[0])], []
 
-        return list(repeated(lowering, x.shape[0], [start], turn)[0])
+        return list(repeat_turns(lowering, x.shape[0], [start], turn)[0])
 
     return rule
 

@@ -77,7 +77,7 @@ def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
     return [lowering.known(np.zeros(result_shape(equation), equation.params["dtype"]))]
 
 
-def chosen(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
+def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
     """One of several arrays, the first for numbers below 0 and the last for numbers beyond."""
     from straightline.rules.elementwise import select
 
@@ -99,7 +99,7 @@ def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: 
                 raise Unsupported(f"one of {last + 1} places that data decide")
             known = [s if a != axis else None for a, s in enumerate(starts)]
             cases = [_update_at(lowering, x, update, known, first) for first in range(last + 1)]
-            return [chosen(lowering.graph, start, cases)]
+            return [select_array(lowering.graph, start, cases)]
     return [_update_at(lowering, x, update, starts, 0)]
 
 

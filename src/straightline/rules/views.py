@@ -12,9 +12,9 @@ from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array
 from straightline.memory import InMemory, contiguous
 from straightline.nodes import Buffer, Key, Node
 from straightline.rules.elementwise import PASSED_ON, select
-from straightline.rules.loops import copied, in_memory, repeated
-from straightline.rules.places import clamped, fill_of, fills, inside, narrowed
-from straightline.rules.shapes import chosen
+from straightline.rules.loops import copied, in_memory, repeat_turns
+from straightline.rules.places import clamp_place, fill_of, fills, inside, narrowed
+from straightline.rules.shapes import select_array
 
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 
@@ -68,12 +68,12 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
 def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower `dynamic_slice` of an array in memory to a view: starts that data decide become moves of its address."""
     sizes = equation.params["slice_sizes"]
-    x = indexable(lowering, inputs[0], inputs[1:])
+    x = make_indexable(lowering, inputs[0], inputs[1:])
     if not isinstance(x, InMemory):
         return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves = 0, []
     for axis, start in enumerate(inputs[1:]):
-        first = clamped(lowering, lowering.scalar(start), x.shape[axis] - sizes[axis])
+        first = clamp_place(lowering, lowering.scalar(start), x.shape[axis] - sizes[axis])
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
@@ -97,11 +97,13 @@ def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, siz
     last = x.shape[axis] - size
     cases = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
     return (
-        cases[min(max(int(start.value), 0), last)] if start.op == "constant" else chosen(lowering.graph, start, cases)
+        cases[min(max(int(start.value), 0), last)]
+        if start.op == "constant"
+        else select_array(lowering.graph, start, cases)
     )
 
 
-def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
+def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
     """Place a table, or a long array, in memory, since data or a loop's counter select its entries."""
     nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
     if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
@@ -117,13 +119,13 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
     indices = narrowed(lowering, indices) if fills(equation) else indices
-    x = indexable(lowering, inputs[0], [indices])
+    x = make_indexable(lowering, inputs[0], [indices])
     if not isinstance(x, InMemory) or indices.size != len(axes) or numbers.operand_batching_dims:
         return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves, flag = 0, [], lowering.graph.constant(True, "bool")
     for axis, start in zip(axes, indices.ravel().tolist(), strict=True):
         last = x.shape[axis] - sizes[axis]
-        first = clamped(lowering, start, last)
+        first = clamp_place(lowering, start, last)
         flag = lowering.graph.node("and", "bool", flag, inside(lowering.graph, start, last))
         if isinstance(first, int):
             offset += x.strides[axis] * first
@@ -159,11 +161,11 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             return [], [np.concatenate([lowering.nodes(x.row(row)) for x in parts], axis=axis - 1)]
 
-        return list(repeated(lowering, shape[0], [], turn)[1])
-    return [joined(lowering, inputs, shape)]
+        return list(repeat_turns(lowering, shape[0], [], turn)[1])
+    return [join_arrays(lowering, inputs, shape)]
 
 
-def joined(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
+def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
     """Join arrays into one in memory: an array that fills its own memory is written there directly."""
     graph = lowering.graph
     type = next(x for x in parts if isinstance(x, InMemory)).type

@@ -22,7 +22,7 @@ from heliograph.factors.roots import observe_information, roots_of
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.paths.model import Paths, Plants, error_covariances, path_information
-from heliograph.planning.paths.relaxation import envelope, split_paths
+from heliograph.planning.paths.relaxation import compute_envelope, split_paths
 
 Steps = tuple[tuple[int, ...], ...]  # the sensors of each step
 
@@ -143,7 +143,9 @@ def burst_sending(paths: Paths, powers: ArrayLike, every: Iterable[int] = range(
     hops = np.broadcast_to(np.asarray(powers, dtype=np.float64), paths.kappa[0].shape)
     total = np.bincount(paths.path, hops, paths.second.shape[1])[None]
     whole = split_paths(paths, np.ones(len(hops), dtype=bool), np.zeros((1, len(hops))))
-    bound = steady_error(paths, envelope(whole, np.full(total.shape, np.inf)).information(total)[0]) * (1 - ROUNDING)
+    bound = steady_error(paths, compute_envelope(whole, np.full(total.shape, np.inf)).information(total)[0]) * (
+        1 - ROUNDING
+    )
     return Bursts(errors, best, errors[best], min(bound, errors[best]))
 
 

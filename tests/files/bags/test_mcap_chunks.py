@@ -10,7 +10,7 @@ pytest.importorskip("mcap")
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from heliograph.files.bags.mcap_chunks import messages_of
+from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from tests.files.bags import ACCEL, ODOMETRY, START, STORE, acceleration, odometry
 
 
@@ -45,7 +45,7 @@ def test_messages_are_those_of_a_record_at_a_time_in_their_order(tmp_path, compr
         assert len(reader.readers[0].storage.chunks) > 10
         some = [connection for connection in reader.connections if connection.topic != "/other"]
         known = [(of.topic, logged, bytes(data)) for of, logged, data in reader.messages(some)]
-        assert [(of.topic, logged, data) for of, logged, data in messages_of(reader, some)] == known
+        assert [(of.topic, logged, data) for of, logged, data in read_messages_in_order(reader, some)] == known
         assert len(known) > 150
 
 
@@ -53,11 +53,11 @@ def test_a_chunk_whose_bytes_have_changed_ends_the_reading_after_what_was_before
     path = written(tmp_path / "a.mcap", CompressionType.NONE, 4)
     with AnyReader([path]) as reader:
         chunk = sorted(reader.readers[0].storage.chunks)[5]
-        whole = list(messages_of(reader, reader.connections))
+        whole = list(read_messages_in_order(reader, reader.connections))
     content = bytearray(path.read_bytes())
     content[chunk.chunk_start_offset + 300] ^= 0xFF
     path.write_bytes(content)
     read = []
     with AnyReader([path]) as reader, pytest.raises(Exception, match="checksum"):
-        read.extend(messages_of(reader, reader.connections))
+        read.extend(read_messages_in_order(reader, reader.connections))
     assert 20 < len(read) < len(whole) and [m.data for m in read] == [m.data for m in whole[: len(read)]]

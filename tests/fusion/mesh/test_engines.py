@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.fusion import MatrixWeights, TraceIntersection
-from heliograph.simulation.centres.mesh import mesh_of
+from heliograph.simulation.centres.mesh import build_mesh
 from tests.fusion.mesh.worlds import PLANT, network
 
 BURSTS = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.2), 0.1, 0.4)
@@ -54,7 +54,7 @@ def test_graphs_by_the_hundred_are_left_to_xla(rule, nodes, long):
     ring = {name: [names[i - 1], names[(i + 1) % nodes]] for i, name in enumerate(names)}
     start = network({}).nodes["a"]
     world = hg.Network(PLANT, {name: start for name in names}, {"m": hg.Fusion("own", rule, neighbours=ring)})
-    assert mesh_of(world, "m").is_long == long
+    assert build_mesh(world, "m").is_long == long
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
-from heliograph.simulation.centres.mesh import mesh_of
+from heliograph.simulation.centres.mesh import build_mesh
 from tests.fusion.mesh.worlds import LINK, RING, RULES, network
 
 BURSTS = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.1), 0.05, 0.3)
@@ -96,7 +96,7 @@ def test_a_step_is_one_program_whatever_the_number_of_nodes():
         ring = {name: [names[i - 1], names[i - 2]] for i, name in enumerate(names)}
         rows = {name: ([[1.0, 0.5]], 0.3) for name in names[::2]}
         net = network({"m": hg.fusion.TraceIntersection()}, ring, rows=rows)
-        mesh = mesh_of(net, "m")
+        mesh = build_mesh(net, "m")
         model = mesh.observation_model
         z = tuple(np.zeros((c, 0 if group is None else 1)) for group, c in zip(model.groups, model.counts, strict=True))
         made = jax.make_jaxpr(lambda s: mesh.step(s, z, mesh.edges.lossless(), np.zeros(0), 0)[0])(mesh.init())
@@ -109,7 +109,7 @@ def test_a_link_for_each_edge(lossy):
     edges = ["b to a", "c to b", "d to b", "a to c", "b to c", "c to d"]
     net = network({"trace": RULES["trace"]}, link={name: LINK if name == "b to a" else hg.perfect() for name in edges})
     arrived = hg.simulation.mesh_arrivals(net, "trace", 400, 0)
-    assert arrived[:, 1:, 0][:, mesh_of(net, "trace").edges.present[1:]].all()
+    assert arrived[:, 1:, 0][:, build_mesh(net, "trace").edges.present[1:]].all()
     assert arrived[:, 0, 0, 1].mean() == pytest.approx(0.7, abs=0.08)
 
 
@@ -152,7 +152,7 @@ def test_parts_of_a_large_graph_are_the_whole(monkeypatch):
         net = network(
             {"m": hg.fusion.TraceIntersection(), "d": hg.fusion.DiffusionWeights()}, near, LINK, 1, plant, rows
         )
-        assert (len(mesh_of(net, "m").buckets) > 1) == (few == 64)
+        assert (len(build_mesh(net, "m").buckets) > 1) == (few == 64)
         arrived = hg.simulation.mesh_arrivals(net, "m", 6, 0)
         results.append([hg.simulation.mesh_errors(net, name, arrived).actual for name in ("m", "d")])
     assert results[0][0] == pytest.approx(results[1][0], rel=1e-12)

@@ -7,7 +7,7 @@ import pytest
 import heliograph as hg
 from heliograph.learning.description import describe
 from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.objective import _by_xla, evaluate_at_points, objectives
+from heliograph.learning.likelihood.objective import _by_xla, evaluate_at_points, make_objectives
 
 STEPS, RECORDINGS = 157, 2
 TOLERANCE = 1e-10  # of the largest entry: what rounding is given that 157 steps add it up, and information squares it
@@ -32,7 +32,7 @@ def walk():
 @pytest.fixture(scope="module", params=[relayed, walk])
 def both(request):
     """An objective and data of which one number is lost."""
-    objective = objectives(describe(request.param))[0]
+    objective = make_objectives(describe(request.param))[0]
     received = objective.description.start.nodes["node"].received
     z = np.cumsum(np.random.default_rng(0).normal(size=(RECORDINGS, STEPS, received)), axis=1)
     z[0, 3, 0] = np.nan

@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.numbers.problem import NumberProblem, check_numbers, function_of_numbers
+from heliograph.planning.numbers.problem import NumberProblem, check_numbers, read_free_numbers
 
 PLANT = hg.LinearPlant([[0.9]], 0.3, [0.0], 1.0)
 OUTSIDE = {"noise": 0.3}
@@ -29,7 +29,7 @@ def test_budgets_and_weights_are_no_reason_to_compile_again():
 
 
 def test_marks_are_the_same_each_time():
-    first, again = (NumberProblem(*function_of_numbers(marks, None), Error()) for _ in range(2))
+    first, again = (NumberProblem(*read_free_numbers(marks, None), Error()) for _ in range(2))
     assert first._slopes is again._slopes
 
 

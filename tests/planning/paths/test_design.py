@@ -6,8 +6,8 @@ from scipy.optimize import minimize
 
 import heliograph as hg
 from heliograph.planning import Budget, Error, independent_paths, paths_of
-from heliograph.planning.budget import power_limits
-from heliograph.planning.paths.design import power_task
+from heliograph.planning.budget import make_power_limits
+from heliograph.planning.paths.design import make_power_task
 from heliograph.planning.paths.relaxation import SplitPaths
 from heliograph.planning.paths.water_filling import water_filling
 from tests.planning.example import (
@@ -32,7 +32,7 @@ def task_of(paths, budget, error=None):
     error, budget = error or Error(), budget if isinstance(budget, Budget) else Budget(budget)
     free, silent = np.ones(len(paths.names), dtype=bool), np.zeros(paths.kappa.shape)
     criterion = error.criterion(tuple(f"x{i}" for i in range(paths.rows.shape[-1])))
-    return power_task(paths, criterion, power_limits(budget, paths.names, free, silent), free, silent, 1, 0)
+    return make_power_task(paths, criterion, make_power_limits(budget, paths.names, free, silent), free, silent, 1, 0)
 
 
 @pytest.mark.parametrize("total", BEST)

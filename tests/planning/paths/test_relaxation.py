@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 import heliograph as hg
 from heliograph.planning import split_power
-from heliograph.planning.paths.relaxation import SplitPaths, envelope, split
+from heliograph.planning.paths.relaxation import SplitPaths, compute_envelope, split
 
 
 @pytest.mark.parametrize("alpha", [[1.0, 2.0], [0.3, 2.0, 0.1, 7.0]], ids=["two hops", "four hops"])
@@ -41,7 +41,7 @@ def test_the_envelope_is_concave_above_and_touches():
     alpha, full = draws.uniform(0.2, 5, (1, 4, 3)), draws.uniform(1, 3, (1, 4))
     alpha[0, 0, 1:], alpha[0, 1, 2] = 0.0, 0.0  # one hop, two hops, three and three
     whole = SplitPaths(full, full * draws.uniform(0.3, 0.95, (1, 4)), alpha)
-    bound, x = envelope(whole, np.full((1, 4), 200.0)), np.linspace(0, 200, 801)
+    bound, x = compute_envelope(whole, np.full((1, 4), 200.0)), np.linspace(0, 200, 801)
     exact = np.array([split(whole, np.full((1, 4), p)).information[0] for p in x])
     above = np.array([bound.information(np.full((1, 4), p))[0][0] for p in x])
     assert np.all(above >= exact * (1 - 1e-12)) and np.all(np.diff(above, 2, axis=0) <= 1e-12)

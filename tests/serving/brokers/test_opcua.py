@@ -9,7 +9,7 @@ pytest.importorskip("asyncua")
 from asyncua import Server, ua
 
 import heliograph as hg
-from heliograph.files.inspection import suggestion
+from heliograph.files.inspection import suggest_sources
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
 from heliograph.serving.brokers.listening import listen
@@ -200,7 +200,7 @@ def test_inspect_lists_the_variables_of_a_server_and_suggests_sources():
     assert int(count) >= 4 and 2.5 < float(rate.removesuffix(" Hz")) < 7.5  # five a second, on a busy machine
     assert 0 <= float(late.split()[0]) < 1.0
     line = f"    {VARIABLE!r}: hg.files.json_field('value', node='NODE', output='OUTPUT', time='source_time'),"
-    assert suggestion(topics, {}).splitlines() == ["sources = {", line, "}"]
+    assert suggest_sources(topics, {}).splitlines() == ["sources = {", line, "}"]
 
 
 @pytest.mark.real("OPC UA")

@@ -8,7 +8,7 @@ import pytest
 from pydantic_core import to_json
 
 from heliograph.live.plant import LinkCounts
-from heliograph.serving.observation.page import PageAddress, parse_page_address, shown
+from heliograph.serving.observation.page import PageAddress, parse_page_address, serve_page
 from heliograph.serving.observation.running_nis import read_nis
 from heliograph.serving.observation.watch import Watch
 from heliograph.serving.output import Output
@@ -30,7 +30,7 @@ def fleet(count, wrong=3, dead=5):
 
 def looked(watch, look, at=None):
     async def work():
-        async with shown(watch, at or PageAddress("127.0.0.1", 0, None)) as port:
+        async with serve_page(watch, at or PageAddress("127.0.0.1", 0, None)) as port:
             await look(f"http://127.0.0.1:{port}")
 
     asyncio.run(work())

@@ -17,7 +17,7 @@ import heliograph as hg
 pytest.importorskip("uvicorn")
 from heliograph.files.sources import Sources
 from heliograph.live.plant import LinkCounts
-from heliograph.serving.observation.page import PageAddress, Tallies, parse_page_address, shown
+from heliograph.serving.observation.page import PageAddress, Tallies, parse_page_address, serve_page
 from heliograph.serving.observation.running_nis import RunningNis
 from heliograph.serving.observation.watch import Watch, watch_of
 from tests.serving.watched import Scripted
@@ -39,7 +39,7 @@ def looked(
     watch.wrap(service).take([str(i).encode() for i in range(rows)])
 
     async def work() -> None:
-        async with shown(watch, PageAddress("127.0.0.1", 0, token)) as port:
+        async with serve_page(watch, PageAddress("127.0.0.1", 0, token)) as port:
             await look(f"http://127.0.0.1:{port}")
 
     asyncio.run(work())

@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.files.recording import read_recording
 from heliograph.relays.design import local_error_design, relay_schedules
-from heliograph.simulation.runs.by_run import trajectories
+from heliograph.simulation.runs.by_run import simulate_trajectories
 from tests.relays.relay_problems import example
 
 STEPS = 7
@@ -38,7 +38,7 @@ def one_run(key):
 def test_every_run_is_the_one_that_a_loop_makes():
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(3), 5)
-        result = trajectories(init, step, keys, tuple(map(jnp.asarray, ROWS)))
+        result = simulate_trajectories(init, step, keys, tuple(map(jnp.asarray, ROWS)))
         assert result["shared"].shape == (1, STEPS)
         assert all(result[name].shape == (5, STEPS) for name in ("walk", "later", "noise"))
         for run, key in enumerate(keys):

@@ -21,7 +21,7 @@ def network(nodes=1):
 
 
 def refusal(monkeypatch, free, *arguments, **options):
-    monkeypatch.setattr(memory, "available", lambda: free)
+    monkeypatch.setattr(memory, "find_available_memory", lambda: free)
     with pytest.raises(ValueError, match="memory of a simulation") as raised:
         hg.monte_carlo(*arguments, **options)
     said = str(raised.value)
@@ -36,7 +36,7 @@ def test_what_does_not_fit_is_refused_before_the_first_run(monkeypatch, engine, 
     needed, said = refusal(monkeypatch, 1e3, network(), 20, 320, 0, KEPT[kept], chunk=32, progress=called)
     assert ("keep=Statistics()" in said) == (kept == "trajectories")
     # What is said to be needed suffices, to the three digits that are said.
-    monkeypatch.setattr(memory, "available", lambda: 1.01 * needed)
+    monkeypatch.setattr(memory, "find_available_memory", lambda: 1.01 * needed)
     hg.monte_carlo(network(), 20, 320, 0, KEPT[kept], chunk=32)
 
 
@@ -77,13 +77,13 @@ def test_an_allocation_that_fails_after_all():
     for error in (MemoryError("Unable to allocate"), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out\nof memory")):
         with (
             pytest.raises(ValueError, match=r"memory of a simulation: .*runs=2, horizon=3") as raised,
-            memory.out_of_memory(2, 3),
+            memory.explain_out_of_memory(2, 3),
         ):
             raise error
         assert "\n" not in str(raised.value)
-    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"), memory.out_of_memory(2, 3):
+    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"), memory.explain_out_of_memory(2, 3):
         raise jax.errors.JaxRuntimeError("INTERNAL: other")
 
 
 def test_available_memory_is_of_this_machine():
-    assert 1e7 < memory.available() < 1e15
+    assert 1e7 < memory.find_available_memory() < 1e15

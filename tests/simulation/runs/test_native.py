@@ -10,9 +10,9 @@ import pytest
 import heliograph as hg
 from heliograph.numerics.keys import seed_key
 from heliograph.relays.design import local_error_design
-from heliograph.simulation.reception import medium_of
+from heliograph.simulation.reception import make_reception
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
-from heliograph.simulation.runs.native import native
+from heliograph.simulation.runs.native import compile_runs
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
 from straightline.nodes import Node, Unsupported
@@ -177,9 +177,9 @@ def test_sums_depend_on_no_chunk(monkeypatch):
 
 
 def code(network: hg.Network, seed: int = 0):
-    world = World(network.plant, medium_of(network), AllFilters(network))
+    world = World(network.plant, make_reception(network), AllFilters(network))
     with jax.enable_x64(True):
-        return native(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories(), 8)
+        return compile_runs(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories(), 8)
 
 
 def test_many_nodes_are_what_each_is_alone(monkeypatch):
@@ -236,9 +236,9 @@ def test_keys_of_another_hash_are_simulated_by_xla():
     network = hg.Network(ALONE, {"a": hg.Node(GAIN, link(), {})})
     record = hg.monte_carlo(network, 3, 2, jax.random.key(0, impl="rbg"))
     assert np.isfinite(record.truth).all()
-    world = World(network.plant, medium_of(network), AllFilters(network))
+    world = World(network.plant, make_reception(network), AllFilters(network))
     with pytest.raises(Unsupported, match="rbg"):
-        native(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories(), 8)
+        compile_runs(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories(), 8)
 
 
 @pytest.mark.slow
@@ -246,7 +246,7 @@ def test_of_a_program_that_is_refused_the_reason_stays_alone():
     """A program of 200,000 operations is 100 MB, which a traceback would hold."""
     plant = hg.Plant(lambda x, u: x / (1 + jnp.linalg.svd(jnp.outer(x, x))[1]), 0.1 * np.eye(2), np.ones(2), np.eye(2))
     network = hg.Network(plant, {"a": hg.Node(POSITION, hg.perfect(), {})})
-    world = World(plant, medium_of(network), AllFilters(network))
+    world = World(plant, make_reception(network), AllFilters(network))
 
     def nodes():
         gc.collect()
@@ -255,5 +255,5 @@ def test_of_a_program_that_is_refused_the_reason_stays_alone():
     before = nodes()
     for _ in range(2):
         with pytest.raises(Unsupported, match="svd"):
-            native(world, np.zeros((3, 0)), seed_key(0), Trajectories(), 8)
+            compile_runs(world, np.zeros((3, 0)), seed_key(0), Trajectories(), 8)
     assert nodes() == before

@@ -8,7 +8,7 @@ import numpy as np
 
 from straightline.compiled import Compiled
 from straightline.limits import TABLE
-from straightline.lowering import Lowering, traced, type_of
+from straightline.lowering import Lowering, trace_function, type_of
 from straightline.memory import InMemory
 from straightline.nodes import Buffer
 from straightline.program import Program, lower
@@ -39,7 +39,7 @@ def program_of(cases: Sequence[Case], known: Sequence[bool] = (False,) * 4) -> P
     """One program for all runs of some cases, of which some arguments are known when it is made and others are data."""
     lowering, inputs, outputs = Lowering(10**7), list[Buffer](), list[Any]()
     for case in cases:
-        made, _ = traced(lambda *row, f=case.function: jax.tree.leaves(f(*row)), *case.row(0))
+        made, _ = trace_function(lambda *row, f=case.function: jax.tree.leaves(f(*row)), *case.row(0))
         columns: list[Any] = []
         for argument, fixed in zip(case.arguments, known, strict=False):
             if not fixed:

@@ -34,7 +34,7 @@ import pytest
 
 import straightline as sl
 from straightline.compiled import Compiled
-from straightline.lowering import IN_MEMORY, RULES, traced
+from straightline.lowering import IN_MEMORY, RULES, trace_function
 from straightline.nodes import Unsupported
 from tests.straightline.conformance import arrays, elementwise, matrices, programs
 from tests.straightline.conformance.case import Case, in_single, is_taken
@@ -143,7 +143,7 @@ def test_every_rule_has_cases_in_which_it_is_used(name):
     if name not in LATER:
         seen = set[str]()
         for case in CASES[name]:
-            seen |= operations(traced(case.function, *case.row(0))[0].jaxpr)
+            seen |= operations(trace_function(case.function, *case.row(0))[0].jaxpr)
             if name in seen:
                 return
         raise AssertionError(f"{name} in its cases: {sorted(seen)}")

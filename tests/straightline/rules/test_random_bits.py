@@ -16,7 +16,7 @@ from straightline.folding import DTYPES, EVALUATED
 from straightline.lowering import scalars
 from straightline.nodes import Node, Unsupported
 from straightline.program import lower
-from straightline.rules.random_bits import hash_function, hashed
+from straightline.rules.random_bits import hash_function, hash_words
 from tests.straightline.compiled import WIDTH, engine_of
 
 WORD = st.integers(0, 2**32 - 1)
@@ -44,7 +44,7 @@ def _computed(node: Node, numbers: list[Any], given: dict[Any, np.ndarray]) -> A
     if node.op == "load":
         return kind(given[node.value[0]].ravel()[node.value[1]])
     if node.op == "threefry":
-        return np.uint64(hashed(*map(int, numbers)))
+        return np.uint64(hash_words(*map(int, numbers)))
     if node.op == "convert":
         return numbers[0].astype(kind)
     if node.op == "bitcast":
@@ -149,4 +149,4 @@ def test_the_compiled_hash() -> None:
     result = np.empty(WIDTH, dtype=np.uint64)
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(engine.get_function_address("all"))
     call(given.ctypes.data, result.ctypes.data)
-    np.testing.assert_array_equal(result, [hashed(*map(int, column)) for column in given.T])
+    np.testing.assert_array_equal(result, [hash_words(*map(int, column)) for column in given.T])

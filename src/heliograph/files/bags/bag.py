@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.bags.layout import Decoder, RawMessage
-from heliograph.files.bags.mcap_chunks import messages_of
+from heliograph.files.bags.mcap_chunks import read_messages_in_order
+from heliograph.files.bags.message_layout import Decoder, RawMessage
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources import Sources, Unread
 from heliograph.numerics.check import InputError, fail, show_error
@@ -83,7 +83,7 @@ def read_bag(
         # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
         try:
-            for batch in batches(raw_messages(path, reader, used)):
+            for batch in batches(read_raw_messages(path, reader, used)):
                 if not decoder.add(batch, events):
                     _append_messages(path, reader, sources, batch, done, events, strict)
                 done += len(batch)
@@ -114,7 +114,7 @@ def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
     with ExitStack() as stack:
         readable, cut = path, ""
         if path.suffix.lower() == ".mcap" and is_cut(path):
-            readable, end = stack.enter_context(whole_part(path))
+            readable, end = stack.enter_context(copy_whole_part(path))
             got = f"one that was cut off after {end:,} bytes of whole records"
             cut = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
         yield stack.enter_context(_open_reader(path, readable)), cut
@@ -138,14 +138,14 @@ def _open_reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
         reader.close()
 
 
-def raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[RawMessage]:
+def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[RawMessage]:
     """Yield the messages of topics in the order in which they were logged.
 
     Raises:
         ValueError: damage, a topic that changes its type; one line with the place.
     """
     connections = [connection for connection in reader.connections if connection.topic in topics]
-    types, raw = dict[str, str](), messages_of(reader, connections) if connections else iter(())
+    types, raw = dict[str, str](), read_messages_in_order(reader, connections) if connections else iter(())
     count, last = 0, 0
     while True:
         try:
@@ -214,7 +214,7 @@ def _append_messages(
                 table.add(reading, logged)
 
 
-def fields_of(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
+def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
     """Yield dotted path and basic type of the fields of a message type; lists and what is in them are left out.
 
     A type that the bag does not define has no fields.
@@ -226,7 +226,7 @@ def fields_of(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) 
         if node == Nodetype.BASE:
             yield prefix + name, str(of[0])
         elif node == Nodetype.NAME:
-            yield from fields_of(reader, str(of), f"{prefix}{name}.", depth - 1)
+            yield from list_fields(reader, str(of), f"{prefix}{name}.", depth - 1)
         else:
             yield prefix + name, "list"
 
@@ -240,7 +240,7 @@ def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
     """Check before reading that each mapped field is in its topic's type, as far as the bag says."""
     # Paths that the sources need of each topic, against the fields of its type.
     for connection in reader.connections:
-        fields = dict(fields_of(reader, connection.msgtype))
+        fields = dict(list_fields(reader, connection.msgtype))
         needed = [path_ for source, *_ in sources.of(connection.topic) for path_ in source.fields if path_]
         # What is needed is a field, a message with fields, or in a list.
         if needed and not fields:
@@ -286,7 +286,7 @@ def is_cut(path: Path) -> bool:
         return begins and file.read() != MAGIC
 
 
-def whole_records(path: Path) -> int:
+def measure_whole_records(path: Path) -> int:
     """Return the number of bytes up to the end of the last record of data that is whole."""
     size, end = path.stat().st_size, len(MAGIC)
     with path.open("rb") as file:
@@ -300,9 +300,9 @@ def whole_records(path: Path) -> int:
 
 
 @contextmanager
-def whole_part(path: Path) -> Iterator[tuple[Path, int]]:
+def copy_whole_part(path: Path) -> Iterator[tuple[Path, int]]:
     """Yield a temporary copy of what is whole, ended as a file of MCAP ends, and its number of bytes of data."""
-    end = whole_records(path)
+    end = measure_whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
         with path.open("rb") as file, copy.open("wb") as whole:

@@ -7,7 +7,7 @@ from itertools import accumulate
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from heliograph.files.bags.layout import RawMessage
+from heliograph.files.bags.message_layout import RawMessage
 
 if TYPE_CHECKING:  # an extra
     from rosbags.highlevel import AnyReader
@@ -19,7 +19,7 @@ HEADER = struct.Struct("<QHIQQ")  # of a message: its length, channel, count, ti
 SIZE, CHECKSUM = struct.Struct("<Q"), struct.Struct("<I")
 
 
-def messages_of(reader: "AnyReader", connections: "Sequence[Connection]") -> Iterator[RawMessage]:
+def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connection]") -> Iterator[RawMessage]:
     """Yield the messages of connections in the order in which they were logged.
 
     Args:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen
+from heliograph.engine.choice import choose_code
 from heliograph.fusion.intersection import intersection_weights, trace_shares
 from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, correct
 from heliograph.fusion.mesh.graph import Graph
@@ -167,7 +167,7 @@ class FrozenWeights(_NeighbourRule):
         """
         rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
-            code = chosen(_weigh_row, (self.rule, *rows), (False, True, True))
+            code = choose_code(_weigh_row, (self.rule, *rows), (False, True, True))
             return None if code.code is None else jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), code.results())
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen
+from heliograph.engine.choice import choose_code
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.filters.linear.linear import linear_filter
@@ -34,7 +34,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 
-def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
+def join_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Return the plant, sensor and channel of all nodes together, in their order, as if no observed loss ever happened.
 
     Raises:
@@ -159,7 +159,7 @@ def _identity_of(build: Build) -> tuple[object, ...]:
     return build.__code__, build.__defaults__, build.__kwdefaults__, cells
 
 
-def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
+def make_objectives(network: Description, by_truth: bool = False) -> list[Objective]:
     """Return objectives that the network allows, the linear one first; `by_truth` the density of the true states alone.
 
     Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
@@ -170,9 +170,9 @@ def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
         ValueError: a network whose likelihood no filter here knows.
     """
     if by_truth:
-        sole_filter(network.start)
+        find_sole_filter(network.start)
         return [_reuse_equal(Objective(network, "truth"))]
-    return [_reuse_equal(Objective(network, form)) for form in forms_of(network.start)]
+    return [_reuse_equal(Objective(network, form)) for form in list_forms(network.start)]
 
 
 @lru_cache
@@ -181,9 +181,9 @@ def _reuse_equal(objective: Objective) -> Objective:
     return objective
 
 
-def forms_of(network: Network) -> list[Form]:
+def list_forms(network: Network) -> list[Form]:
     """Return the forms that a network allows."""
-    plant, sensor, channel = joint_world(network)
+    plant, sensor, channel = join_world(network)
     link = first(channel)
     plain = not link.remembers and not link.past
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
@@ -198,14 +198,14 @@ def forms_of(network: Network) -> list[Form]:
 def filter_of(network: Network, form: Form) -> AbstractFilter:
     """Filter of all that the network's nodes receive, whose likelihood is of this form; "truth": the network's own."""
     if form == "truth":
-        return sole_filter(network)
-    plant, sensor, channel = joint_world(network)
+        return find_sole_filter(network)
+    plant, sensor, channel = join_world(network)
     if form == "linear":
         return linear_filter(plant, sensor, channel)
     return cubature_filter(plant, sensor, without_memory(channel))
 
 
-def sole_filter(network: Network) -> AbstractFilter:
+def find_sole_filter(network: Network) -> AbstractFilter:
     """Only filter of a network, of all that arrives and of all states.
 
     Raises:
@@ -228,7 +228,7 @@ def evaluate_at_points(objective: Objective, x: Float[np.ndarray, "points p"], d
     count, copies = len(data.measurements), (len(x), 1, 1)
     runs = np.repeat(x, count, axis=0), *(np.tile(data_row, copies) for data_row in data_rows)
     with jax.enable_x64(True):
-        choice = chosen(one_recording, (objective, *runs), [False, *(True for _ in runs)])
+        choice = choose_code(evaluate_recording, (objective, *runs), [False, *(True for _ in runs)])
         if choice.code is not None:
             results = choice.results()
         else:
@@ -238,7 +238,7 @@ def evaluate_at_points(objective: Objective, x: Float[np.ndarray, "points p"], d
     return Evaluation(density, score, halves.sum(axis=1))
 
 
-def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
+def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
     """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p); derivatives run forward.
 
     With the true states e is the error of the estimates and S what they claim.
@@ -260,7 +260,7 @@ def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Arr
     return Evaluation(density, score, halves)
 
 
-_by_xla = quickly_compiled(one_recording)
+_by_xla = quickly_compiled(evaluate_recording)
 
 
 def _score_innovation(

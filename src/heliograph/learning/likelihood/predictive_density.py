@@ -11,8 +11,8 @@ from scipy.special import logsumexp, ndtr
 from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
 from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.row_times import judge_dates
 from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.unequal_steps import judge_dates
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.maximise import FLAT, Domains, Evaluated, maximise
 from heliograph.learning.likelihood.objective import Evaluation, Objective, evaluate_at_points
+from heliograph.learning.likelihood.trust_region import FLAT, Domains, Evaluated, maximise
 from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
 

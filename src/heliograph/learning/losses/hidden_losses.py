@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, ends_alone, fill_ends
 from heliograph.learning.losses.loss_law import AbstractLossLaw, Packets
-from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
+from heliograph.learning.losses.shares import Share, estimate_shares, logits, maximise_shares
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -54,8 +54,8 @@ class HiddenModeLosses(AbstractLossLaw):
             given, by_ends = ends.likelihood(x)
             return value - given, slope - by_ends
 
-        top, value = maximum(likelihood, [*STARTS])
-        good, bad, fails, recovers = shares_at(likelihood, top, value, intervals)
+        top, value = maximise_shares(likelihood, [*STARTS])
+        good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
         if good.estimate > bad.estimate:
             good, bad, fails, recovers = bad, good, recovers, fails
         return HiddenModeLosses(good, bad, fails, recovers)

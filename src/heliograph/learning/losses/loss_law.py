@@ -5,7 +5,7 @@ from typing import TypeVar
 import numpy as np
 
 from heliograph.learning.losses.fates import CHOSEN, Fates, check_fates, fill_ends, is_trial
-from heliograph.learning.losses.shares import logits, maximum, shares_at
+from heliograph.learning.losses.shares import estimate_shares, logits, maximise_shares
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
@@ -216,7 +216,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
         score = np.array([failed / a - stayed / (1 - a) - by_a.sum(), recovered / b - lost / (1 - b) - by_b.sum()])
         return float(value - np.sum(np.log(again / total))), score * shares * (1 - shares)
 
-    top, value = maximum(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
+    top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
     shares = 1 / (1 + np.exp(-top))
     # variances of the logits, 1 / (n p (1 - p)) of n packets alone, from differences of the score
     steps = 1e-4 * np.eye(2)
@@ -225,7 +225,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
     size = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
     fails, recovers = shares
     alone = size[:, None] * np.array([[1 - fails, fails], [recovers, 1 - recovers]])
-    fail, recover = shares_at(likelihood, top, value, intervals)
+    fail, recover = estimate_shares(likelihood, top, value, intervals)
     recover = recover if counts[1].any() else wilson(0, 0)  # without losses nothing tells how they end
     return MarkovLosses(np.asarray(alone), (fail, recover))
 

@@ -11,7 +11,7 @@ from heliograph.learning.intervals import mean_and_error
 from heliograph.learning.losses.fates import CheckedFates, Fates, check_fates, fill_ends, is_trial
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
-from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
+from heliograph.learning.losses.shares import Share, estimate_shares, logits, maximise_shares
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -241,8 +241,8 @@ class RunningRateLosses(AbstractLossLaw):
             )
             return float(value), np.asarray(slope * share * (1 - share))
 
-        top, value = maximum(likelihood, [*STARTS])
-        return RunningRateLosses(*shares_at(likelihood, top, value, intervals))
+        top, value = maximise_shares(likelihood, [*STARTS])
+        return RunningRateLosses(*estimate_shares(likelihood, top, value, intervals))
 
     def shares(self) -> dict[str, Share]:
         """Base, weight and step with likelihood intervals."""

@@ -18,7 +18,7 @@ END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
 Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient of a log-likelihood of logits
 
 
-def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13) -> tuple[np.ndarray, float]:
+def maximise_shares(function: Slope, starts: list[np.ndarray], precision: float = 1e-13) -> tuple[np.ndarray, float]:
     """Maximise from several starts (logits); return the best point and the value there. Logits stay within END.
 
     precision: the relative change of the value at which a search ends.
@@ -34,7 +34,7 @@ def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13)
     return np.asarray(best.x), -float(best.fun)
 
 
-def shares_at(function: Slope, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
+def estimate_shares(function: Slope, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
     """Shares at the maximum, each with the interval where the likelihood, maximised over the others, falls by FALL.
 
     A share at 0 is "0, below the high end", one at 1 "1, above the low end"; then FALL_AT_END counts.
@@ -68,7 +68,7 @@ def _find_crossing(function: Slope, top: np.ndarray, level: float, i: int, side:
             value, slope = function(whole)
             return value, slope[others]
 
-        free, best = maximum(held, [near[others]], 1e-9)
+        free, best = maximise_shares(held, [near[others]], 1e-9)
         if best > level:
             near[others] = free
         return best - level

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.rows import BEFORE
-from heliograph.live.stored.layout import can_read, describe_old_layout, place_flags, relocate_parts, split_by_path
+from heliograph.live.stored.old_layout import can_read, describe_old_layout, place_flags, relocate_parts, split_by_path
 from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import Identity
 from heliograph.numerics.check import fail

@@ -32,7 +32,7 @@ from heliograph.random_affine.outliers import has_bounded_noise
 PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"
 
 
-def differences(believed: Premise, own: Premise) -> tuple[str, ...]:
+def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
     """Return the parts of what is believed that are not the world's own: plant, sensor, channel, trigger, relays.
 
     Args:

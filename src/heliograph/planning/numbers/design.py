@@ -7,11 +7,11 @@ from scipy.optimize import nnls
 
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Float
-from heliograph.planning.budget import PowerLimits, check_budget, make_unlimited, power_limits
-from heliograph.planning.descent import ACTIVE, Limits, Problem, Programme, Vector, search
+from heliograph.planning.budget import PowerLimits, check_budget, make_power_limits, make_unlimited
 from heliograph.planning.network_of_design import repeat_network
-from heliograph.planning.numbers.problem import Build, NumberProblem, function_of_numbers
+from heliograph.planning.numbers.problem import Build, NumberProblem, read_free_numbers
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
+from heliograph.planning.quadratic_programme import ACTIVE, Limits, Problem, Programme, Vector, search
 
 
 class Conditions(NamedTuple):
@@ -33,7 +33,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         ValueError: no start from which a budget or a target error is met, a network that does not fit the error.
     """
     starts, seed = check_count("starts", task.starts), check_seed("seed", task.seed)
-    problem = NumberProblem(*function_of_numbers(build, task.free), task.criterion)
+    problem = NumberProblem(*read_free_numbers(build, task.free), task.criterion)
     target = None if task.target_error is None else float(scalar("target error", task.target_error, 0.0))
     if target == 0:
         raise fail("target error", "a number above zero", "0")
@@ -48,7 +48,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     if best is None:
         raise _explain_unmet(descent, limits, begin)
     # The design, and what Lagrange's conditions say of it.
-    now, conditions = problem.at(best), lagrange_conditions(descent, limits, best)
+    now, conditions = problem.at(best), check_lagrange_conditions(descent, limits, best)
     network, error = problem.network(best), problem.criterion.exact(now.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     return PowerDesign(
@@ -70,7 +70,7 @@ def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)
-    limits = power_limits(check_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
+    limits = make_power_limits(check_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
     if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
     return limits
@@ -102,7 +102,7 @@ def _explain_unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> Val
     return fail("budget", expected, "none that is")
 
 
-def lagrange_conditions(problem: Problem, limits: Limits, x: Vector) -> Conditions:
+def check_lagrange_conditions(problem: Problem, limits: Limits, x: Vector) -> Conditions:
     """Return the multipliers of the limits that leave least of the gradient, what they leave, and a watt's worth."""
     programme, z = Programme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
     value, gradient = programme.value(z)

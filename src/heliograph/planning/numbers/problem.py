@@ -20,11 +20,17 @@ from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, array, fail, instance, items, table
 from heliograph.numerics.module import same
 from heliograph.numerics.types import Array, Float
-from heliograph.planning.descent import Evaluation, Problem
 from heliograph.planning.error import Criterion, Error
 from heliograph.planning.moments import check_stable
 from heliograph.planning.numbers.mode_riccati import ModeSolution, ModeSystem, lagrangian, solve_riccati
-from heliograph.planning.numbers.reception import check_time, means_are_known, mode_system, sources_of, transmitters_of
+from heliograph.planning.numbers.reception import (
+    check_time,
+    list_sources,
+    means_are_known,
+    mode_system,
+    transmitters_of,
+)
+from heliograph.planning.quadratic_programme import Evaluation, Problem
 from heliograph.simulation.network import Network
 
 Build = Callable[..., Network]
@@ -117,7 +123,7 @@ def _check_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
     return value
 
 
-def function_of_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
+def read_free_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
     """Function and its free numbers, from {name: (start, low, high)} or, without, from the marks `hg.free` in it.
 
     Raises:
@@ -242,7 +248,7 @@ class NumberProblem:
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)
         check_time(network, error)
-        sources = sources_of(network).items()
+        sources = list_sources(network).items()
         if not all(means_are_known(name, first(source.channel)) for name, source in sources):
             self.young, self.numbers = True, Numbers(numbers.by_name | {YOUNG: young_scalars(error.steps)})
         self.names, self.criterion = transmitters_of(network), error.criterion(network.states)

@@ -65,7 +65,7 @@ class _Modes(NamedTuple):
     forgets: bool
 
 
-def sources_of(network: Network) -> dict[str, Source]:
+def list_sources(network: Network) -> dict[str, Source]:
     """Return the sensors with their channels by node.
 
     Raises:
@@ -90,14 +90,14 @@ def sources_of(network: Network) -> dict[str, Source]:
 
 def transmitters_of(network: Network) -> tuple[str, ...]:
     """Return the names of all transmitters, in the order of `ModeSystem.powers`."""
-    sources = sources_of(network).items()
+    sources = list_sources(network).items()
     return tuple(f"{name}.{hop}" for name, source in sources for hop in transmitter_names(first(source.channel)))
 
 
 def check_time(network: Network, error: Error) -> None:
     """Raise ValueError unless all that varies over time in a network fits an error's horizon, or else its period."""
     check_design_plant(network.plant)
-    covered = steps_covered((network.plant, sources_of(network)))
+    covered = steps_covered((network.plant, list_sources(network)))
     if error.horizon is not None:
         check_horizon(error.horizon, covered)
     elif steps_covered(network.plant) is not None:
@@ -123,7 +123,7 @@ def mode_system(network: Network, error: Error, young: Array | None = None) -> M
     states, b = jnp.stack([jnp.asarray(second) for second in seconds]), None
     if young is not None:
         b = jnp.broadcast_to(young, (steps,))
-    nodes = [describe_reception(name, source, states, forever, b) for name, source in sources_of(network).items()]
+    nodes = [describe_reception(name, source, states, forever, b) for name, source in list_sources(network).items()]
     count = prod(node.law.shape[1] for node in nodes)
     if count > MOST_MODES:
         raise fail("modes of a design", f"at most {MOST_MODES} together", count)

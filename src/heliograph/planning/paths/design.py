@@ -8,12 +8,12 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.planning.budget import MET, PowerLimits, Powers
-from heliograph.planning.descent import Evaluation, Limits, Problem, Vector, search
 from heliograph.planning.error import Criterion
 from heliograph.planning.paths.model import PathInformation, Paths, error_covariances, path_information, sensitivities
-from heliograph.planning.paths.relaxation import SplitPaths, envelope, split_paths
+from heliograph.planning.paths.relaxation import SplitPaths, compute_envelope, split_paths
 from heliograph.planning.paths.water_filling import water_filling
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
+from heliograph.planning.quadratic_programme import Evaluation, Limits, Problem, Vector, search
 
 UNLIMITED = 1e13  # times alpha: more changes nothing but rounding
 REACHED = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
@@ -126,7 +126,7 @@ class PowerTask(NamedTuple):
         np.add.at(peak.T, problem.path, limits.peak.T)
         np.add.at(mean, problem.path, limits.mean)
         cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)
-        bound = envelope(self.whole(), cap)
+        bound = compute_envelope(self.whole(), cap)
         return problem._replace(
             path=np.arange(count),
             information=lambda powers: PathInformation(*bound.information(powers)),
@@ -145,7 +145,7 @@ def is_convex(path: Int[np.ndarray, "free"]) -> bool:
     return len(set(path.tolist())) == len(path)
 
 
-def power_task(
+def make_power_task(
     paths: Paths,
     criterion: Criterion,
     limits: PowerLimits,
@@ -168,14 +168,14 @@ def power_task(
         largest = np.minimum(limits.peak.mean(axis=0), limits.mean)
         plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
         total = float(np.where(np.isfinite(largest), largest, plenty).sum())
-    masks = supports(paths.path[free], len(fixed), starts, seed)
+    masks = choose_supports(paths.path[free], len(fixed), starts, seed)
     even = [limits._replace(total=total).even(mask) for mask in masks]
     sizes = [limits.total, *limits.peak[np.isfinite(limits.peak)], float(even[0].max(initial=0.0))]
     scale = max((size for size in sizes if np.isfinite(size)), default=1.0) or 1.0
     return PowerTask(PathProblem(paths, criterion, paths.path[free], information, limits, scale), free, fixed, even)
 
 
-def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
+def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
     """Masks of the paths that send at each step: all, then every choice or `starts` drawn ones; one mask if convex."""
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):

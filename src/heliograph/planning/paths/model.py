@@ -176,11 +176,11 @@ def independent_paths(
     n, hops, steps = len(a), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1], error.steps
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
-    r = check_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
-    fading = check_at_least(
+    r = require_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
+    fading = require_at_least(
         1.0, "kappa of paths", array("kappa of paths", _broadcast_to_hops(kappa, len(c), hops), (len(c), hops))
     )
-    costs = check_at_least(
+    costs = require_at_least(
         0.0, "alpha of paths", array("alpha of paths", _broadcast_to_hops(alpha, len(c), hops), (len(c), hops))
     )
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
@@ -205,7 +205,7 @@ def independent_paths(
     )
 
 
-def check_at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def require_at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Return the numbers, none below `least`; ValueError if some are."""
     if value.size and np.min(value) < least:
         raise fail(name, f"numbers of at least {least:g}", f"{np.min(value):g}")

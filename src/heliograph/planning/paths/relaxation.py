@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.types import ArrayLike, Bool, Float
-from heliograph.planning.paths.model import Paths, PathValues, Powers, check_at_least, fading, share_of_signal
+from heliograph.planning.paths.model import Paths, PathValues, Powers, fading, require_at_least, share_of_signal
 
 NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
 BISECTIONS = 120
@@ -74,7 +74,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
     Raises:
         ValueError: a negative noise or total, no hops, noises or a total whose squares are no numbers.
     """
-    noise, power = hop_noises(alpha), float(scalar("total power", total, 0.0))
+    noise, power = check_hop_noises(alpha), float(scalar("total power", total, 0.0))
     if not np.any(noise):
         return np.zeros(len(noise))
     if power and not 1 / LARGEST <= power <= LARGEST:
@@ -83,9 +83,9 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
     return np.asarray(split(SplitPaths(unit, 0 * unit, noise[None, None]), power * unit).powers[0, 0])
 
 
-def hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
+def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
     """Return the noises of a chain's hops, checked."""
-    noise = check_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
+    noise = require_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
     if not len(noise):
         raise fail("alpha of hops", "at least one", "none")
     if np.max(noise) > LARGEST:
@@ -147,7 +147,7 @@ class Envelope(NamedTuple):
         return np.where(on_ray, self.ray * total, exact.information), np.where(on_ray, self.ray, exact.slope)
 
 
-def envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
+def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     """Concave envelopes: a ray touches where D (1 - P l) = t, by bisection in log l, as the left side falls with l."""
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.report.figures import COLOURS, MUTED, STYLE, WIDTH, legend_above
+from heliograph.report.figures import COLOURS, MUTED, STYLE, WIDTH, place_legend_above
 from heliograph.report.outputs import round_to
 from heliograph.report.pages.page import Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
@@ -24,11 +24,13 @@ CLAIMED = (0.5, 0.8, 0.95)
 def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str) -> Results:
     """Return the content of the results folder; `network` is the user's name of the network."""
     return Results(
-        {"coverage": _draw_coverage(found)}, lambda drawings: backtest_page(found, network, drawings), _summarise(found)
+        {"coverage": _draw_coverage(found)},
+        lambda drawings: make_backtest_page(found, network, drawings),
+        _summarise(found),
     )
 
 
-def doubts_of(found: "heliograph.forecasting.Backtest") -> list[str]:
+def list_doubts(found: "heliograph.forecasting.Backtest") -> list[str]:
     """List coverages that are further from what was claimed than chance explains, a line each."""
     return [
         f"{s.node}/{s.filter}, {s.part} {s.name}, {s.horizon} ahead: the interval of {said} held {share.value:.1%} "
@@ -55,13 +57,13 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
     for claimed in CLAIMED[1:]:
         axes.axhline(claimed, color=MUTED, linewidth=1)
     axes.set(xlabel="rows ahead", ylabel="share inside", ylim=(None, 1.02), xticks=found.horizons)
-    legend_above(figure, axes, 2)
+    place_legend_above(figure, axes, 2)
     return figure
 
 
-def backtest_page(found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes]) -> Page:
+def make_backtest_page(found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes]) -> Page:
     """Return the page; `drawings` holds each figure as SVG."""
-    doubts = [visible(line) for line in doubts_of(found)]
+    doubts = [visible(line) for line in list_doubts(found)]
     title = f"{len(doubts)} claims ahead do not hold" if doubts else "What was said ahead held"
     lead = (
         f"From each of {found.rows:,} rows `{visible(network)}` forecast {', '.join(map(str, found.horizons))} rows "
@@ -101,4 +103,4 @@ def _summarise(found: "heliograph.forecasting.Backtest") -> dict[str, Json]:
         return float(value) if isinstance(value, float) and np.isfinite(value) else None
 
     scores: list[Json] = [{name: plain(value) for name, value in s.row().items()} for s in found.scores]
-    return {"rows": found.rows, "horizons": list(found.horizons), "warnings": doubts_of(found), "scores": scores}
+    return {"rows": found.rows, "horizons": list(found.horizons), "warnings": list_doubts(found), "scores": scores}

@@ -38,7 +38,9 @@ class DesignResults:
 
 def design_results(results: DesignResults) -> Results:
     """Return the content of the results folder."""
-    return Results(figures(results), partial(page, results), summary(results), partial(write_networks, results))
+    return Results(
+        draw_figures(results), partial(make_page, results), make_summary(results), partial(write_networks, results)
+    )
 
 
 def write_networks(results: DesignResults, folder: Path) -> None:
@@ -53,7 +55,7 @@ def mean_powers(design: PowerDesign) -> dict[str, float]:
     return {name: power if power > ROUNDING * design.total else 0.0 for name, power in mean.items()}
 
 
-def summary(results: DesignResults) -> dict[str, Json]:
+def make_summary(results: DesignResults) -> dict[str, Json]:
     """Return all numbers of the report."""
     design, certificate = results.design, results.design.certificate
     # JSON has no arrays: all numbers become lists.
@@ -75,17 +77,17 @@ def summary(results: DesignResults) -> dict[str, Json]:
     }  # fmt: skip
 
 
-def figures(results: DesignResults) -> dict[str, Figure]:
+def draw_figures(results: DesignResults) -> dict[str, Figure]:
     """Return the front, the powers, and the map if there is one, by file name."""
-    drawn = {"front": front_figure(results.front, {"this design": (results.design.total, results.design.error)})}
-    drawn["powers"] = powers_figure(results.before, mean_powers(results.design))
+    drawn = {"front": draw_front(results.front, {"this design": (results.design.total, results.design.error)})}
+    drawn["powers"] = draw_powers(results.before, mean_powers(results.design))
     if results.map is not None:
-        drawn["map"] = map_figure(results.map)
+        drawn["map"] = draw_map(results.map)
     return drawn
 
 
 @matplotlib.rc_context(STYLE)
-def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure:
+def draw_front(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure:
     """Plot error over total power: the least found, the lower bound, and named points (power, error)."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
@@ -106,7 +108,7 @@ def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figu
 
 
 @matplotlib.rc_context(STYLE)
-def powers_figure(before: Mapping[str, float], after: Mapping[str, float]) -> Figure:
+def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figure:
     """Plot the mean power of each transmitter, original and designed, as bars."""
     names = sorted(after, key=lambda name: -after[name])[:MOST]
     names = [name for name in after if name in names]
@@ -125,7 +127,7 @@ def powers_figure(before: Mapping[str, float], after: Mapping[str, float]) -> Fi
 
 
 @matplotlib.rc_context(STYLE)
-def map_figure(sites: SiteMap) -> Figure:
+def draw_map(sites: SiteMap) -> Figure:
     """Plot the error over places, darker where it is smaller, with the best place."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()
@@ -138,7 +140,7 @@ def map_figure(sites: SiteMap) -> Figure:
     return figure
 
 
-def page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
+def make_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     design = results.design
     sections = [_make_result_section(results), _front_section(drawings), _make_powers_section(results, drawings)]

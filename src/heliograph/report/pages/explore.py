@@ -7,7 +7,7 @@ from importlib.resources import files
 
 from markupsafe import Markup
 
-from heliograph.report.pages.page import Page, environment
+from heliograph.report.pages.page import Page, make_environment
 
 LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")  # 1.4 MB without its widgets; Plotly's one file has 4.8 MB
 STATIC = "static"  # sections of this kind are seen in print, and where no script runs
@@ -49,7 +49,7 @@ def explore_html(page: Page, tables: Sequence[Explored]) -> str:
     """Return the page with tables to explore before its sections, as HTML that loads nothing else."""
     data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (
-        environment()
+        make_environment()
         .get_template("explore.html.j2")
         .render(
             page=page,

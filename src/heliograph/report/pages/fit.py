@@ -21,7 +21,7 @@ from heliograph.report.figures import (
     PALE,
     STYLE,
     VERMILION,
-    legend_above,
+    place_legend_above,
     stacked_panels,
 )
 from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -51,7 +51,7 @@ class Learned:
         return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
 
 
-def fit_figures(learned: Learned) -> dict[str, Figure]:
+def draw_fit_figures(learned: Learned) -> dict[str, Figure]:
     """Return figures by file name: estimates; correlations of innovations before and after; PITs."""
     drawn = {"estimates": _draw_estimates(learned)}
     tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
@@ -109,7 +109,7 @@ def _draw_correlations(tested: list[Change]) -> Figure:
         axes.set_title(quote_for_figure(f"{change.node}/{change.filter}"))
         axes.set_ylabel("correlation")
         axes.set_xticks(lags)
-    legend_above(figure, grid[0])
+    place_legend_above(figure, grid[0])
     grid[-1].set_xlabel("rows apart")
     return figure
 
@@ -133,7 +133,7 @@ def _draw_pits(received: list[Uniformity]) -> Figure:
     return figure
 
 
-def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
+def make_fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
@@ -304,4 +304,4 @@ def _make_delays_section(learned: Learned) -> list[Section]:
 
 def pages(learned: Learned) -> "partial[Page]":
     """Return the page, once the figures are drawn."""
-    return partial(fit_page, learned)
+    return partial(make_fit_page, learned)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.numerics.check import instance
 from heliograph.report.arrivals import Arrivals
-from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above, stacked_panels
+from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, place_legend_above, stacked_panels
 from heliograph.report.forecasts import draw_forecasts, forecast_tables
 from heliograph.report.health import Health
 from heliograph.report.innovations import (
@@ -21,16 +21,16 @@ from heliograph.report.innovations import (
     LOOK,
     MOST,
     choose_picture,
-    innovations_figure,
-    innovations_section,
+    draw_innovations,
     label_time_axis,
+    make_innovations_section,
     say_not_drawn,
     tested_by_figure,
 )
-from heliograph.report.outputs import errors_of, round_to
+from heliograph.report.outputs import compare_with_truth, round_to
 from heliograph.report.pages.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.pages.run_summary import run_summary
-from heliograph.report.position_map import coordinates_of, map_figure
+from heliograph.report.position_map import coordinates_of, draw_position_map
 from heliograph.report.results import Json, Results, write_into
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
@@ -45,7 +45,7 @@ def make_run_results(health: Health, network: str) -> Results:
     return Results(run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None)
 
 
-def results_of_plants(examined: Mapping[str, Health], network: str) -> Results:
+def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Results:
     """Return the results of several plants: an overview, the most doubted first, and beside it a folder for each."""
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
@@ -94,10 +94,10 @@ def run_figures(health: Health) -> dict[str, Figure]:
     if coordinates_of(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
             node = _nodes_to_draw(record)[0]
-            drawn[_map_name(kind)] = map_figure(record, node, list(record.estimates[node])[: len(COLOURS)])
+            drawn[_map_name(kind)] = draw_position_map(record, node, list(record.estimates[node])[: len(COLOURS)])
     for kind, record in _collect_estimates(health):
         drawn |= {f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_nodes_to_draw(record))}
-    drawn |= {name: innovations_figure(health, tested) for name, tested in tested_by_figure(health).items()}
+    drawn |= {name: draw_innovations(health, tested) for name, tested in tested_by_figure(health).items()}
     if health.links:
         drawn["links"] = _draw_deliveries(health)
     return drawn
@@ -133,7 +133,7 @@ def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
     record.plot(node, names, axes=grid, sigmas=BAND)
     if record is health.record:
         draw_forecasts(grid, record, node, health.forecasts.get(node, {}), names, BAND)
-    legend_above(figure, grid[0])
+    place_legend_above(figure, grid[0])
     label_time_axis(health.record, grid[-1])
     return figure
 
@@ -192,9 +192,9 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
                 "At a glance",
                 [KeyFigures(keys), *_list_doubts(doubts), *_list_baseline_remarks(health), *_list_premises(health)],
             ),
-            Section("Estimates", [*errors_table(record), *_list_pictures(health, drawings)]),
+            Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
             *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
-            innovations_section(health, drawings),
+            make_innovations_section(health, drawings),
             Section("Links", _make_links_section(health, drawings)),
         ],
     )
@@ -250,13 +250,13 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
     return pictures
 
 
-def errors_table(record: Record) -> list[Table]:
+def make_errors_table(record: Record) -> list[Table]:
     """Return the errors of each filter where the recording has the true state."""
     rows = [
         [visible(f"{errors.node}/{errors.filter}"), errors.claim,
          *(round_to(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
          "–" if np.isnan(errors.nees) else round_to(errors.nees, errors.nees_error)]
-        for errors in errors_of(record)
+        for errors in compare_with_truth(record)
     ]  # fmt: skip
     # What the columns are, in words.
     caption = (
@@ -344,7 +344,7 @@ def _make_links_section(health: Health, drawings: Mapping[str, bytes]) -> list[T
         Table(headers, rows, slower if any(link.due_in != "each row" for link in health.links) else ""),
         *picture,
         *missing,
-        *shared_text(health.shared),
+        *describe_shared(health.shared),
     ]
 
 
@@ -362,7 +362,7 @@ def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
     return round_to(float(values.mean()), error), round_to(deviation, error / 2**0.5)
 
 
-def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
+def describe_shared(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
     """Return what nodes share as a sentence each; nothing where their links are independent."""
     said = [
         f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."

@@ -5,7 +5,7 @@ import numpy as np
 from heliograph.numerics.check import instance
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.health import FilterHealth, Health
-from heliograph.report.outputs import errors_of, output_numbers
+from heliograph.report.outputs import compare_with_truth, summarise_output
 from heliograph.report.results import Json
 from heliograph.simulation.results.record import Record
 
@@ -25,7 +25,9 @@ def run_summary(health: Health) -> dict[str, Json]:
         filters.setdefault(tested.node, {})[tested.filter] = _filter_numbers(tested)
     outputs: dict[str, dict[str, dict[str, Json]]] = {}
     for output in health.outputs:
-        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.judged.output] = output_numbers(output)
+        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.judged.output] = summarise_output(
+            output
+        )
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
         links.setdefault(link.node, {})[link.component] = _link_numbers(link)
@@ -59,7 +61,7 @@ def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
 def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
     """Errors by node and filter, where the truth is known."""
     errors: dict[str, dict[str, Json]] = {}
-    for of_filter in errors_of(record):
+    for of_filter in compare_with_truth(record):
         size = None if np.isnan(of_filter.nees) else of_filter.nees
         rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
         errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 from heliograph.files.event_columns import YEAR
 from heliograph.files.fields import decode_json, parse_arrival
-from heliograph.files.message_files import log_line, of_log
+from heliograph.files.message_files import log_line, read_log_entry
 from heliograph.files.sources import Reading, Sources, Unread
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.serving.brokers.transport import LOG
@@ -73,7 +73,7 @@ class Translator:
             content = decode_json(payload[:LONGEST], "line")
         except InputError:
             content = None
-        logged = of_log(content)
+        logged = read_log_entry(content)
         if logged is None and content is None:
             parts = log_line(payload.decode(errors="replace"))
             logged = parts and (*parts, False)

@@ -68,7 +68,7 @@ class Overview:
     ) -> list[Wrong]:
         """Return the plants with something wrong, the worst first; `refused` has words by plant."""
         for plant in self.touched:
-            doubts = tuple(doubts_of(tests.get(plant, {})))
+            doubts = tuple(find_doubts(tests.get(plant, {})))
             wrong = Wrong(plant, tuple(dead.get(plant, ())), doubts, refused.get(plant, ""))
             if wrong.describe:
                 self._wrong[plant] = wrong
@@ -78,7 +78,7 @@ class Overview:
         return sorted(self._wrong.values(), key=lambda wrong: wrong.severity, reverse=True)
 
 
-def doubts_of(tests: Mapping[Name, RunningNis]) -> Iterable[Doubt]:
+def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[Doubt]:
     """Yield the doubted filters of a plant, the most doubted first."""
     doubts = []
     for (node, name), test in tests.items():
@@ -113,7 +113,7 @@ that were refused.{more}</p></header>
 """
 
 
-def page_of(title: str, plants: Collection[str], wrong: Sequence[Wrong], most: int) -> str:
+def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[Wrong], most: int) -> str:
     """Return the page of all plants, at most so many rows."""
     named = {item.plant for item in wrong}
     rows = [(item.plant, "<br>".join(escape(line) for line in item.describe), "doubt") for item in wrong]

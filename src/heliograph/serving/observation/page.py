@@ -26,8 +26,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from heliograph.live.event import VERDICTS
 from heliograph.numerics.check import fail
-from heliograph.report.outputs import output_numbers
-from heliograph.serving.observation.overview import page_of
+from heliograph.report.outputs import summarise_output
+from heliograph.serving.observation.overview import make_plants_page
 from heliograph.serving.observation.watch import LISTED, Watch
 
 
@@ -144,7 +144,7 @@ def _collect_outputs(watch: Watch) -> Iterable[Metric]:
     }
     # Numbers of each output of each filter that weighs; none where there are too few rows.
     for output in watch.outputs.health():
-        numbers = output_numbers(output)
+        numbers = summarise_output(output)
         for name, metric in metrics.items():
             if isinstance(value := numbers[name], float):
                 metric.add_metric([output.node, output.filter, output.judged.output], value)
@@ -222,7 +222,7 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: Sequence[str] = ()) -> Starlette:
+def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: Sequence[str] = ()) -> Starlette:
     """Return the web application: the page at /, its data at /events until `stopped`, metrics at /metrics.
 
     Without a token, or where `hosts` are given, it answers to these names and those of this machine alone.
@@ -244,7 +244,7 @@ def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: 
 
     def plants(_: Request) -> Response:
         with watch.lock:
-            text = page_of(watch.title, {name for name, _ in watch.plants()}, watch.worst(), LISTED)
+            text = make_plants_page(watch.title, {name for name, _ in watch.plants()}, watch.worst(), LISTED)
         return Response(text, media_type="text/html", headers=POLICY)
 
     # It says only that the service serves, so that it needs no token.
@@ -332,7 +332,7 @@ class _Page(uvicorn.Server):
 
 
 @asynccontextmanager
-async def shown(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
+async def serve_page(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
     """Serve the page for the duration of a block, which receives its port.
 
     Raises:
@@ -345,7 +345,7 @@ async def shown(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
         raise fail("page", "a free port of this machine", f"{at.host}:{at.port}, {why}") from None
     stopped = asyncio.Event()
     config = uvicorn.Config(
-        application(watch, at.token, stopped, at.hosts),
+        make_application(watch, at.token, stopped, at.hosts),
         log_level="warning",
         access_log=False,
         timeout_graceful_shutdown=3,

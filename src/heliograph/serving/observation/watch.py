@@ -17,7 +17,7 @@ from heliograph.live.event import VERDICTS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
-from heliograph.report.outputs import RecentOutputs, output_row
+from heliograph.report.outputs import RecentOutputs, make_output_row
 from heliograph.serving.observation.overview import Overview, Wrong
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observed_service import ObservedService, Serves, Taken, WatchedPlant
@@ -229,7 +229,7 @@ class Watch:
                 "links": self._hide_uncounted(_add_counts(results)),
                 "senders": senders,
                 "tests": [_make_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
-                "outputs": [output_row(output) for output in health],
+                "outputs": [make_output_row(output) for output in health],
                 "warnings": list(self._yield_warnings(results, tests, senders))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
                 "all": self.links(),

@@ -14,20 +14,20 @@ PASSING = "starting up", "shutting down", "terminating connection", "recovery mo
 PLACE = "a file, or a URL as postgresql://host/database"
 
 
-def engine_at(location: str) -> Engine:
+def open_database(location: str) -> Engine:
     """Open the database of a store, at a path (SQLite) or a URL (PostgreSQL).
 
     Raises:
         ValueError: no path, or the URL of another kind of database; the message contains no password.
     """
-    engine = create_engine(url_of(location))
+    engine = create_engine(read_location(location))
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _configure_sqlite)
         event.listen(engine, "begin", _begin_immediate)
     return engine
 
 
-def url_of(location: str) -> URL:
+def read_location(location: str) -> URL:
     """Read the location of a store.
 
     Raises:

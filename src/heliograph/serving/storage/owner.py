@@ -11,7 +11,7 @@ from sqlalchemy.engine import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliograph.numerics.check import InputError, fail
-from heliograph.serving.storage.database import engine_at, is_away
+from heliograph.serving.storage.database import is_away, open_database
 from heliograph.serving.storage.store_protocol import AwayError
 
 try:
@@ -47,7 +47,7 @@ def own_store(location: str, process: str) -> Iterator[None]:
     Raises:
         ValueError: another service has it; the message says which.
     """
-    engine = engine_at(location)
+    engine = open_database(location)
     try:
         if engine.dialect.name == "postgresql":
             with _lock_session(engine, process):

@@ -14,7 +14,7 @@ from heliograph.live.stored.migration import DESCRIPTION, LISTED, Carrier, list_
 from heliograph.live.stored.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
-from heliograph.serving.storage.database import engine_at, is_away
+from heliograph.serving.storage.database import is_away, open_database
 from heliograph.serving.storage.store_protocol import AwayError, ConflictError, Damage, Entry, StoredPlant
 from heliograph.serving.storage.tables import (
     CARRIED,
@@ -70,7 +70,7 @@ class Store:
         carrier: Carrier | None = None,
     ):
         self.process, self.journal, self.identity = process, journal, {}
-        self._engine = engine_at(location)
+        self._engine = open_database(location)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         try:

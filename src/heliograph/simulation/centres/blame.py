@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 
-from heliograph.engine.choice import chosen
+from heliograph.engine.choice import choose_code
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
@@ -62,7 +62,7 @@ def _judge_rows(
         states = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], before[name])
         arguments = filter, states, z, u[rows], rows
         with jax.enable_x64(True):
-            code = chosen(_judgement, arguments, (False, True, True, True, True))
+            code = choose_code(_judgement, arguments, (False, True, True, True, True))
             judgement = to_numpy(_all_by_xla(*arguments, len(rows)) if code.code is None else code.results())
         votes.append(np.stack([np.broadcast_to(field, len(rows)) for field in judgement], axis=-1))
     return np.stack(votes, axis=1)

@@ -186,7 +186,7 @@ class Centre(Module):
     def gathered(self, parts: Sequence[LinearStep]) -> LinearStep:
         """Matrices of the sources' filters in the order of the nodes, padded with zeros to the longest measurement."""
 
-        return gathered(parts, self.order, self.size)
+        return gather_steps(parts, self.order, self.size)
 
     def step(
         self, state: CentreState, parts: Sequence[LinearStep], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
@@ -205,7 +205,7 @@ MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, 
 Matrices = TypeVar("Matrices", LinearStep, Linearised)
 
 
-def gathered(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
+def gather_steps(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
     """Matrices of several groups of filters in this order, with zeros up to a measurement of `size` components."""
 
     def padded(name: str, leaf: jax.Array) -> jax.Array:
@@ -217,7 +217,7 @@ def gathered(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrice
     return kind(*(jnp.concatenate([padded(f, getattr(p, f)) for p in parts])[order] for f in kind._fields))
 
 
-def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:
+def stack_nodes(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:
     """Stack nodes of one structure."""
     return ObservationModel(
         stack([without_output_names(sensor) for sensor in sensors]),

@@ -22,7 +22,7 @@ from heliograph.simulation.centres.centre import (
     Together,
     along_estimates,
     describe_channel,
-    observation_model,
+    stack_nodes,
 )
 from heliograph.simulation.centres.linearised import LinearisedCentre
 from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
@@ -194,5 +194,5 @@ def _observe(
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
         return Together(network.common.sensor, describe_channel(network.common.channel), np.array(padded))
     parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
-    items = tuple(observation_model([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
+    items = tuple(stack_nodes([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
     return Apart(items, order, size)

@@ -24,7 +24,7 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.centre import gathered
+from heliograph.simulation.centres.centre import gather_steps
 
 
 class Followed(NamedTuple):
@@ -69,7 +69,7 @@ class LinearisedCentre(Module):
         k: jax.Array,
     ) -> tuple[dict[str, Followed], dict[str, Estimate]]:
         """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
-        linear, reports = gathered(parts, self.order, self.size), jnp.concatenate(means)[self.order]
+        linear, reports = gather_steps(parts, self.order, self.size), jnp.concatenate(means)[self.order]
         # I - K_i C_i of all nodes.
         plant = at(self.plant, k)
         keep = jnp.eye(reports.shape[-1]) - linear.gain @ linear.output

@@ -30,9 +30,9 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.centre import Apart, ObservationModel, observation_model
+from heliograph.simulation.centres.centre import Apart, ObservationModel, stack_nodes
 from heliograph.simulation.centres.edges import Edges, edges_of
-from heliograph.simulation.centres.messages import Messages, OnTheWay, messages_of, one_step_on, test_moved_beyond
+from heliograph.simulation.centres.messages import Messages, OnTheWay, gather_messages, step_way, test_moved_beyond
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -171,7 +171,7 @@ class Mesh(Module):
         held = None if state.sent is None else sent @ motion.matrix.T + motion.shift
         after = MeshState(mean, gains.covariance, joint, parts.plant, held, None)
         if messages is not None and state.way is not None:
-            on = one_step_on(messages, state.way, motion, common, weighted, parts.data.information)
+            on = step_way(messages, state.way, motion, common, weighted, parts.data.information)
             after = after._replace(way=on)
         return after, self._split_by_group(mean, claimed)
 
@@ -180,7 +180,7 @@ class Mesh(Module):
         if state.way is None:
             return None
         ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)
-        return messages_of(state.mean, state.covariance, state.way, self.quantizer, self.senders, ages)
+        return gather_messages(state.mean, state.covariance, state.way, self.quantizer, self.senders, ages)
 
     def _send_estimates(
         self, mean: jax.Array, state: MeshState, arrives: jax.Array, messages: Messages | None
@@ -347,7 +347,7 @@ def _pad_to_degree(parts: jax.Array, degree: int) -> Float[jax.Array, "node degr
     return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), *[(0, 0)] * (parts.ndim - 2)))
 
 
-def mesh_of(network: Network, name: str) -> Mesh:
+def build_mesh(network: Network, name: str) -> Mesh:
     """Build the fusion `name` between neighbours of a network."""
     fusion = network.meshes[name]
     assert fusion.neighbours is not None
@@ -359,7 +359,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
     group_places: dict[str, int] = {}
     for names in network.groups:
         sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
-        groups.append(observation_model([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
+        groups.append(stack_nodes([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
         group_places |= {node: len(group_places) + i for i, node in enumerate(names)}
     # Kinds of its filters, and the places of their nodes in the mesh.
     kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
@@ -385,7 +385,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
     )
 
 
-def meshes_of(network: Network) -> dict[str, Mesh]:
+def build_meshes(network: Network) -> dict[str, Mesh]:
     """Return the fusions between neighbours, by name, to be stepped.
 
     Raises:
@@ -397,4 +397,4 @@ def meshes_of(network: Network) -> dict[str, Mesh]:
             kind = type(fusion.rule).__name__
             expected = f"at most {DENSE} nodes, whose joint covariance it follows (freeze it, or intersect)"
             raise fail(f"fusion {name!r} between neighbours by {kind}", expected, nodes)
-    return {name: mesh_of(network, name) for name in network.meshes}
+    return {name: build_mesh(network, name) for name in network.meshes}

@@ -21,7 +21,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.centres.edges import Edges
-from heliograph.simulation.centres.mesh import Mesh, MeshStep, mesh_of
+from heliograph.simulation.centres.mesh import Mesh, MeshStep, build_mesh
 from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.network import Network
 
@@ -296,7 +296,7 @@ def mesh_named(network: Network, fusion: str) -> Mesh:
     if len(network.mesh_nodes(fusion)) > SPARSE:
         raise fail(f"fusion {fusion!r}", f"at most {SPARSE} nodes, for the covariance of all their errors",
                    len(network.mesh_nodes(fusion)))  # fmt: skip
-    return mesh_of(network, fusion)
+    return build_mesh(network, fusion)
 
 
 def _check_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:

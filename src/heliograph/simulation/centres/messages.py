@@ -65,7 +65,7 @@ def quantize_estimate(
     return received, widen(covariance, jnp.asarray(quantizer.error(len(mean))))
 
 
-def messages_of(
+def gather_messages(
     mean: jax.Array, covariance: jax.Array, way: OnTheWay, quantizer: AbstractQuantizer | None, senders: np.ndarray,
     ages: Int[jax.Array, "node rounds degree"],
 ) -> Messages:  # fmt: skip
@@ -88,7 +88,7 @@ def messages_of(
     return Messages(means, covariances, rows, (ages >= 0) & ~without.at[:, 0].set(False)[:, None], ages == 0)
 
 
-def one_step_on(
+def step_way(
     messages: Messages, way: OnTheWay, motion: Motion, common: jax.Array, weighted: jax.Array, information: jax.Array
 ) -> OnTheWay:
     """Return the estimates on the way after a step, of measurements with sums `weighted` of innovations about `common`.

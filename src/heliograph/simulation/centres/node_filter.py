@@ -22,7 +22,7 @@ from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
-from heliograph.simulation.centres.centre import Apart, observation_model
+from heliograph.simulation.centres.centre import Apart, stack_nodes
 from heliograph.simulation.centres.edges import Edges
 from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
 from heliograph.simulation.centres.messages import OnTheWay, quantize_estimate
@@ -135,7 +135,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     row = Graph(nodes, graph.senders[i : i + 1, :count], np.ones((1, count), dtype=bool))
     names = (node, *neighbours[node])
     sensors = [network.nodes[name] for name in names]
-    models = [observation_model([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in sensors]
+    models = [stack_nodes([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in sensors]
     sizes = tuple(n.received for n in sensors)
     mesh = Mesh(
         plant=network.plant,

@@ -13,7 +13,7 @@ from heliograph.numerics.module import LINES, cut
 from heliograph.numerics.traced import describe_rounded, is_traced
 from heliograph.random_affine.composite import ARROW, DIRECT
 from heliograph.random_affine.memory import memories
-from heliograph.simulation.claims import beliefs
+from heliograph.simulation.claims import list_other_beliefs
 from heliograph.simulation.description.single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
 from heliograph.simulation.shared_fading import memory_places
@@ -54,7 +54,7 @@ def diagram(network: HasNodes) -> list[DiagramLine]:
 def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
     """Return the claim of each estimate by node and filter, with what the filter believes that is not the node's."""
     words: dict[str, dict[str, str]] = {node: dict(by_name) for node, by_name in network.claims().items()}
-    for belief in beliefs(network):
+    for belief in list_other_beliefs(network):
         words[belief.node][belief.filter] += f", believes {belief.another}"
     return words
 

@@ -24,12 +24,12 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
-from heliograph.simulation.claims import Belief, beliefs
+from heliograph.simulation.claims import Belief, list_other_beliefs
 from heliograph.simulation.declared.refit import declares_noise
 from heliograph.simulation.description.diagram import list_rounded, list_shared
 from heliograph.simulation.description.fallbacks import list_fallbacks
 from heliograph.simulation.description.separable import separate_nodes
-from heliograph.simulation.description.wide_angles import wide_at_the_start
+from heliograph.simulation.description.wide_angles import warn_wide_at_start
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -64,7 +64,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     instance("network", network, Network, "a Network")
     lines = [*_find_unobservable(network), *_doubt_boundedness(network), *_find_unheard(network)]
     lines += [*_find_forgetful_filters(network), *_find_other_beliefs(network)]
-    lines += [Doubt(True, words) for words in wide_at_the_start(network)]
+    lines += [Doubt(True, words) for words in warn_wide_at_start(network)]
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
@@ -192,7 +192,7 @@ def _find_other_beliefs(network: Network) -> Iterator[Doubt]:
     """Yield the filters that believe another world than that in which they stand, so that they claim nothing of it."""
     alike: dict[tuple[bool, str, tuple[str, ...]], list[Belief]] = {}
     forgetful = _list_forgetful_nodes(network)
-    for belief in beliefs(network):
+    for belief in list_other_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
             continue  # said already, with what to do
         alike.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.disk.quoting import join_names
-from heliograph.engine.choice import refusal
+from heliograph.engine.choice import explain_refusal
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.mesh import DENSE, mesh_of
+from heliograph.simulation.centres.mesh import DENSE, build_mesh
 from heliograph.simulation.network import Network
 
 SHOWN = 3  # of many that are refused for one reason
@@ -31,7 +31,7 @@ def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
         for label, filter in filters.items():
             z, u = jnp.zeros(filter.received), jnp.zeros(len(filter.inputs))
             state = jax.tree.map(jnp.asarray, filter.init())
-            if why := refusal(_step, filter, state, z, u, jnp.asarray(0)):
+            if why := explain_refusal(_step, filter, state, z, u, jnp.asarray(0)):
                 yield f"filter {label!r}{where}", why
 
 
@@ -44,7 +44,7 @@ def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
     """Yield each fusion between neighbours whose step is too long to be written out."""
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
-        if (nodes <= DENSE or not fusion.rule.needs_joint) and mesh_of(network, name).is_long:
+        if (nodes <= DENSE or not fusion.rule.needs_joint) and build_mesh(network, name).is_long:
             yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"
 
 

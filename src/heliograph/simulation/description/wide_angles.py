@@ -38,7 +38,7 @@ def largest_deviation(filter: AbstractFilter) -> float:
     return WIDE
 
 
-def wide_at_the_start(network: Network) -> Iterator[str]:
+def warn_wide_at_start(network: Network) -> Iterator[str]:
     """Yield a line for each angle of which a filter starts with less knowledge than it can use."""
     lines: dict[tuple[str, str, float], list[str]] = {}
     for node, label, filter in _find_filters(network):
@@ -51,7 +51,7 @@ def wide_at_the_start(network: Network) -> Iterator[str]:
         yield f"wide angle: {where} starts with {name!r} known to +- {known:.2g} rad; {REMEDY}"
 
 
-def wide_in_rows(network: Network, record: Record) -> Iterator[str]:
+def warn_wide_in_rows(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each filter that knew an angle less well in some row than it can use."""
     for node, label, filter in _find_filters(network):
         covariance = np.asarray(record.estimates[node][label].covariance)
@@ -113,7 +113,7 @@ def _yield_deviations(
         yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
 
 
-def beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
+def warn_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
     """Yield a line for each measured angle with values beyond a full turn, as degrees have."""
     for name, angles in network.angles.items():
         names = network.nodes[name].received_names if angles else ()

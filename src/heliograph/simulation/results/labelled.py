@@ -287,20 +287,20 @@ def each_filter(
     dataset: "xr.Dataset", names: Sequence[str], lead: Sequence[str]
 ) -> Iterator[tuple[str, str, Claim, dict[str, np.ndarray]]]:
     """Yield node, filter, claim, and copies of these fields without their axes (node, filter), of each filter there."""
-    nodes, filters, claim = names_of(dataset, "node"), names_of(dataset, "filter"), values_of(dataset, "claim", lead)
-    fields = {name: values_of(dataset, name, lead) for name in names}
+    nodes, filters, claim = names_of(dataset, "node"), names_of(dataset, "filter"), read_values(dataset, "claim", lead)
+    fields = {name: read_values(dataset, name, lead) for name in names}
     places = {name: axes_of(name, lead).index("node") for name in names}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
         values = {name: field[(*(slice(None),) * places[name], i, j)].copy() for name, field in fields.items()}
         yield nodes[i], filters[j], cast(Claim, str(claim[i, j])), values
 
 
-def uplinks_from(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
+def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
     """Return the uplinks of a dataset, by the fusion's name."""
     if "place" not in dataset:
         return {}
-    senders, positions = names_of(dataset, "sender"), values_of(dataset, "place", lead)
-    saturated, symbols = (values_of(dataset, name, lead) for name in SENT)
+    senders, positions = names_of(dataset, "sender"), read_values(dataset, "place", lead)
+    saturated, symbols = (read_values(dataset, name, lead) for name in SENT)
     uplinks = {}
     for i, name in enumerate(names_of(dataset, "fusion")):
         order = np.array([j for j in np.argsort(positions[i], kind="stable") if positions[i, j] >= 0], dtype=int)
@@ -330,7 +330,7 @@ def names_of(dataset: "xr.Dataset", axis: str) -> list[str]:
     return [str(name) for name in dataset[axis].values]
 
 
-def values_of(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarray:
+def read_values(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarray:
     """Return the values of a field with its axes in their order."""
     axes = axes_of(name, lead)
     if name not in dataset or set(dataset[name].dims) != set(axes):
@@ -339,7 +339,7 @@ def values_of(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarr
     return np.asarray(dataset[name].transpose(*axes).values)
 
 
-def units_of(dataset: "xr.Dataset") -> dict[str, str]:
+def read_units(dataset: "xr.Dataset") -> dict[str, str]:
     """Return the units of the states and of time in a dataset."""
     time = {TIME: str(dataset[TIME].attrs["units"])} if "units" in dataset[TIME].attrs else {}
     if "unit" not in dataset.coords:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # an extra
     from matplotlib.axes import Axes
 
 
-def chosen_filters(
+def choose_filters(
     known: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
 ) -> tuple[str, list[str]]:
     """Choose the node and its filters to draw: the first with any, and all."""
@@ -41,7 +41,7 @@ def state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int
     return [list(known).index(name) for name in chosen]
 
 
-def panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
+def make_panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
     """Return the given axes, or those of a new figure, one below the other."""
     if axes is None:
         import matplotlib.pyplot as plt

@@ -26,17 +26,17 @@ from heliograph.simulation.results.labelled import (
     check_title,
     each_filter,
     names_of,
+    read_units,
+    read_uplinks,
+    read_values,
     record_fields,
     record_frame,
-    units_of,
-    uplinks_from,
-    values_of,
 )
 from heliograph.simulation.results.plots import (
-    chosen_filters,
+    choose_filters,
     colour_of,
     legend_outside,
-    panels,
+    make_panels,
     state_places,
 )
 from heliograph.simulation.results.saved import Saved
@@ -234,22 +234,22 @@ class Record(Saved):
         """
         check_title(dataset, RECORD)
         lead, nodes = ["run", TIME] if "run" in dataset.dims else [TIME], names_of(dataset, "node")
-        measurement, length = values_of(dataset, "measurement", lead), values_of(dataset, "length", lead)
+        measurement, length = read_values(dataset, "measurement", lead), read_values(dataset, "length", lead)
         # Back to nodes and filters by name.
-        there = np.flatnonzero(values_of(dataset, "estimated", lead))
+        there = np.flatnonzero(read_values(dataset, "estimated", lead))
         estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in there}
         for node, name, claim, values in each_filter(dataset, ("mean", "covariance"), lead):
             estimates[node][name] = Estimate(values["mean"], values["covariance"], claim)
         return cls(
             time=np.asarray(dataset[TIME].values),
             states=tuple(names_of(dataset, "state")),
-            truth=values_of(dataset, "truth", lead) if "truth" in dataset else None,
+            truth=read_values(dataset, "truth", lead) if "truth" in dataset else None,
             measurements={
                 node: measurement[..., i, : length[i]].copy() for i, node in enumerate(nodes) if length[i] >= 0
             },
             estimates=estimates,
-            uplinks=uplinks_from(dataset, lead),
-            units=units_of(dataset),
+            uplinks=read_uplinks(dataset, lead),
+            units=read_units(dataset),
         )  # fmt: skip
 
     def to_pandas(self) -> "pd.DataFrame":
@@ -299,12 +299,12 @@ class Record(Saved):
             ModuleNotFoundError: without matplotlib (extra "report").
         """
         # What is drawn, on which axes.
-        node, filters = chosen_filters(self.estimates, node, filters)
+        node, filters = choose_filters(self.estimates, node, filters)
         places = state_places(states, self.states)
         if self.runs is not None and check_count("run", run, 0) >= self.runs:
             raise fail("run", f"one of {self.runs}, counted from 0", run)
         which: Any = ... if self.runs is None else run
-        drawn = panels(axes, len(places), self.time, self.units)
+        drawn = make_panels(axes, len(places), self.time, self.units)
         # Mean and +- sigmas claimed deviations, then the truth.
         for panel, i in zip(drawn, places, strict=True):
             for number, name in enumerate(filters):

@@ -17,16 +17,16 @@ from heliograph.simulation.results.labelled import (
     check_title,
     each_filter,
     names_of,
-    units_of,
-    uplinks_from,
-    values_of,
+    read_units,
+    read_uplinks,
+    read_values,
 )
 from heliograph.simulation.results.plots import (
     FAR,
-    chosen_filters,
+    choose_filters,
     colour_of,
     legend_outside,
-    panels,
+    make_panels,
     state_places,
 )
 from heliograph.simulation.results.saved import Saved
@@ -105,8 +105,8 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             ValueError: no such dataset.
         """
         check_title(dataset, STATISTICS)
-        states, count = names_of(dataset, "state"), values_of(dataset, "runs", [TIME])
-        upper, uplinks = np.triu_indices(len(states)), uplinks_from(dataset, [TIME])
+        states, count = names_of(dataset, "state"), read_values(dataset, "runs", [TIME])
+        upper, uplinks = np.triu_indices(len(states)), read_uplinks(dataset, [TIME])
         # Back to nodes and filters by name; of symmetric matrices the pairs i <= j.
         results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in names_of(dataset, "node")}
         sums = ("errors", "claimed", "nees", "failed", "failed_runs")
@@ -121,7 +121,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
                 failed=None if np.isnan(values["failed"]).any() else values["failed"],
                 failed_runs=int(values["failed_runs"]),
             )
-        return cls(results, tuple(states), units_of(dataset))
+        return cls(results, tuple(states), read_units(dataset))
 
     def to_pandas(self) -> "pd.DataFrame":
         """Table: a row for each node and filter, with claim, runs, RMSE, NEES, their errors, and figures by state.
@@ -162,10 +162,10 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             ModuleNotFoundError: without matplotlib (extra "report").
         """
         # What is drawn, on which axes.
-        node, filters = chosen_filters(self, node, filters)
+        node, filters = choose_filters(self, node, filters)
         places = state_places(states, self.states)
         time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
-        drawn = panels(axes, len(places), time, self.units)
+        drawn = make_panels(axes, len(places), time, self.units)
         for panel, i in zip(drawn, places, strict=True):
             for number, name in enumerate(filters):
                 # Solid: actual; dashed: claimed.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.choice import chosen, map_arrays, setting
+from heliograph.engine.choice import choose_code, map_arrays, read_setting
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.fusion.rules import Fusion
@@ -224,10 +224,10 @@ class RowSmoother:
 
     def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
         """Return the program for histories of this length, which an engine is chosen for once."""
-        key = len(history.rows), setting()
+        key = len(history.rows), read_setting()
         if key not in self._programs:
             span = np.zeros(2, dtype=np.int32)
-            choice = chosen(self._run, (self._numbers, history, span), [False] * 3)
+            choice = choose_code(self._run, (self._numbers, history, span), [False] * 3)
             if choice.code is None:
                 self._programs[key] = lambda *arguments: to_numpy(self._by_xla(self._numbers, *arguments))
             else:

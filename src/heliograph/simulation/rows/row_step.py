@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import chosen
+from heliograph.engine.choice import choose_code
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, understood
 from heliograph.numerics.module import Module, readable
@@ -17,7 +17,7 @@ from heliograph.numerics.trees.program_text import text_of
 from heliograph.numerics.trees.static import Static, cast
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.plausible_step import plausible_step
+from heliograph.simulation.plausible_step import step_plausibly
 from heliograph.simulation.rows.columns import columns_of
 from heliograph.simulation.stepping import AllFilters, initial_states
 
@@ -44,7 +44,7 @@ class NetworkStep(Module):
         The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
         kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
         """
-        after, outputs = plausible_step(self.filters, state, self.groups(received), u, k)
+        after, outputs = step_plausibly(self.filters, state, self.groups(received), u, k)
         return after, {name: outputs[name] for name in OUTPUTS}
 
     def groups(self, received: jax.Array) -> list[jax.Array]:
@@ -106,7 +106,7 @@ class RowStep:
         # Native code with the network's numbers filled in, where it takes the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
-        self._choice = chosen(_make_row_function(self._layout), (self._numbers, row), (False, True))
+        self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), (False, True))
         code = self._choice.code
         self._code = None if code is None else code.with_first(*self._numbers)
 

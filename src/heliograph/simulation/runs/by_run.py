@@ -13,7 +13,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 from heliograph.numerics.types import PyTree
 
 
-def trajectories(
+def simulate_trajectories(
     init: Callable[[jax.Array], PyTree], step: Callable[..., tuple[PyTree, PyTree]], keys: jax.Array, rows: PyTree
 ) -> PyTree:
     """Outputs of `step(carry, key, row)` from `init(key)` on, (run, time, ...); (1, time, ...) if common to all runs.

@@ -111,7 +111,7 @@ def added(total: PyTree, more: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: b if is_shared(b) else a + b, total, more, is_leaf=is_shared)
 
 
-def in_chunks(
+def advance_in_chunks(
     advance: Callable[[int, int], PyTree], lanes: int, wide: bool, runs: tuple[int, int], progress: Progress | None
 ) -> list[PyTree]:
     """Advance over all blocks; `runs`: their number, and that of a chunk, between which there is progress.

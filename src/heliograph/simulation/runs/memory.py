@@ -33,7 +33,7 @@ def size_of(tree: PyTree) -> float:
     return float(sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree)))
 
 
-def available() -> float | None:
+def find_available_memory() -> float | None:
     """Return the bytes that this machine can still give, at most all of its memory; None where it does not say."""
     try:
         lines = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
@@ -52,7 +52,7 @@ def check_memory(needed: Needed, runs: int, horizon: int) -> None:
     Raises:
         ValueError: more is needed, with both numbers, the largest part, and what needs less.
     """
-    total, free = sum(needed), available()
+    total, free = sum(needed), find_available_memory()
     if free is None or total <= free:
         return
     part, most = max(needed._asdict().items(), key=lambda item: item[1])
@@ -62,7 +62,7 @@ def check_memory(needed: Needed, runs: int, horizon: int) -> None:
 
 
 @contextmanager
-def out_of_memory(runs: int, horizon: int) -> Iterator[None]:
+def explain_out_of_memory(runs: int, horizon: int) -> Iterator[None]:
     """Say in one line that memory was not given after all, in place of an allocator's text.
 
     Raises:

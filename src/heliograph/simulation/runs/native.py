@@ -21,10 +21,10 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.reception import medium_of
+from heliograph.simulation.reception import make_reception
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.lanes import LANES, Progress, in_chunks
+from heliograph.simulation.runs.lanes import LANES, Progress, advance_in_chunks
 from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.runs.native_lanes import Native, NativeLanes
 from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
@@ -38,7 +38,7 @@ FEW = 64  # of arrays of so many numbers at most
 NODES = 4  # simulated by one program: the plant is simulated again for each so many nodes, which costs a tenth
 
 
-def native(
+def compile_runs(
     world: World,
     inputs: np.ndarray,
     key: jax.Array,
@@ -204,7 +204,7 @@ def _collect_smoothed(
     return reduce_run(reducer, later, outputs)
 
 
-def natively(
+def simulate_natively(
     network: Network,
     inputs: np.ndarray,
     key: jax.Array,
@@ -270,10 +270,10 @@ def code_of_network(
     parts: int = 1,
     precision: Precision = "float64",
 ) -> Native:
-    """Make the native code of a network's runs, as `native` of its world; a part of it may be smoothed."""
+    """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
     filters = AllFilters(network, smoothing and smoothing.kinds)
-    world = World(network.plant, medium_of(network), filters)
-    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, precision)
+    world = World(network.plant, make_reception(network), filters)
+    return compile_runs(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, precision)
 
 
 def _run_chunks(
@@ -286,5 +286,5 @@ def _run_chunks(
 ) -> Recorded:
     """Sums over all runs, and what is collected of them, chunk by chunk; `memory` as that of `NativeLanes`."""
     lanes = NativeLanes(code, first_run, first_run + runs, [] if memory is None else memory)
-    parts = in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)
+    parts = advance_in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)
     return lanes.total()._replace(collected=lanes.joined(parts))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from heliograph.engine.choice import chosen, threads
+from heliograph.engine.choice import choose_code, threads
 from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import fully_optimised, to_numpy
 from heliograph.numerics.masked import fill_masked
@@ -39,7 +39,7 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
     # Native code where it supports the function.
-    choice = chosen(function, values, [True] * len(values))
+    choice = choose_code(function, values, [True] * len(values))
     return choice.results() if choice.code is not None else _apply_by_xla(function, values, width)
 
 

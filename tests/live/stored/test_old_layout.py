@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.live.stored.layout import (
+from heliograph.live.stored.old_layout import (
     can_read,
     describe_old_layout,
     factorise,

@@ -56,7 +56,9 @@ class LossChain(NamedTuple):
         return float((self.initial * self.loss @ np.linalg.matrix_power(moved * self.loss, count - 1)).sum())
 
 
-def sender_status(trigger: AbstractTrigger, losses: LossChain, last: int | None, final: int, now: int) -> SenderStatus:
+def make_sender_status(
+    trigger: AbstractTrigger, losses: LossChain, last: int | None, final: int, now: int
+) -> SenderStatus:
     """The status where the newest value is of step `last`, the newest final step `final` and the present one `now`."""
     begun = -1 if last is None else last
     silent, provisional = max(final - begun, 0), max(now - max(final, begun), 0)

@@ -9,7 +9,7 @@ pytest.importorskip("rosbags")
 from rosbags.interfaces import Nodetype
 
 import heliograph as hg
-from heliograph.files.bags.layout import Decoder
+from heliograph.files.bags.message_layout import Decoder
 from tests.files import bags
 
 KINDS = bags.STORE.types

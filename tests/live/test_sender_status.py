@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.senders import LossChain
+from heliograph.live.sender_status import LossChain
 
 PLANT, SENSOR = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
 LOSSY = hg.erasure(hg.perfect(), 0.8)

@@ -70,7 +70,7 @@ def test_who_interrupts_keeps_the_best_so_far(monkeypatch, last):
             PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {}, trigger=hg.SendOnDelta(hg.free(0.45, "delta")))}
         )
 
-    monkeypatch.setattr("heliograph.learning.senders.log_likelihood", stopping)
+    monkeypatch.setattr("heliograph.learning.sender_fit.log_likelihood", stopping)
     fitted = hg.fit(build, {"a": np.arange(40.0)[:, None]}, starts=2)
     (row,) = fitted.rows()
     assert fitted.stopped == (last < 10_000) and np.isfinite(row.estimate) and "delta" in str(fitted)
@@ -85,7 +85,7 @@ def test_who_interrupts_before_the_first_point_has_nothing(monkeypatch):
     def stopping(filter, z, u):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("heliograph.learning.senders.log_likelihood", stopping)
+    monkeypatch.setattr("heliograph.learning.sender_fit.log_likelihood", stopping)
 
     def build():
         node = hg.Node(SENSOR, hg.perfect(), {}, trigger=hg.SendOnDelta(hg.free(0.45, "delta")))

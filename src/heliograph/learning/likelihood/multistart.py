@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.learning.likelihood.maximise import MOST_STEPS, NEAR, Maximum, maximise
 from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, Maximum, maximise
 from heliograph.numerics.types import Bool, Float
 
 HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its number may as well be the end of its domain
