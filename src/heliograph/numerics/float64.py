@@ -69,6 +69,15 @@ def _compile_at_call(
 
 
 @cache
+def in_haste() -> Options:
+    """Return the options for a long program that takes few steps: without optimisation it is compiled in a third.
+
+    Of twelve event filters of twelve states the step then takes 0.09 ms for 0.01, and compiles in 11 s for 31.
+    """
+    return {name: 0 if name == LEVEL else value for name, value in understood().items()}
+
+
+@cache
 def understood() -> Options:
     """Return those of the options that this release of the compiler knows: they are not part of its promises.
 

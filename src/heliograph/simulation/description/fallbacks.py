@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from heliograph.disk.quoting import join_names
 from heliograph.engine.choice import explain_refusal
 from heliograph.filters.base import AbstractFilter
+from heliograph.model.sensor import without_output_names
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.mesh import DENSE, build_mesh
 from heliograph.simulation.network import Network
@@ -28,7 +29,8 @@ def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     places = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
     for where, filters in (*places, ("", central)):
-        for label, filter in filters.items():
+        for label, named in filters.items():
+            filter = without_output_names(named)  # so that filters of one structure are compiled once
             z, u = jnp.zeros(filter.received), jnp.zeros(len(filter.inputs))
             state = jax.tree.map(jnp.asarray, filter.init())
             if why := explain_refusal(_step, filter, state, z, u, jnp.asarray(0)):

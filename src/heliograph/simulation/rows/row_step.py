@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.float64 import in_float64, understood
+from heliograph.numerics.float64 import in_float64, in_haste, understood
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.flat import Flat, flat_like, row_of
 from heliograph.numerics.trees.program_text import text_of
@@ -134,7 +134,7 @@ class RowStep:
             stepped: np.ndarray = self._code(rows)
             return stepped
         width, together = (1, 1) if alone else self._block
-        run = _compile_xla(self._layout, self.outputs, width, together)
+        run = _compile_xla(self._layout, self.outputs, width, together, self._block[1] == 1)
         done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
         for begin in range(0, len(rows), width):
             count = min(width, len(rows) - begin)
@@ -192,8 +192,11 @@ def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
 
 
 @lru_cache
-def _compile_xla(layout: Layout, outputs: Flat, width: int, together: int) -> PyTree:
-    """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns."""
+def _compile_xla(layout: Layout, outputs: Flat, width: int, together: int, is_long: bool) -> PyTree:
+    """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns.
+
+    `is_long`: a row is so long that it is stepped alone, which compilation would take longer than all steps to come.
+    """
     step = _make_row_function(layout)
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
@@ -206,4 +209,4 @@ def _compile_xla(layout: Layout, outputs: Flat, width: int, together: int) -> Py
         stepped: jax.Array = jax.lax.fori_loop(0, turns, turn, jnp.zeros((width, columns)))
         return stepped
 
-    return jax.jit(run, compiler_options=understood())
+    return jax.jit(run, compiler_options=in_haste() if is_long else understood())
