@@ -9,6 +9,7 @@ import re
 import socket
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
+from functools import partial
 from importlib.resources import files
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from heliograph.live.event import VERDICTS
 from heliograph.numerics.check import fail
 from heliograph.report.outputs import summarise_output
+from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.overview import make_plants_page
 from heliograph.serving.observation.watch import LISTED, Watch
 
@@ -37,7 +39,8 @@ class Tallies(Collector):
     def __init__(self, watch: Watch):
         self.watch = watch
         watch.registry.register(self)
-        self._last = b""
+        text = partial(generate_latest, watch.registry)
+        self._texts = LastAnswers(watch.lock, lambda _: text(), text())
 
     def collect(self) -> Iterable[Metric]:
         """Yield the current metrics."""
@@ -53,12 +56,7 @@ class Tallies(Collector):
 
     def text(self) -> bytes:
         """Return all metrics as text; while a batch takes long, as where programs compile, those before it."""
-        if self.watch.lock.acquire(timeout=PATIENCE if self._last else -1.0):
-            try:
-                self._last = generate_latest(self.watch.registry)
-            finally:
-                self.watch.lock.release()
-        return self._last
+        return self._texts.ask()
 
 
 def _yield_plant_metrics(watch: Watch) -> Iterable[Metric]:
@@ -152,7 +150,6 @@ def _collect_outputs(watch: Watch) -> Iterable[Metric]:
 
 
 SHOWN = 50  # plants with metrics of their own; of more the worst
-PATIENCE = 1.0  # seconds that a batch may take before the metrics before it are told
 STUCK = 60.0  # seconds after which a batch that is being taken is no sign of health
 NIS = {
     "nis": "Normalised innovation squared of what a filter used over its expectation, of a plant's last rows; 1.",
@@ -222,12 +219,18 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+def list_plants(watch: Watch) -> str:
+    """Return the page of all plants, the worst first."""
+    return make_plants_page(watch.title, {name for name, _ in watch.plants()}, watch.worst(), LISTED)
+
+
 def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: Sequence[str] = ()) -> Starlette:
     """Return the web application: the page at /, its data at /events until `stopped`, metrics at /metrics.
 
     Without a token, or where `hosts` are given, it answers to these names and those of this machine alone.
     """
     tallies = Tallies(watch)
+    overview = LastAnswers(watch.lock, lambda _: list_plants(watch), list_plants(watch))
 
     # The first view is written into the page; all others come from /events.
     def page(request: Request) -> Response:
@@ -243,9 +246,7 @@ def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, ho
         return StreamingResponse(_yield_events(watch, request, stopped), media_type="text/event-stream")
 
     def plants(_: Request) -> Response:
-        with watch.lock:
-            text = make_plants_page(watch.title, {name for name, _ in watch.plants()}, watch.worst(), LISTED)
-        return Response(text, media_type="text/html", headers=POLICY)
+        return Response(overview.ask(), media_type="text/html", headers=POLICY)
 
     # It says only that the service serves, so that it needs no token.
     def health(_: Request) -> Response:

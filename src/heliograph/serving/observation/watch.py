@@ -18,6 +18,7 @@ from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
 from heliograph.report.outputs import RecentOutputs, make_output_row
+from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.overview import Overview, Wrong
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observed_service import ObservedService, Serves, Taken, WatchedPlant
@@ -57,6 +58,15 @@ class Point(NamedTuple):
     estimates: dict[str, dict[str, dict[str, object]]]
 
 
+class FromServices(NamedTuple):
+    """What the page tells of the services themselves: the names of all plants, and of one plant its links."""
+
+    names: list[str]
+    links: dict[str, dict[str, int]]
+    malformed: int
+    wrong: int
+
+
 class Watch:
     """Observer of any number of services of one network; a call from another thread waits for the current batch.
 
@@ -81,7 +91,9 @@ class Watch:
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused, self.uncounted = dict(fused or {}), uncounted
         # Of all plants together, of each plant, and histograms.
-        self.lock, self._count = threading.Lock(), 0
+        self.lock, self._count = threading.Lock(), 0  # held for a batch
+        self._noting = threading.Lock()  # held while outputs are recorded
+        self._told = LastAnswers(self.lock, self._ask_services, FromServices([], {}, 0, 0), PLANTS)
         self.services: list[Serves] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
         self.outputs = RecentOutputs(MEMORY, names or {})
@@ -114,6 +126,10 @@ class Watch:
 
     def note(self, outputs: Sequence[Output], last: Taken | None) -> None:
         """Record the outputs and statistics of a batch; None where nothing came."""
+        with self._noting:
+            self._record(outputs, last)
+
+    def _record(self, outputs: Sequence[Output], last: Taken | None) -> None:
         if last is not None:
             self.took.observe(last.took)
             self.committed.observe(last.committed)
@@ -205,20 +221,22 @@ class Watch:
         return total
 
     def view(self, plant: str | None, since: int = 0) -> dict[str, Any]:
-        """Return the data of the page for a plant (None: the one with the newest message), after the point `since`."""
-        with self.lock:
-            # Plants by name may be in several services: counts are summed.
+        """Return the data of the page for a plant (None: the one with the newest message), after the point `since`.
+
+        While a batch is being taken, as where programs compile, the counts are those before it.
+        """
+        with self._noting:
             name = next(reversed(self._points), "") if plant is None else plant
-            results = [status for known, status in self.plants() if known == name]
+        told = self._told.ask(name)
+        with self._noting:
             points = [point for point in self._points.get(name, ()) if point.number > since]
             tests, senders = self._tests.get(name, {}), self._senders.get(name, {})
             health = self._outputs[name].health() if name in self._outputs else []
-            names = sorted(known for known, _ in self.plants())
             # One JSON object; lists are bounded, so that its size does not grow with the plants.
             return {
                 "title": self.title,
-                "count": len(names),
-                "plants": names[:LISTED],
+                "count": len(told.names),
+                "plants": told.names[:LISTED],
                 "plant": name,
                 "states": self.states,
                 "units": [unit_of(state) for state in self.states],
@@ -226,15 +244,25 @@ class Watch:
                 "since": since,
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
-                "links": self._hide_uncounted(_add_counts(results)),
+                "links": self._hide_uncounted(told.links),
                 "senders": senders,
                 "tests": [_make_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
                 "outputs": [make_output_row(output) for output in health],
-                "warnings": list(self._yield_warnings(results, tests, senders))[:WARNINGS],
-                "malformed": sum(service.malformed for service in self.services),
+                "warnings": list(self._yield_warnings(told.links, tests, senders))[:WARNINGS],
+                "malformed": told.malformed,
                 "all": self.links(),
-                "wrong": len(self.worst()),
+                "wrong": told.wrong,
             }
+
+    def _ask_services(self, plant: str) -> FromServices:
+        """Ask the services, between two batches, for their plants, and for the counts of one, summed over them."""
+        every = list(self.plants())
+        return FromServices(
+            sorted(name for name, _ in every),
+            _add_counts([status for name, status in every if name == plant]),
+            sum(service.malformed for service in self.services),
+            len(self.worst()),
+        )
 
     def fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
         """Return the check of each fusion of estimates that has no test of itself, by the claims of what it fuses."""
@@ -250,11 +278,11 @@ class Watch:
 
     def _yield_warnings(
         self,
-        plants: Sequence[WatchedPlant],
+        links: Mapping[str, Mapping[str, int]],
         tests: Mapping[tuple[str, str], RunningNis],
         senders: Mapping[str, Mapping[str, Any]],
     ) -> Iterator[str]:
-        """Yield what is wrong with plants, a line each: doubted filters, dead senders, then messages by count."""
+        """Yield what is wrong with a plant, a line each: doubted filters, dead senders, then messages by count."""
         # Filters that are doubted, senders that are dead, then the nodes' messages.
         for (node, filter_name), test in tests.items():
             if doubt := test.doubt():
@@ -263,7 +291,6 @@ class Watch:
             if sender["dead"]:
                 chance = f"by chance once in {1 / sender['chance']:,.0f}" if sender["chance"] else "never by chance"
                 yield f"{node}: its sender is dead: {sender['missed']} heartbeats did not come, {chance}"
-        links = _add_counts(plants)
         for name, words in COUNTED.items():
             of = sorted(node for node in links if links[node][name])
             # A line for each node, or one for many.
@@ -295,7 +322,7 @@ def _deviation_of(variance: float | None) -> float | None:
     return None if variance is None else math.sqrt(max(variance, 0.0))
 
 
-def _add_counts(plants: Iterator[WatchedPlant] | Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
+def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
     """Sum the counts of several plants, by node."""
     results: dict[str, dict[str, int]] = {}
     for plant in plants:

@@ -1,0 +1,36 @@
+"""Answers that are computed between batches; while one is being taken, those before it."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+PATIENCE = 1.0  # seconds that a batch may take before the answer before it is told
+
+
+class LastAnswers(Generic[T]):
+    """Answers to a kind of question about a service, the last of each kept: a batch may take minutes to compile.
+
+    Args:
+        lock: that which is held while a batch is taken.
+        answer: computes the answer to a question, of what does not change while the lock is held.
+        begin: the answer to a question that was not asked before.
+        most: answers that are kept, those that were asked for last.
+    """
+
+    def __init__(self, lock: threading.Lock, answer: Callable[[str], T], begin: T, most: int = 1):
+        self.lock, self.answer, self.begin, self.most = lock, answer, begin, most
+        self._last: OrderedDict[str, T] = OrderedDict()
+
+    def ask(self, question: str = "") -> T:
+        """Return the answer of now, or after `PATIENCE` that before the batch which is being taken."""
+        if self.lock.acquire(timeout=PATIENCE):
+            try:
+                self._last[question] = self.answer(question)
+                self._last.move_to_end(question)
+                while len(self._last) > self.most:
+                    self._last.popitem(last=False)
+            finally:
+                self.lock.release()
+        return self._last.get(question, self.begin)
