@@ -1,7 +1,7 @@
 """Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,10 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError, array, fail, instance
+from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, rows_are_messages
+from heliograph.report.constant_error import ConstantError, find_constant_error
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared
@@ -23,8 +25,9 @@ from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, whitened_innovations
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
-FALSE = 0.01  # probability of a false warning by one kind of test, of all filters together
+FALSE = 0.001  # probability of a false warning by one kind of test, of all filters together
 LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below which none is worth a warning
+MOST = 0.5  # share of what is too large, from which one constant error explains it
 LEAST_CORRELATION = 0.1  # below which memory is not worth a warning: it predicts 1 % of the variance
 
 
@@ -44,6 +47,13 @@ class FilterHealth:
     trusted: bool = True  # whether the network relies on it
     declared: DeclaredJudgement | None = None
     unit: str = "steps"
+    off: ConstantError | None = None  # of one output of several, where that explains most of what is doubtful
+    nothing_else: bool = False  # whether it explains all
+
+    @property
+    def numbers(self) -> int:
+        """Return how many innovations were tested; 0 where they are not known."""
+        return 0 if self.white is None else int(np.count_nonzero(~np.isnan(self.white)))
 
 
 @dataclass(frozen=True)
@@ -107,36 +117,54 @@ class Health:
         """Say which claims innovations contradict: the size of each output's, of all together, and their memory."""
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
+        if health.off is not None:
+            yield _say_off(name, health.off)
+            if health.nothing_else:
+                return
         said = [] if health.declared is None else health.declared.sentences(health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)
         if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
             return
-        test = health.test
-        # Many filters are tested: each at a level at which all together are seldom wrong (Bonferroni).
-        level = FALSE / sum(filter.test is not None for filter in self.filters)
+        yield from self._describe_sizes(health, health.test)
+        if self._has_memory(health, health.test):
+            yield _say_memory(name, health.test)
+
+    def _level(self) -> float:
+        """Return the level of a test of one filter: all together are seldom wrong (Bonferroni)."""
+        return FALSE / sum(filter.test is not None for filter in self.filters)
+
+    def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
+        """Say of which outputs the mean square of innovations is not what is claimed."""
+        name, level = f"{health.node}/{health.filter}", self._level()
         outputs = [e for e in self.outputs if (e.node, e.filter) == (health.node, health.filter)]
         weighs = any(output.weighs for output in outputs)
         # Each output by itself, since a mean over outputs hides the one that is wrong; all together where none is.
-        sizes = {e.judged.output: (e.judged.size, e.judged.size_error)
+        sizes = {e.judged.output: (e.judged.size, e.judged.size_error, e.judged.summary.received)
                  for e in outputs if e.judged.summary.received > LAGS}  # fmt: skip
-        wrong = {output: _compare_with_claim(*size, level / len(sizes)) for output, size in sizes.items()}
+        wrong = {output: compare_with_claim(*size, level / len(sizes)) for output, size in sizes.items()}
         if not any(wrong.values()):
-            sizes, wrong = (
-                {"": (test.power, test.power_error)},
-                {"": _compare_with_claim(test.power, test.power_error, level)},
-            )
+            sizes = {"": (test.power, test.power_error, health.numbers)}
+            wrong = {"": compare_with_claim(*sizes[""], level)}
         for sign, say in ((1, _say_overconfident), (-1, _say_underconfident)):
             of = [output for output, departure in wrong.items() if departure == sign and not (weighs and sign < 0)]
             if of:
                 yield say(name, of if len(sizes) > 1 else [""], [sizes[output][0] for output in of])
-        if test.p_value < level and abs(test.correlation[0]) >= LEAST_CORRELATION:
-            yield (
-                f"{name} could know more: each of its innovations is correlated with the one before "
-                f"({test.correlation[0]:.2f}); "
-                "links, sensors or the plant remember what the model forgets. Until that is a state of the model "
-                "(hg.model.with_bias, hg.model.with_past, a link with memory), the size of innovations cannot tell how "
-                "large the errors are"
-            )
+
+    def explains_all(self, health: FilterHealth, off: ConstantError) -> bool:
+        """Ask whether innovations without a constant error are as large as claimed, and have no memory."""
+        level = self._level() / off.squares.shape[1]
+        sizes = [(*average_correlated(column), int(np.count_nonzero(~np.isnan(column)))) for column in off.squares.T
+                 if np.any(~np.isnan(column))]  # fmt: skip
+        test = _test_innovations(off.white)
+        return not any(compare_with_claim(*size, level) for size in sizes) and not (
+            test is not None and self._has_memory(health, test)
+        )
+
+    def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
+        """Ask whether innovations are correlated with those before, by more than a few numbers have by chance."""
+        by_chance = -ndtri(self._level() / 2) / np.sqrt(health.numbers) if health.numbers else 0.0
+        least = max(LEAST_CORRELATION, by_chance)
+        return test.p_value < self._level() and abs(test.correlation[0]) >= least
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
         """Say of which outputs a filter that weighs left out most, as `heliograph.run` does."""
@@ -147,15 +175,17 @@ class Health:
                 )
 
 
-def _compare_with_claim(size: float, error: float, level: float) -> int:
-    """Return 1 or -1 where a mean square is above or below its claim by its interval and by a tenth; else 0.
+def compare_with_claim(size: float, error: float, numbers: int, level: float) -> int:
+    """Return 1 or -1 where a mean square of so many numbers is off its claim by its interval and by a tenth; else 0.
 
     The logarithm of a mean square is nearly Gaussian, with its relative error; one that came out small has a small
-    error too.
+    error too. An error that a few numbers tell is itself known to some 1 / sqrt(2 N), so that it counts no less than
+    sqrt(2 / N), which is that of N independent Gaussian numbers.
     """
     if not (size > 0 and error > 0):
         return 0
-    sure = max(-ndtri(level / 2) * error / size, np.log(LEAST_SIZE))
+    relative = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
+    sure = max(-ndtri(level / 2) * relative, np.log(LEAST_SIZE))
     return int(np.sign(np.log(size))) if abs(np.log(size)) > sure else 0
 
 
@@ -170,6 +200,25 @@ def _say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]
     return (
         f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
         "something out"
+    )
+
+
+def _say_memory(name: str, test: MemoryTest) -> str:
+    """The sentence on innovations that are correlated in time."""
+    return (
+        f"{name} could know more: each of its innovations is correlated with the one before "
+        f"({test.correlation[0]:.2f}); "
+        "links, sensors or the plant remember what the model forgets. Until that is a state of the model "
+        "(hg.model.with_bias, hg.model.with_past, a link with memory), the size of innovations cannot tell how "
+        "large the errors are"
+    )
+
+
+def _say_off(name: str, off: ConstantError) -> str:
+    """The sentence on the one output whose constant error leaves nothing else doubtful."""
+    return (
+        f"{name} is off by a constant error of {off}: it pulls the estimates, and makes innovations of the others "
+        "larger too. hg.model.with_bias makes it a state, which the filter then estimates"
     )
 
 
@@ -222,9 +271,23 @@ def examine(
         unit = _time_unit(record) if TIME_STEP in network.inputs else "steps"
         filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit))
     others = tuple(belief.words for belief in network.beliefs())
-    return Health(
+    health = Health(
         record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
     )
+    return replace(health, filters=[_explain(network, health, judged, inputs) for judged in filters])
+
+
+def _explain(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> FilterHealth:
+    """Find the constant error of one output that explains what is doubtful in a filter of several."""
+    if not judged.trusted or judged.test is None or judged not in health.doubted():
+        return judged
+    every = listeners(network, health.record)
+    listener = next(one for one in every if (one.node, one.name) == (judged.node, judged.filter))
+    off = find_constant_error(listener.outputs, listener.filter, listener.measurements, inputs)
+    if off is None:
+        return judged
+    nothing_else = health.explains_all(judged, off)
+    return replace(judged, off=off, nothing_else=nothing_else) if nothing_else or off.explained > MOST else judged
 
 
 def _judge_declared(filter: AbstractFilter, z: np.ndarray, inputs: np.ndarray) -> DeclaredJudgement | None:

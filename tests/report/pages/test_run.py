@@ -225,12 +225,12 @@ def test_many_filters_do_not_make_a_doubt_of_chance(health):
         of = [FilterHealth("a", f"f{i}", "exact", None, quiet if i else test) for i in range(count)]
         return replace(health, filters=of, links=[], outputs=[]).warnings()
 
-    # Normal quantiles of 1 % and 1 % / 20, both sides: 2.58 and 3.48 relative errors of 0.1.
-    for count, errors in ((1, 2.58), (20, 3.48)):
+    # Normal quantiles of 0.1 % and 0.1 % / 20, both sides: 3.29 and 4.06 relative errors of 0.1.
+    for count, errors in ((1, 3.29), (20, 4.06)):
         for sign in (-1, 1):
             assert judged(np.exp(sign * 0.1 * (errors - 0.02)), 0.5, count) == []
             assert len(judged(np.exp(sign * 0.1 * (errors + 0.02)), 0.5, count)) == 1
-    assert len(judged(1.0, 0.009, 1)) == 1 and judged(1.0, 0.009, 20) == []
+    assert len(judged(1.0, 0.0009, 1)) == 1 and judged(1.0, 0.0009, 20) == []
 
 
 def test_the_title_is_the_result_and_doubts_follow(health):

@@ -1,0 +1,133 @@
+"""A constant error of one sensor of several, found by what it does to all innovations of the filter that joins them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.types import Float
+from heliograph.report.outputs import round_to
+
+SMALL = 1e-3  # of an innovation's deviation: the step by which responses are found
+MOST = 24  # outputs of which each is tried
+CLEAR = 2 * np.log(1000)  # of twice the logarithm of a likelihood ratio: 1000 to 1
+LARGEST = 10.0  # response to a step of one: beyond it an angle went around
+
+
+class ConstantError(NamedTuple):
+    """The output whose constant error explains innovations best.
+
+    Args:
+        outputs: names of the outputs, of which one has the error; several where they cannot be told apart.
+        error: the error of the first of them, in the output's unit.
+        standard_error: its standard error if all else is as the model says.
+        explained: share of what squared innovations are too large by that goes with it.
+        squares: squares over their variances of the innovations without what it does to them (time, m).
+        white: these innovations in units of the filter's claim (time, m).
+    """
+
+    outputs: tuple[str, ...]
+    error: float
+    standard_error: float
+    explained: float
+    squares: np.ndarray
+    white: np.ndarray
+
+    def __str__(self) -> str:
+        """Name the output and its error, such as "c: y, of 0.93 ± 0.04"."""
+        half = 1.96 * self.standard_error
+        size = f"{round_to(self.error, self.standard_error)} ± {round_to(half, self.standard_error)}"
+        return f"{' or '.join(self.outputs)}, of {size}"
+
+
+def find_constant_error(
+    names: Sequence[str],
+    filter: AbstractFilter,
+    measurements: Float[np.ndarray, "time m"],
+    inputs: Float[np.ndarray, "time inputs"],
+) -> ConstantError | None:
+    """Find the one output of several whose constant error explains innovations best; None where there is none.
+
+    A constant b added to output j moves the innovations e of a filter by b r_j, of which the response r_j is found by
+    adding a small step. With S their covariance, twice the logarithm of the likelihood ratio of b over 0 is greatest at
+    b = sum r_j' S^-1 e / sum r_j' S^-1 r_j, and is (sum r_j' S^-1 e)^2 / sum r_j' S^-1 r_j there (the generalised
+    likelihood ratio of Willsky and Jones). So the one that is off is told from those that it pulls away with it.
+
+    Args:
+        names: of the outputs (m).
+        filter: a filter that claims a covariance.
+        measurements: what it received (time, m), NaN where nothing arrived.
+        inputs: its inputs (time, inputs).
+    """
+    if not 2 <= len(names) <= MOST:
+        return None
+    outcome = filter.run(measurements, inputs)
+    e, s = np.asarray(outcome.innovations), np.asarray(outcome.innovation_covariances)
+    there, variance = ~np.isnan(e), np.diagonal(s, axis1=1, axis2=2)
+    deviations = np.sqrt([np.median(v[t]) if t.any() else 0.0 for v, t in zip(variance.T, there.T, strict=True)])
+    whiten = _inverse_roots(s, there)
+    white = np.einsum("tij,tj->ti", whiten, np.where(there, e, 0.0))
+    tried = []
+    for j in np.flatnonzero((deviations > 0) & np.isfinite(deviations)):
+        response = np.where(there, _find_response(filter, measurements, inputs, e, int(j), deviations), 0.0)
+        of_white = np.einsum("tij,tj->ti", whiten, response)
+        weight, agreement = float(np.sum(of_white**2)), float(np.sum(of_white * white))
+        if weight > 0 and np.isfinite(agreement):
+            tried.append(
+                _Tried(agreement**2 / weight, names[int(j)], agreement / weight, weight**-0.5, response, of_white)
+            )
+    if not tried:
+        return None
+    best = max(tried, key=lambda one: one.gain)
+    others = tuple(one.output for one in tried if one is not best and best.gain - one.gain < CLEAR)
+    left = np.where(there, e - best.error * best.response, np.nan)
+    too_large = float(np.sum(white**2)) - np.count_nonzero(there)
+    return ConstantError(
+        (best.output, *others),
+        best.error,
+        best.standard_error,
+        best.gain / too_large if too_large > 0 else 0.0,
+        left**2 / np.where(variance > 0, variance, np.nan),
+        np.where(there, white - best.error * best.white, np.nan),
+    )
+
+
+class _Tried(NamedTuple):
+    """The likeliest error of one output, and what it does; gain: twice the logarithm of the likelihood ratio."""
+
+    gain: float
+    output: str
+    error: float
+    standard_error: float
+    response: np.ndarray
+    white: np.ndarray
+
+
+def _find_response(
+    filter: AbstractFilter,
+    measurements: Float[np.ndarray, "time m"],
+    inputs: Float[np.ndarray, "time inputs"],
+    innovations: Float[np.ndarray, "time m"],
+    output: int,
+    deviations: Float[np.ndarray, " m"],
+) -> Float[np.ndarray, "time m"]:
+    """Return the change of all innovations by a step of one in an output, 0 where an angle went around."""
+    step = SMALL * deviations[output]
+    moved = np.array(measurements, dtype=float)
+    moved[:, output] += step
+    response = (np.asarray(filter.run(moved, inputs).innovations) - innovations) / step
+    return np.where(np.abs(response) * deviations[output] < LARGEST * deviations, response, 0.0)
+
+
+def _inverse_roots(s: Float[np.ndarray, "time m m"], there: Float[np.ndarray, "time m"]) -> np.ndarray:
+    """Return S^(-1/2) over the components that arrived, by row; zero for the others."""
+    both = np.asarray(there[:, :, None] & there[:, None, :])
+    eye = np.eye(s.shape[1])
+    filled = np.where(both, s, eye)
+    sound = np.asarray(np.isfinite(filled).all(axis=(1, 2)))
+    filled = np.where(sound[:, None, None], filled, eye)
+    values, vectors = np.linalg.eigh(filled)
+    root = np.where(values > 0, np.abs(values), np.inf) ** -0.5
+    inverse = np.einsum("tij,tj,tkj->tik", vectors, root, vectors)
+    return np.asarray(np.where(both & sound[:, None, None], inverse, 0.0))
