@@ -20,7 +20,8 @@ INSIDE = """[...document.querySelectorAll('body *')].filter(part => part.scrollW
 def wrong(browser: Browser, page: str) -> list[str]:
     """What is wrong with a page, a file or what a server on this machine tells."""
     served = page.startswith("http://127.0.0.1:")
-    local = ("file:", "data:", page) if served else ("file:", "data:")
+    server = ("/".join([*page.split("/")[:3], ""]),) if served else ()
+    local = ("file:", "data:", *server)
     results = []
     for width in WIDTHS:
         seen = browser.open(page if served else Path(page).resolve().as_uri(), width)

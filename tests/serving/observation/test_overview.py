@@ -40,6 +40,16 @@ def metrics(text):
     return dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
 
 
+@pytest.mark.real("browser")
+def test_what_is_wrong_is_read_on_a_phone(fits):
+    """It stood to the right of a window of 400 pixels, in one long line."""
+
+    async def look(url):
+        await asyncio.to_thread(fits, f"{url}/plants")
+
+    looked(fleet(6)[0], look)
+
+
 @pytest.mark.parametrize("count", [20, 60])
 def test_one_wrong_plant_of_many_is_seen(count):
     """Pooled, its ratio of 16 is hardly seen; where there are many plants the worst have metrics of their own."""

@@ -103,11 +103,11 @@ PAGE = """<!doctype html>
 <header><p class="kicker">heliograph, live</p><h1>{title}: {count:,} plants, {wrong:,} with something wrong</h1>
 <p class="note">The worst first: dead senders, then filters whose innovations are not what they claim, then messages
 that were refused.{more}</p></header>
-<main><div class="scroll" tabindex="0"><table>
-<thead><tr><th scope="col">plant</th><th scope="col">what is wrong</th></tr></thead>
+<main><table>
+<thead><tr><th scope="col">plant</th><th scope="col" class="words">what is wrong</th></tr></thead>
 <tbody>
 {rows}
-</tbody></table></div></main>
+</tbody></table></main>
 </body>
 </html>
 """
@@ -120,7 +120,7 @@ def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[Wrong]
     rows += [(plant, "nothing", "fine") for plant in sorted(plants) if plant not in named]
     lines = [
         f'<tr><th scope="row"><a href="./?plant={quote(plant, safe="")}">{escape(plant) or "(no name)"}</a></th>'
-        f'<td class="{kind}">{said}</td></tr>'
+        f'<td class="words {kind}">{said}</td></tr>'
         for plant, said, kind in rows[:most]
     ]
     more = f" The first {most:,} are shown." if len(rows) > most else ""

@@ -39,9 +39,9 @@ LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0
 
 COUNTED = {  # of a node's messages
     "late": "came too late to be used; a longer --window would hold what they change",
-    "future": "are later than they can be; its clock is wrong",
-    "implausible": "are implausible and were refused; their lines say why",
-    "dropped": "values are beyond its limits, or codes, and count as not arrived",
+    "future": "of a time that is not yet, refused; its clock is wrong",
+    "implausible": "implausible and refused; the refused lines say why",
+    "dropped": "beyond its limits, or codes, counted as not arrived",
     "conflict": "came again with other values; the first stayed",
 }
 

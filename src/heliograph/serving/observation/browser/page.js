@@ -230,7 +230,7 @@ function links(view) {
     const link = view.links[node] || { used: 0, lost: 0, late: 0, duplicate: 0 };
     const checks = view.tests.filter((test) => test.node === node);
     const doubted = checks.some((test) => test.doubt);
-    const judged = made("td", checks.length ? (doubted ? "doubtful" : "hold") : "", doubted ? "doubt" : "fine");
+    const judged = made("td", checks.length ? (doubted ? "doubtful" : "not refuted") : "", doubted ? "doubt" : "fine");
     const counts = [link.used, link.lost, link.late, link.duplicate];
     return row(node, [...counts.map(counted), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
   }));
@@ -240,7 +240,7 @@ function tests(view) {
   const some = new Map(searched(view).map((node, i) => [node, node === "fused" ? -1 : i]));
   const rows = view.tests.filter((test) => some.has(test.node)).sort((a, b) => some.get(a.node) - some.get(b.node) || a.filter.localeCompare(b.filter));
   at("tests").replaceChildren(...rows.map((test) => row(test.node + "/" + test.filter, [test.claim, ...(test.by.length
-    ? [made("td", test.doubt ? "doubtful" : "holds", test.doubt ? "doubt" : "fine"), "by " + listed(test.by)]
+    ? [made("td", test.doubt ? "doubtful" : "not refuted", test.doubt ? "doubt" : "fine"), "by " + listed(test.by)]
     : [made("td", two(test.ratio), test.doubt ? "doubt" : "fine"), two(test.low) + " to " + two(test.high)])])));
 }
 
