@@ -101,4 +101,18 @@ def test_nobody_knows_when_messages_of_others_are_rows():
     came = np.zeros(400, dtype=bool)
     came[np.cumsum(RNG.integers(1, 6, 100))] = True
     link = arrivals(came, of_messages=True)
-    assert link.due_in == "not known" and link.due is None and not link.lost_rows.any()
+    assert link.due_in == "not known" and link.due is None and not len(link.lost_times)
+
+
+@pytest.mark.parametrize("dated", [False, True])
+def test_what_a_slow_sender_lost_is_drawn_when_it_was_due(dated):
+    """One each 0.5 among rows each 0.1: the lost ones lie between the others, and one behind the last."""
+    time = np.arange(100) / 10
+    came = np.zeros(100, dtype=bool)
+    came[3::5] = True
+    came[[23, 28, 98]] = False
+    times = np.datetime64("2026-01-01T00:00:00", "ns") + (time * 1e9).astype("timedelta64[ns]") if dated else time
+    link = Arrivals("a", "y", times, came, np.zeros(came.sum()), True, of_messages=True)
+    lost = link.lost_times
+    lost = (lost - times[0]) / np.timedelta64(1, "s") if dated else lost
+    np.testing.assert_allclose(lost, [2.3, 2.8], atol=1e-6)  # the last interval is not over: less than a quarter late

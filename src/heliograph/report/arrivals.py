@@ -122,11 +122,20 @@ class Arrivals:
         return f"{some}, each {self.period:.4g}" if some else f"each {self.period:.4g}"
 
     @property
-    def lost_rows(self) -> Bool[np.ndarray, " time"]:
-        """Mask of the rows in which it was due and did not come; none of a sender that is slower than the rows."""
-        if self.slots is None or self.period is not None:
-            return np.zeros(len(self.arrived), dtype=bool)
-        return ~self.arrived if self.pattern is None else ~self.arrived & self.pattern.rows
+    def lost_times(self) -> np.ndarray:
+        """Times at which it was due and did not come; of a sender that is slower than the rows between its arrivals."""
+        if self.slots is None or not self.arrived.any():
+            return self.time[:0] if self.slots is None else self.time
+        due = np.ones(len(self.slots), dtype=bool) if self.pattern is None else self.pattern.rows
+        lost = np.flatnonzero(~self.slots & due)
+        if self.period is None:
+            return self.time[lost]
+        clock, came = _clock(self.time), np.flatnonzero(self.slots)
+        times = clock[self.arrived]
+        if len(came) != len(times):  # several that came in one slot
+            times = np.interp(came, [came[0], max(came[-1], came[0] + 1)], [times[0], times[-1]])
+        at = np.interp(lost, came, times) + np.maximum(lost - came[-1], 0) * self.period
+        return np.asarray(self.time[0] + at * np.timedelta64(10**9, "ns") if self.time.dtype.kind == "M" else at)
 
     @property
     def due(self) -> int | None:

@@ -27,6 +27,7 @@ from heliograph.simulation.results.whiteness import MemoryTest, whitened_innovat
 LAGS = 10  # of the test for memory, with ten rows for each at least
 FALSE = 0.001  # probability of a false warning by one kind of test, of all filters together
 LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below which none is worth a warning
+PULLED = 0.25  # of the largest excess of a mean square over its claim: what is less goes with it
 MOST = 0.5  # share of what is too large, from which one constant error explains it
 LEAST_CORRELATION = 0.1  # below which memory is not worth a warning: it predicts 1 % of the variance
 
@@ -84,16 +85,20 @@ class Health:
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
     def held(self) -> dict[tuple[str, str], str]:
-        """Return a line for each output that repeats one value for longer than its noise allows, by node and output."""
+        """Return a line for each output that repeats one value for longer than its noise allows, by node and output.
+
+        Of a node that no filter listens to by itself, the output is known from a central one, by its name there.
+        """
         trusted = {(filter.node, filter.filter) for filter in self.filters if filter.trusted}
+        stuck = {
+            f"{health.node}: {health.judged.output}" if health.node != Network.FUSED else health.judged.output: health
+            for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED)
+            if health.judged.held is not None and (health.node, health.filter) in trusted
+        }
         return {
-            (health.node, health.judged.output): f"{health.node}: {health.judged.output} is stuck, or has no noise: "
-            f"{health.judged.held}, where its noise makes no run as long; what else is said of filters that use it may "
-            "be due to that"
-            for health in self.outputs
-            if health.judged.held is not None
-            and health.node != Network.FUSED
-            and (health.node, health.filter) in trusted
+            (health.node, health.judged.output): f"{name} is stuck, or has no noise: {health.judged.held}, where its "
+            "noise makes no run as long; what else is said of filters that use it may be due to that"
+            for name, health in stuck.items()
         }
 
     def doubted(self) -> list[FilterHealth]:
@@ -118,7 +123,7 @@ class Health:
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
         if health.off is not None:
-            yield _say_off(name, health.off)
+            yield _say_off(name, health.off, health.nothing_else)
             if health.nothing_else:
                 return
         said = [] if health.declared is None else health.declared.sentences(health.unit)
@@ -147,6 +152,9 @@ class Health:
             wrong = {"": compare_with_claim(*sizes[""], level)}
         for sign, say in ((1, _say_overconfident), (-1, _say_underconfident)):
             of = [output for output, departure in wrong.items() if departure == sign and not (weighs and sign < 0)]
+            # One that is far off pulls the estimates, and so makes others a little larger.
+            most = max((sizes[output][0] - 1 for output in of), default=0.0)
+            of = [output for output in of if sign < 0 or sizes[output][0] - 1 >= PULLED * most]
             if of:
                 yield say(name, of if len(sizes) > 1 else [""], [sizes[output][0] for output in of])
 
@@ -214,8 +222,11 @@ def _say_memory(name: str, test: MemoryTest) -> str:
     )
 
 
-def _say_off(name: str, off: ConstantError) -> str:
-    """The sentence on the one output whose constant error leaves nothing else doubtful."""
+def _say_off(name: str, off: ConstantError, nothing_else: bool) -> str:
+    """The sentence on the one output whose constant error leaves nothing else doubtful, or explains most of it."""
+    if not nothing_else:
+        share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
+        return f"{name}: a constant error of {off}, would explain {share}, not all"
     return (
         f"{name} is off by a constant error of {off}: it pulls the estimates, and makes innovations of the others "
         "larger too. hg.model.with_bias makes it a state, which the filter then estimates"

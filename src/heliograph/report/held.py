@@ -37,6 +37,8 @@ def find_held_value(values: Float[np.ndarray, " time"], variance: Float[np.ndarr
     A reading of resolution q whose innovation has variance S equals the one before it with probability at most
     q / sqrt(2 pi S): q times the greatest density. A run of n then begins at one of N readings with probability at
     most N p^(n - 1). The resolution is the least difference of two values; where all values are equal, p = 1/2.
+    A law may repeat a value by itself, as a link that is off gives 0 each time: p is at least the share of the value
+    among the readings outside of the run, and the share of those that equal the one before.
 
     Args:
         values: what was received (time,), NaN where nothing arrived.
@@ -54,10 +56,20 @@ def find_held_value(values: Float[np.ndarray, " time"], variance: Float[np.ndarr
     levels = np.unique(came)
     resolution = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
     density = 1 / np.sqrt(2 * np.pi * float(np.median(variance[rows])))
-    repeats = resolution * density if len(levels) > 1 else 0.5
+    repeats = (
+        max(resolution * density, *_share_outside(came, starts[longest], lengths[longest])) if len(levels) > 1 else 0.5
+    )
     if repeats >= 1:
         return None
-    expected = np.log(len(came)) + (int(lengths[longest]) - 1) * np.log(repeats)
+    expected = np.log(len(came)) + (int(lengths[longest]) - 1) * np.log(max(repeats, 1e-300))
     if lengths[longest] < 3 or expected > np.log(SELDOM):
         return None
     return HeldValue(float(came[starts[longest]]), int(rows[starts[longest]]), int(lengths[longest]), len(came))
+
+
+def _share_outside(came: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
+    """Return the share of a run's value outside of it, and the share of readings there that equal the one before."""
+    outside = np.ones(len(came), dtype=bool)
+    outside[start : start + length] = False
+    equal = (came[1:] == came[:-1])[outside[1:] & outside[:-1]]
+    return float(np.mean(came[outside] == came[start])), float(np.mean(equal)) if len(equal) else 0.0

@@ -201,7 +201,7 @@ def test_many_nodes_have_one_warning_of_a_kind():
         link.late, link.future = i, int(i == 3)
     late, clock = watch.view(None)["warnings"]
     assert late.startswith("node 1, node 2, node 3, node 4: 10 came too late") and clock.startswith(
-        "node 3: 1 are later"
+        "node 3: 1 of a time that is not yet"
     )
 
 

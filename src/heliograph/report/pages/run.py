@@ -145,7 +145,7 @@ def _draw_deliveries(health: Health) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
     axes = figure.subplots()
     for row, link in enumerate(links):
-        lost = link.time[link.lost_rows]
+        lost = link.lost_times
         came = link.time[link.arrived]
         axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
         axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
@@ -334,7 +334,7 @@ def _make_links_section(health: Health, drawings: Mapping[str, bytes]) -> list[T
         "Where each row is a message of some node, nobody knows when another without such an interval is due. A "
         "**gap** counts what was due and did not come."
     )
-    came, lost = any(link.arrived.any() for link in health.links), not all(link.arrived.all() for link in health.links)
+    came, lost = any(link.arrived.any() for link in health.links), any(len(link.lost_times) for link in health.links)
     parts = ["arrived (blue, above)"] * came + ["did not (orange, below)" if came else "did not arrive (orange)"] * lost
     caption = f"When each component {' and when it '.join(parts)}." + ("" if lost else " None is missing.")
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
