@@ -285,7 +285,7 @@ def examine(
     health = Health(
         record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
     )
-    return replace(health, filters=[_explain(network, health, judged, inputs) for judged in filters])
+    return replace(health, filters=[_explain(network, health, judged, u) for judged in filters])
 
 
 def _explain(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> FilterHealth:
