@@ -25,6 +25,7 @@ class ConstantError(NamedTuple):
         explained: share of what squared innovations are too large by that goes with it.
         squares: squares over their variances of the innovations without what it does to them (time, m).
         white: these innovations in units of the filter's claim (time, m).
+        nothing_else: whether these are as the filter claims.
     """
 
     outputs: tuple[str, ...]
@@ -33,6 +34,7 @@ class ConstantError(NamedTuple):
     explained: float
     squares: np.ndarray
     white: np.ndarray
+    nothing_else: bool = False
 
     def __str__(self) -> str:
         """Name the output and its error, such as "c: y, of 0.93 ± 0.04"."""

@@ -48,8 +48,6 @@ class FilterHealth:
     trusted: bool = True  # whether the network relies on it
     declared: DeclaredJudgement | None = None
     unit: str = "steps"
-    off: ConstantError | None = None  # of one output of several, where that explains most of what is doubtful
-    nothing_else: bool = False  # whether it explains all
 
     @property
     def numbers(self) -> int:
@@ -68,6 +66,7 @@ class Health:
     shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
     beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
     forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
+    off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
@@ -122,9 +121,10 @@ class Health:
         """Say which claims innovations contradict: the size of each output's, of all together, and their memory."""
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
-        if health.off is not None:
-            yield _say_off(name, health.off, health.nothing_else)
-            if health.nothing_else:
+        off = self.off.get((health.node, health.filter))
+        if off is not None:
+            yield _say_off(name, off)
+            if off.nothing_else:
                 return
         said = [] if health.declared is None else health.declared.sentences(health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)
@@ -222,9 +222,9 @@ def _say_memory(name: str, test: MemoryTest) -> str:
     )
 
 
-def _say_off(name: str, off: ConstantError, nothing_else: bool) -> str:
+def _say_off(name: str, off: ConstantError) -> str:
     """The sentence on the one output whose constant error leaves nothing else doubtful, or explains most of it."""
-    if not nothing_else:
+    if not off.nothing_else:
         share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
         return f"{name}: a constant error of {off}, would explain {share}, not all"
     return (
@@ -285,20 +285,21 @@ def examine(
     health = Health(
         record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
     )
-    return replace(health, filters=[_explain(network, health, judged, u) for judged in filters])
+    off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
+    return replace(health, off={place: error for place, error in off.items() if error is not None})
 
 
-def _explain(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> FilterHealth:
+def _find_off(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> ConstantError | None:
     """Find the constant error of one output that explains what is doubtful in a filter of several."""
-    if not judged.trusted or judged.test is None or judged not in health.doubted():
-        return judged
+    if judged.test is None:
+        return None
     every = listeners(network, health.record)
     listener = next(one for one in every if (one.node, one.name) == (judged.node, judged.filter))
     off = find_constant_error(listener.outputs, listener.filter, listener.measurements, inputs)
     if off is None:
-        return judged
-    nothing_else = health.explains_all(judged, off)
-    return replace(judged, off=off, nothing_else=nothing_else) if nothing_else or off.explained > MOST else judged
+        return None
+    off = off._replace(nothing_else=health.explains_all(judged, off))
+    return off if off.nothing_else or off.explained > MOST else None
 
 
 def _judge_declared(filter: AbstractFilter, z: np.ndarray, inputs: np.ndarray) -> DeclaredJudgement | None:
