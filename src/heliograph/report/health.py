@@ -293,7 +293,7 @@ def _find_off(network: Network, health: Health, judged: FilterHealth, inputs: np
     """Find the constant error of one output that explains what is doubtful in a filter of several."""
     if judged.test is None:
         return None
-    every = listeners(network, health.record)
+    every = list_listeners(network, health.record)
     listener = next(one for one in every if (one.node, one.name) == (judged.node, judged.filter))
     off = find_constant_error(listener.outputs, listener.filter, listener.measurements, inputs)
     if off is None:
