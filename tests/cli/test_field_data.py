@@ -9,6 +9,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.network_program import NetworkProgram
+from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
@@ -27,7 +28,7 @@ def served(folder, lines):
     network, module = load_module(str(folder / "net.py"))
     reads = Translator(module["sources"], network)
     service = Service(Fleet(NetworkProgram(network), Options(window=60.0, ahead=0.1)), InMemoryStore())
-    payloads = [payload for line in lines for payload in reads.line(line.encode())]
+    payloads = LineReader(network, reads).read([line.encode() for line in lines])
     return [json.loads(output.body) for output in [*service.take(payloads), *service.finish(True)]]
 
 
@@ -163,6 +164,30 @@ def test_counts_of_devices_are_absent_at_0_wrap_and_begin_again(folder, capsys, 
     assert [p["plant"] for p in finals].count("a") == 4 and [p["plant"] for p in finals].count("b") == 3
 
 
+def chirpstack_uplink(device, at, count, measured):
+    body = {"time": f"2026-09-01T{at}.000+00:00", "deviceInfo": {"devEui": device}, "fPort": 2, "object": measured}
+    body |= {} if count is None else {"fCnt": count}
+    return json.dumps({"topic": f"application/7/device/{device}/event/up", "payload": json.dumps(body)})
+
+
+def test_uplinks_of_chirpstack(folder, capsys):
+    """A count that is absent at 0 and wraps; a device that joined again, and a frame of it without a value."""
+    counts = {"70b3": [65535, None, 1], "a840": [700, None, 1]}
+    lines = [
+        chirpstack_uplink(device, f"10:0{k}:00", count, {"t": start + k / 10})
+        for start, device in enumerate(counts, 20)
+        for k, count in enumerate(counts[device])
+    ]
+    lines.append(chirpstack_uplink("a840", "10:04:00", 2, {"battery": 3.1}))
+    source = 'hg.files.chirpstack("t", node="a")'
+    out, _, table = run(folder, capsys, "up.jsonl", "\n".join(lines), source, "--plant", "70b3")
+    agrees(table, [0, 60, 120], [20.0, 20.1, 20.2])
+    assert "70b3, a: 3 used\n" in out
+    out, _, table = run(folder, capsys, "up.jsonl", "\n".join(lines), source, "--plant", "a840")
+    agrees(table, [0, 60, 120, 240], [21.0, 21.1, 21.2, np.nan])
+    assert "a840, a: 3 used, 1 without a value\n" in out
+
+
 def test_each_plant_has_estimates_of_its_own(folder, capsys):
     (folder / "net.py").write_text(f"{WALK}\nsources = hg.files.the_things_stack('t', node='a')\n")
     (folder / "up.jsonl").write_text("\n".join(UPLINKS))
@@ -275,8 +300,11 @@ REFUSED = {
         "node,sequence,time,arrival,y\na,0,2026-09-27T10:00:00Z,2026-09-27T05:00:00.1,20.1\n",
         "row 1, column 'arrival': expected a zone with every date or with none",
     ),
-    "the year 1": ("time,y\n0001-01-01,20.1\n2026-01-01,20.2\n", "row 1: expected a date as"),
-    "ten digits of a second": ("time,y\n2026-01-01T00:00:00.0123456789Z,20.1\n", "row 1: expected a date as"),
+    "the year 1": ("time,y\n0001-01-01,20.1\n", "row 1, column 'time': expected a date as"),
+    "ten digits of a second": (
+        "time,y\n2026-01-01T00:00:00.0123456789Z,20.1\n",
+        "row 1, column 'time': expected a date",
+    ),
 }
 
 

@@ -129,7 +129,7 @@ TABLES = {
     "doubled column": ("time,push,pos,pos\n0,0,0,0\n", ["distinct columns", "'pos'"]),
     "time goes backwards": (
         "time,push,pos\n0,0,1\n2,0,1\n1,0,1\n", ["row 3, column 'time'", "does not go backwards", "1 after 2"]),
-    "text in a cell": ("time,push,pos\n0,0,1\n1,0,far\n", ["row 2, column 'pos'", "a number", "'far'"]),
+    "text in all cells": ("time,push,pos\n0,0,far\n1,0,far\n", ["row 1, column 'pos'", "a number", "'far'"]),
     "infinite": ("time,push,pos\n0,0,inf\n", ["row 1, column 'pos'", "a finite number", "inf"]),
     "missing input": ("time,push,pos\n0,,1\n", ["row 1, column 'push'", "a finite number", "an empty cell"]),
     "short row": ("time,push,pos\n0,0\n", ["row 1", "3 cells", "got 2"]),

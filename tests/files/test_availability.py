@@ -8,6 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.files.sources import Sources
+from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.storage.store import Store
 from heliograph.serving.words import LastWordsService
@@ -140,7 +141,10 @@ def test_a_service_hears_the_words(network):
     (said,) = came("zigbee2mqtt/garden/availability", b"asleep")
     assert said == "zigbee2mqtt/garden/availability: expected one of online, true, offline, false, got 'asleep'"
     assert came(*value) == []
-    assert translator.line(b"zigbee2mqtt/garden/availability online") == [] and len(came(*value)) == 1
+    assert (
+        LineReader(network, translator).read([b"zigbee2mqtt/garden/availability online"]) == []
+        and len(came(*value)) == 1
+    )
     assert translator.left_out() == ["messages left out, of devices offline: zigbee2mqtt/garden (2)"]
 
 

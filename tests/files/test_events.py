@@ -9,7 +9,6 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.files.own_messages import holds_events
 from heliograph.live.event import Event
 from heliograph.live.recorded import play
 
@@ -85,8 +84,8 @@ def test_every_way_to_write_events_is_read_alike(tmp_path, network):
     numbers = {name: [float(x) if x else None for x in columns[name]] for name in HEADER[4:]}
     pq.write_table(pa.table({**{name: list(columns[name]) for name in HEADER[:4]}, **numbers}), tmp_path / "d.parquet")
     same(plain, read_events(tmp_path / "d.parquet", network)[0])
-    assert all(holds_events(tmp_path / name) for name in ("a.csv", "b.csv", "c.csv", "d.parquet"))
-    assert not holds_events(written(tmp_path / "rows.csv", ["time", "left"], [(0, 1)]))
+    with pytest.raises(ValueError, match="a message in our own form, or sources for its topic"):
+        read_events(written(tmp_path / "rows.csv", ["time", "left"], [(0, 1)]), network)
 
 
 def test_a_table_of_events_has_rows_and_delays(tmp_path, network):

@@ -92,7 +92,7 @@ def test_truth_values_are_one_and_zero_in_csv(tmp_path):
         ("time,a,a\n0,1,2\n", ["header", "distinct columns", "'a'"]),
         ("time,a\n0,1\n1,abc\n", ["row 2, column 'a'", "a number", "'abc'"]),
         ("time,a\n0,1\n1\n", ["row 2", "2 cells", "got 1"]),
-        ('time,a\n0,"1\n', ["data.csv", "a CSV file", "unexpected end of data"]),
+        ('time,a\n0,"1\n', ["data.csv, row 1", "a row of CSV", "unexpected end of data"]),
     ],
 )
 def test_csv_that_is_no_table_of_numbers(tmp_path, text, fragments):

@@ -5,6 +5,7 @@ import json
 import pytest
 
 import heliograph as hg
+from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
@@ -59,7 +60,7 @@ def test_a_field_that_cannot_be_read_costs_that_node_alone_and_is_not_lost(trans
     bodies = [{"plant": "p", "t": 1e9 + k, "n": k, "warm": 1.0, "wet": 1.0} for k in range(4)]
     bodies[1]["warm"] = "hot"
     texts = [json.dumps({"topic": "dev/up", "payload": json.dumps(body)}).encode() for body in bodies]
-    service, link, refused = served([payload for text in texts for payload in translator.line(text)], 3)
+    service, link, refused = served(LineReader(moving(), translator).read(texts), 3)
     assert (link.used, link.lost) == (3, 0)
     assert service.plants["p"].links["b"].used == 4
     (only,) = refused
@@ -70,9 +71,10 @@ def test_a_service_says_while_it_runs_that_a_field_names_senders(caplog):
     """Once, after a power of two of messages, when each name has come again."""
     source = hg.files.json_field("v", node="a", time="t", time_unit="s")
     translator, said = Translator({"dev/up": source}, moving()), []
+    lines = LineReader(moving(), translator)
     for k in range(40):
         body = {"v": 1.0, "t": 1e9 + k, "entity_id": ("attic", "cellar")[k % 2]}
-        translator.line(json.dumps({"topic": "dev/up", "payload": json.dumps(body)}).encode())
+        lines.read([json.dumps({"topic": "dev/up", "payload": json.dumps(body)}).encode()])
         said.append(len(caplog.messages))
     assert said[:4] == [0, 0, 0, 1] and said[-1] == 1
     assert "field 'entity_id' of dev/up has 2 values (attic, cellar)" in caplog.messages[0]

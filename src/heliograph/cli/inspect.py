@@ -51,7 +51,7 @@ def _collect_topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], 
     """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
     from heliograph.files.inspection import inspect_bag, inspect_file
     from heliograph.files.message_files import LINES
-    from heliograph.files.table import kind_of
+    from heliograph.files.text.text_file import kind_of
     from heliograph.report.progress import progress
 
     with progress(2) as advance:

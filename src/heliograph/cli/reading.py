@@ -1,7 +1,7 @@
 """Reading of measured data for every command alike: rows of a table, or messages, of which a timeline uses some."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
 
+SAID = 3  # reasons in a line
 WINDOW = 10.0  # how late a message may be, as of `heliograph serve`
 
 
@@ -29,7 +30,9 @@ class ReadingOptions:
         float | None, Parameter(help="Of messages: how much later than its arrival a time may be; 0.1 unless given.")
     ] = None
     plant: Annotated[str | None, Parameter(help="Of messages: the plant to read; all, unless given.")] = None
-    strict: Annotated[bool, Parameter(help="Stop at the first message that cannot be read.", negative="")] = False
+    strict: Annotated[bool, Parameter(help="Stop at the first message or row that cannot be read.", negative="")] = (
+        False
+    )
     ignore_unknown: Annotated[
         bool, Parameter(help="Leave out columns that the network does not know.", negative="")
     ] = False
@@ -89,7 +92,7 @@ def read_measured(
     if events is None:
         if options.of_messages:
             raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
-        return [_read_rows(path, network, options)]
+        return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]
     measured = [_convert_events(events.of(plant), plant, options) for plant in wanted]
     # What was read is said once.
@@ -138,14 +141,15 @@ def read_events(
     return read_messages(path, network, sources, progress, options.strict, options.ignore_unknown)
 
 
-def _read_rows(path: Path, network: "Network", options: ReadingOptions) -> Measured:
-    """Return the rows of a table as the measured data of its only plant."""
-    from heliograph.files.recording import read_recording
+def read_rows(path: Path, network: "Network", options: ReadingOptions) -> Measured:
+    """Read rows of time, and say which of them could not be read."""
+    from heliograph.files.recording import read_recording_file
 
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
-        recording = read_recording(path, network, ignore_unknown=options.ignore_unknown)
-    return Measured("", recording, warnings=[str(doubt.message) for doubt in doubts])
+        recording, refused = read_recording_file(path, network, options.strict, options.ignore_unknown)
+    lines = [describe_refused(path, "rows", len(refused), refused[:SAID])] if refused else []
+    return Measured("", recording, warnings=[*lines, *(str(doubt.message) for doubt in doubts)])
 
 
 def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -> Measured:
@@ -170,8 +174,12 @@ def describe_unread(path: Path, events: "EventTable") -> list[str]:
     """Say how many messages could not be read, and why, of the first of them; and where the reading ended."""
     lines = [events.broken] if events.broken else []
     if events.refused:
-        more = events.refused - len(events.reasons)
-        others = f"; and {more} more" if more > 0 else ""
-        count = f"messages that could not be read: {events.refused}"
-        lines.append(f"{path}: {count}; {'; '.join(events.reasons)}{others}")
+        lines.append(describe_refused(path, "messages", events.refused, events.reasons))
     return lines
+
+
+def describe_refused(path: Path, what: str, count: int, reasons: Sequence[str]) -> str:
+    """Say how many rows or messages could not be read, and why, of the first of them."""
+    more = count - len(reasons)
+    others = f"; and {more} more" if more > 0 else ""
+    return f"{path}: {what} that could not be read: {count}; {'; '.join(reasons)}{others}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from heliograph.cli.app import number, path_option
-from heliograph.cli.reading import ReadingOptions, read_events
+from heliograph.cli.reading import ReadingOptions, read_events, read_rows
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,7 +35,12 @@ def replay(
     duplicates: Annotated[float, Parameter(help="Probability that a message arrives twice.")] = 0.0,
     trace: Annotated[Path | None, path_option("CSV of a recorded link, one delay a message, nan if lost.")] = None,
     seed: Annotated[int, number("Seed of what happens on the way.")] = 0,
-    strict: Annotated[bool, Parameter(help="Stop at the first message that cannot be read.", negative="")] = False,
+    strict: Annotated[
+        bool, Parameter(help="Stop at the first message or row that cannot be read.", negative="")
+    ] = False,
+    ignore_unknown: Annotated[
+        bool, Parameter(help="Leave out columns that the network does not know.", negative="")
+    ] = False,
 ) -> None:
     """Send a recording as messages, JSON lines on stdout for `heliograph serve`, at the pace of the recording."""
     from time import monotonic, sleep
@@ -50,9 +55,10 @@ def replay(
     if trace is not None and link != Link():
         raise fail("--trace", "no --loss, --run, --delay and --duplicates beside it", "both")
     check_seed("--seed", seed)
+    options = ReadingOptions(strict=strict, ignore_unknown=ignore_unknown)
     # Events of each plant of the recording, and those that arrive through the link.
     sent = []
-    for i, (name, events, origin) in enumerate(_read_events(recording, network, strict)):
+    for i, (name, events, origin) in enumerate(_read_events(recording, network, options)):
         received = simulate_link(events, link, seed + i) if trace is None else delay_as_traced(events, trace)
         sent.append(encode_messages(received, name if plant is None else plant, origin))
     # Wait for each arrival on the clock, speeded up.
@@ -68,17 +74,21 @@ def replay(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _read_events(path: Path, reference: str, strict: bool) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
+def _read_events(
+    path: Path, reference: str, options: ReadingOptions
+) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
     """Yield the events of each plant with its name, and the date of time 0, which is that of all."""
     from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_module
-    from heliograph.serving.brokers.replay import recorded
+    from heliograph.serving.brokers.replay import events_of_recording
 
     network, module = load_module(reference)
-    options = ReadingOptions(strict=strict)
     table = read_events(path, reference, network, module, options, lambda *_: None)
     if table is None:
-        yield ("", *recorded(path, network))
+        rows = read_rows(path, network, options)
+        for line in rows.warnings:
+            print(f"heliograph: {visible(line)}", file=sys.stderr)
+        yield ("", *events_of_recording(rows.recording, network))
         return
     from heliograph.cli.reading import describe_unread
 

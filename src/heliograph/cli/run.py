@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from heliograph.files.estimates.forecasts import ByFilter
     from heliograph.files.event_table import EventTable
-    from heliograph.files.forecasts import ByFilter
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.report.progress import Advance
@@ -172,7 +172,7 @@ def _write_rows(write: "Write", record: "Record", forecasts: "ByFilter", place: 
     if not forecasts:
         write(record, place)
         return
-    from heliograph.files.forecasts import write_forecast
+    from heliograph.files.estimates.forecasts import write_forecast
 
     write_forecast(record, forecasts, place)
 
@@ -227,7 +227,7 @@ def _check_options(
 def _choose_writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Write":
     """Return the function that writes estimates: to a table, or to MCAP with the pose that the network's file names."""
     from heliograph.files.bags.output import write_bag
-    from heliograph.files.recording import write_estimates
+    from heliograph.files.estimates.table import write_estimates
 
     origin = None if messages is None or messages.steps or messages.numbers else messages.date
 

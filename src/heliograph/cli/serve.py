@@ -54,6 +54,9 @@ class ServeOptions:
     forecast: Annotated[
         str, Parameter(help="How far ahead forecasts are published beside estimates: 5s,1min, or steps.")
     ] = ""
+    ignore_unknown: Annotated[
+        bool, Parameter(help="Of a table: leave out columns that the network does not know.", negative="")
+    ] = False
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False
 
     def settings(self, reference: str) -> "ServiceSettings":
@@ -80,6 +83,7 @@ class ServeOptions:
             hosts=tuple(self.host or ()),
             anew=tuple(self.anew or ()),
             sources=module.get("sources"),
+            ignore_unknown=self.ignore_unknown,
             name=name_of(reference),
             accept_changes=self.accept_changes,
             every=self.every,
@@ -92,7 +96,8 @@ def serve(network: str | None = None, /, *, options: ServeOptions | None = None)
     """Keep the filters of your own network running: messages as JSON lines in, estimates as JSON lines out.
 
     Where the network's file names `sources`, messages of their topics are read too: of the broker, or of lines with a
-    topic and a payload, as mosquitto_sub -F %j prints them.
+    topic and a payload, as mosquitto_sub -F %j prints them. What `run` reads of text may come through a pipe, too:
+    tables of CSV (rows of time, events, rows that sources map), JSON, logs, packed or not.
 
     Parameters
     ----------

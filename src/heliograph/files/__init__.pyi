@@ -10,13 +10,16 @@ from .computed import (
     Covariance as Covariance,
     Yaw as Yaw,
 )
+from .estimates.table import (
+    write_estimates as write_estimates,
+)
 from .event_table import (
     EventTable as EventTable,
 )
 from .fitted import (
     load_fitted as load_fitted,
 )
-from .forecasts import (
+from .estimates.forecasts import (
     write_forecast as write_forecast,
 )
 from .json_field import (
@@ -40,7 +43,6 @@ from .network_file import (
 from .recording import (
     Recording as Recording,
     read_recording as read_recording,
-    write_estimates as write_estimates,
     write_recording as write_recording,
 )
 from .sources import (

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from heliograph.files.text.dialects import NO_VALUE
 from heliograph.live.event import check_63_bits
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import UNITS, dates, instant
@@ -116,8 +117,11 @@ def _getter(path: str) -> "attrgetter[Any]":
 
 
 def convert_number(value: Any, name: str, quoted: bool = False) -> float:
-    """Convert a value to a number; NaN for null and for what is not finite. A number may be `quoted` on request."""
-    if value is None or value == "":
+    """Convert a value to a number; NaN for null, for words of that meaning, and for what is not finite.
+
+    A number may be `quoted` on request.
+    """
+    if value is None or value == "" or (isinstance(value, str) and NO_VALUE.fullmatch(value.strip())):
         return np.nan
     if quoted and isinstance(value, str):
         value = parse_number(value)
@@ -172,7 +176,9 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
     whole_units = float(value).is_integer()
     stamp = int(value) * UNITS[unit] if whole_units else round(Decimal(repr(float(value))) * UNITS[unit])
     if not -(2**63) < stamp < 2**63:
-        raise fail(name, f"a time in {unit} since 1970", show_value(value))
+        fits = next((other for other, size in UNITS.items() if 0 <= float(value) * size < 2**63), None)
+        hint = "" if fits is None else f": in {fits} it is one (time_unit={fits!r})"
+        raise fail(name, f"a time in {unit} since 1970", f"{show_value(value)}{hint}")
     return stamp
 
 

@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from heliograph.files.fields import decode_json, parse_number
-from heliograph.files.table import check_separators, csv_lines, kind_of, open_text, read_csv_header
-from heliograph.numerics.check import InputError, fail
+from heliograph.files.text.csv_text import CsvRow, csv_rows, read_csv_header
+from heliograph.files.text.dialects import check_distinct
+from heliograph.files.text.text_file import is_text, kind_of, open_text, until_cut_off
+from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import instant
 
 TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
 ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second
 CLOCKS = ("timestamp", "time", "ts")  # the same, where they are dates with a zone or seconds, beside a payload
 YEARS = 1e9, 1e10  # seconds since 1970 of 2001 to 2286
-ANNOTATIONS = ("#group", "#datatype", "#default", "#constant")  # of Influx's annotated CSV
 LINES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
 # A date or seconds, a topic and a payload, as `mosquitto_sub -F "%I %t %p"` and `mosquitto_sub -v` print them.
 LOGGED = re.compile(r"(?:(?P<arrival>\d{4}-\d\d-\d\dT\S+|\d+(?:\.\d+)?) )?(?P<topic>[^\s{}\[\]\",]+) (?P<payload>.*)")
@@ -70,17 +71,18 @@ def read_parquet_names(path: Path) -> list[str]:
 def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file, or why one cannot be read, in the order of the file.
 
+    Where the file is damaged or cut off the last is a `CutOffError`.
+
     Raises:
         ValueError: the file cannot be read at all; one line.
     """
     kind = kind_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
-    if kind in LINES:
-        yield from _read_lines(path)
-        return
-    for where, row in _read_csv_rows(path) if kind == ".csv" else _read_parquet_rows(path):
-        yield row if isinstance(row, InputError) else _convert_row(where, row)
+    if kind == ".parquet":
+        yield from (convert_row(where, row) for where, row in _read_parquet_rows(path))
+    else:
+        yield from until_cut_off(_read_lines(path) if kind in LINES else _read_csv_messages(path))
 
 
 def log_line(text: str) -> tuple[str, str, str | None] | None:
@@ -116,7 +118,8 @@ def _is_moment(value: object) -> bool:
     return isinstance(number, int | float) and YEARS[0] <= number < YEARS[1]
 
 
-def _convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
+def convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
+    """Return the message of a row of a table: with a payload, or with the fields of its columns."""
     arrival = find_arrival(row) if PAYLOAD in row else row.get("arrival")
     if TOPIC not in row:
         return FileMessage(where, None, row, arrival)
@@ -134,30 +137,35 @@ def _read_lines(path: Path) -> Iterator[FileMessage | InputError]:
             except (ValueError, RecursionError):
                 lines = enumerate(text.splitlines(), 1)
             else:
-                yield from (_convert_object(f"{path}, message {n}", item) for n, item in enumerate(_flat(whole), 1))
+                yield from (convert_object(f"{path}, message {n}", item) for n, item in enumerate(flatten(whole), 1))
                 return
         else:
             lines = enumerate(file, 1)
         for number, line in lines:
             if line.strip():
-                yield _convert_line(f"{path}, line {number}", line)
+                yield from convert_line(f"{path}, line {number}", line)
 
 
-def _flat(content: object) -> Iterator[object]:
+def flatten(content: object) -> Iterator[object]:
     """Yield what is in a list, and in lists of lists."""
     for item in content if isinstance(content, list) else [content]:
-        yield from _flat(item) if isinstance(item, list) else [item]
+        yield from flatten(item) if isinstance(item, list) else [item]
 
 
-def _convert_line(where: str, line: str) -> FileMessage | InputError:
+def convert_line(where: str, line: str) -> list[FileMessage | InputError]:
+    """Return the message of a line, those of a list of them, or why it cannot be read."""
+    line = line.strip()
+    if not is_text(line):
+        return [fail(where, "a text in UTF-8", show_value(line))]
     try:
-        return _convert_object(where, decode_json(line, where))
+        return [convert_object(where, item) for item in flatten(decode_json(line, where))]
     except InputError as error:
         parts = log_line(line)
-        return error if parts is None else FileMessage(where, *parts)
+        return [error if parts is None else FileMessage(where, *parts)]
 
 
-def _convert_object(where: str, content: object) -> FileMessage:
+def convert_object(where: str, content: object) -> FileMessage:
+    """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file."""
     logged = read_log_entry(content)
     if logged is None:
         return FileMessage(where, None, content, content.get("arrival") if isinstance(content, dict) else None)
@@ -165,29 +173,15 @@ def _convert_object(where: str, content: object) -> FileMessage:
     return FileMessage(where, topic, payload, arrival, stored)
 
 
-def _read_csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any] | InputError]]:
-    """Yield the rows from 1, with numbers as numbers and empty cells as None; of annotated CSV each table's."""
-    header: list[str] | None = None
-    with csv_lines(path) as lines:
-        number = 0
-        for line in lines:
-            if line[0].strip() in ANNOTATIONS:
-                header = None
-                continue
-            if header is None:
-                header = [name.strip() for name in line]
-                check_separators(path, header)
-                twice = [name for i, name in enumerate(header) if name and name in header[:i]]
-                if twice:
-                    raise fail(f"{path}, header", "distinct columns", f"{twice[0]!r} more than once")
-                continue
-            number += 1
-            where = f"{path}, row {number}"
-            if len(line) != len(header):
-                yield where, fail(where, f"{len(header)} cells, one for each column", len(line))
-                continue
-            cells = [(name, cell.strip()) for name, cell in zip(header, line, strict=True)]
-            yield where, {name: cell if name == PAYLOAD else _cell(cell) for name, cell in cells}
+def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
+    for row in csv_rows(path, marked=True):
+        yield row if isinstance(row, InputError) else convert_row(row.where, typed_cells(row))
+
+
+def typed_cells(row: CsvRow) -> dict[str, Any]:
+    """Return the cells of a row by name: numbers as numbers, whole ones with every digit, empty cells as None."""
+    cells = zip(row.header, row.cells, strict=True)
+    return {name: cell if name == PAYLOAD else parse_number(cell) if cell else None for name, cell in cells}
 
 
 def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -197,9 +191,7 @@ def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
     table = pq.ParquetFile(path).read()
     names = table.column_names
-    if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise fail(f"{path}, header", "distinct columns", f"{twice!r} more than once")
+    check_distinct(path, names)
     for i, column in enumerate(table.columns):
         if pa.types.is_timestamp(column.type):
             whole = column.cast(pa.timestamp("ns", "UTC")).cast(pa.int64()).to_pylist()
@@ -213,11 +205,6 @@ def _iso(nanoseconds: int) -> str:
     import numpy as np
 
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
-
-
-def _cell(cell: str) -> float | int | str | None:
-    """Convert a cell to a number where it is one; whole numbers keep every digit."""
-    return parse_number(cell) if cell else None
 
 
 def decode_payload(message: FileMessage) -> object:

@@ -16,7 +16,7 @@ from heliograph.files.message_files import (
 )
 from heliograph.files.own_messages import OwnMessages, holds_events, is_own
 from heliograph.files.sources import Sources, Unread
-from heliograph.files.table import kind_of
+from heliograph.files.text.text_file import CutOffError, kind_of
 from heliograph.numerics.check import InputError, check_progress, fail, file_path, flag, instance
 from heliograph.simulation.network import Network
 
@@ -97,7 +97,11 @@ def _map_messages(path: Path, network: Network, sources: Sources | None, strict:
     """Read messages by their topics, and those in our own form among them."""
     events = None if sources is None else EventTable(network, sources.step)
     own = OwnMessages(network, path, False)
+    broken = ""
     for message in read_message_file(path):
+        if isinstance(message, CutOffError) and not strict:
+            broken = str(message)
+            continue
         if isinstance(message, InputError) or (message.topic is None and is_own(message.content)):
             own.add(message, strict)
             continue
@@ -108,6 +112,7 @@ def _map_messages(path: Path, network: Network, sources: Sources | None, strict:
         if events is not None and len(events):
             raise fail(str(path), "messages in our own form, or of topics", "both")
         events = own.events()
+    events.broken = broken
     events.refused += own.refused if own.used == 0 else 0
     events.reasons += own.reasons if own.used == 0 else []
     return events

@@ -10,8 +10,10 @@ from heliograph.files.event_columns import counts_losses
 from heliograph.files.event_table import EventTable
 from heliograph.files.fields import convert_name
 from heliograph.files.message_files import FileMessage, read_parquet_names
-from heliograph.files.sources import Reading
-from heliograph.files.table import kind_of, read_csv_header
+from heliograph.files.sources import Reading, Unread
+from heliograph.files.text.csv_text import read_csv_header
+from heliograph.files.text.dialects import NO_VALUE
+from heliograph.files.text.text_file import CutOffError, kind_of
 from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
@@ -27,9 +29,14 @@ OWN = (NODE, SEQUENCE, TIME, ARRIVAL, VALUES, INPUTS, PLANT)
 def holds_events(path: str | Path) -> bool:
     """Return whether a CSV or Parquet file has events instead of rows: it has the columns `node` and `sequence`."""
     path = Path(path)
-    if not path.is_file() or kind_of(path) not in (".csv", ".parquet"):
+    if not path.is_file() or not is_table(path):
         return False
     return {NODE, SEQUENCE} <= set(read_parquet_names(path) if kind_of(path) == ".parquet" else read_csv_header(path))
+
+
+def is_table(path: Path) -> bool:
+    """Return whether a file has rows, by its name."""
+    return kind_of(path) in (".csv", ".parquet")
 
 
 def is_own(content: object) -> bool:
@@ -40,11 +47,6 @@ def is_own(content: object) -> bool:
 class OwnMessages:
     """Messages in our own form as they are read, to a table of their events.
 
-    Fields: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), `plant` (optional), and the
-    values: one field for each component, named as the sensor's outputs or the plant's inputs, or `values` with all of
-    the node's numbers, as a list or separated by spaces. What is empty did not arrive. Times are numbers or dates of
-    ISO 8601, all with a time zone or all without. A sequence keeps every digit.
-
     Args:
         network: the network that the names belong to.
         path: the file.
@@ -52,16 +54,9 @@ class OwnMessages:
     """
 
     def __init__(self, network: Network, path: Path, ignore_unknown: bool):
-        self.network, self.path, self._ignore = network, path, ignore_unknown
-        self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
-        self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
-        self.steps = TIME_STEP not in network.inputs
-        self._numbered = [name for name in network.names if counts_losses(network, name)]
+        self.path, self._reader = path, OwnReader(network, str(path), ignore_unknown, is_table(path))
         self._table: EventTable | None = None
-        self._zero: int | None = None  # that whole numbers are counted from, which doubles could not tell apart
-        self._zoned: bool | None = None
-        self._columns: Set[str] = frozenset()
-        self.used, self.refused, self.reasons = 0, 0, list[str]()
+        self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
 
     def add(self, message: FileMessage | InputError, strict: bool) -> None:
         """Append the events of a message; what cannot be read is refused alone.
@@ -72,13 +67,16 @@ class OwnMessages:
         try:
             if isinstance(message, InputError):
                 raise message
-            self._add_message(message.where, message.content)
+            self._add_message(message)
             self.used += 1
         except HeaderError:
             raise
         except InputError as error:
             if strict:
                 raise
+            if isinstance(error, CutOffError):
+                self.broken = str(error)
+                return
             self.refused += 1
             self.reasons += [str(error)] if len(self.reasons) < 3 else []
 
@@ -90,13 +88,61 @@ class OwnMessages:
         """
         if self._table is None:
             raise InputError(self.reasons[0]) if self.reasons else fail(str(self.path), "at least one row", "none")
-        if self._zero:
-            self._table.notes.append(f"{self.path}: times are counted from {self._zero}")
-        self._table.refused, self._table.reasons = self.refused, self.reasons
+        if self._reader.zero:
+            self._table.notes.append(f"{self.path}: times are counted from {self._reader.zero}")
+        self._table.refused, self._table.reasons, self._table.broken = self.refused, self.reasons, self.broken
         return self._table
 
-    def _add_message(self, where: str, row: Mapping[str, Any]) -> None:
+    def _add_message(self, message: FileMessage) -> None:
         """Add the event of one message to the table, and one of the inputs that it brings."""
+        found = self._reader.read(message.where, message.content)
+        if self._table is None:
+            self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
+        for reading, arrival in found:
+            if isinstance(reading, Unread):
+                assert reading.counted is not None
+                self._table.note_unread(reading.counted, arrival)
+                raise reading.error
+            self._table.add(reading, arrival)
+
+
+class OwnReader:
+    """Reader of messages in our own form.
+
+    Fields: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), `plant` (optional), and the
+    values: one field for each component, named as the sensor's outputs or the plant's inputs, or `values` with all of
+    the node's numbers, as a list or separated by spaces. What is empty did not arrive. Times are numbers or dates of
+    ISO 8601, all with a time zone or all without. A sequence keeps every digit.
+
+    Args:
+        network: the network that the names belong to.
+        source: where the messages are from, for errors.
+        ignore_unknown: whether fields that nobody knows are left out.
+        table: whether the messages are rows of a table, whose columns all have.
+
+    Attributes:
+        numbers: whether times are numbers, and not dates; None before the first.
+        zero: what whole numbers are counted from that doubles could not tell apart; 0 or None for others.
+    """
+
+    def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
+        self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
+        self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
+        self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+        self.steps = TIME_STEP not in network.inputs
+        self._numbered = [name for name in network.names if counts_losses(network, name)]
+        self.numbers: bool | None = None
+        self.zero: int | None = None
+        self._zoned: bool | None = None
+        self._columns: Set[str] = frozenset()
+
+    def read(self, where: str, row: Mapping[str, Any]) -> list[tuple[Reading | Unread, Any]]:
+        """Return the events of a message, each with its arrival, in the unit of times.
+
+        Raises:
+            HeaderError: columns that lack, or that nobody knows.
+            ValueError: a message that cannot be read; one line.
+        """
         self._check_columns(where, row)
         node = row[NODE]
         if node not in self.components:
@@ -104,40 +150,41 @@ class OwnMessages:
         sequence = _parse_whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
         time, dated = self._read_moment(row[TIME], f"{where}, column {TIME!r}")
         arrival = time
-        if ARRIVAL in row and (row[ARRIVAL] is not None or "line" not in where):
+        if ARRIVAL in row and (row[ARRIVAL] is not None or self._table):
             arrival, _ = self._read_moment(row[ARRIVAL], f"{where}, column {ARRIVAL!r}")
         plant = "" if row.get(PLANT) is None else convert_name(row[PLANT], f"{where}, column {PLANT!r}")
-        if self._table is None:
-            self._table = EventTable(self.network, numbers=not dated)
+        self.numbers = not dated
         try:
             values = _read_values(row, self.components[node], where, node in self._numbered)
-        except InputError:
-            self._table.note_unread(Reading(plant, node, sequence, time, NOTHING), arrival)
-            raise
+        except InputError as error:
+            return [(Unread(error, Reading(plant, node, sequence, time, NOTHING)), arrival)]
+        found: list[tuple[Reading | Unread, Any]] = []
         if isinstance(row.get(INPUTS), list) and node != INPUTS:
             given = _read_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
-            self._table.add(Reading(plant, INPUTS, sequence, time, given), arrival)
-        self._table.add(Reading(plant, node, sequence, time, values), arrival)
+            found.append((Reading(plant, INPUTS, sequence, time, given), arrival))
+        return [*found, (Reading(plant, node, sequence, time, values), arrival)]
 
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
         """Refuse unknown columns, which are most likely misspelt; of rows that are alike one is looked at."""
         if row.keys() == self._columns:
             return
+        place = f"{self.source}, header" if self._table else where
+        make = HeaderError if self._table else InputError
         known = [*OWN, *(name for names in self.components.values() for name in names)]
         for name in () if self._ignore else row:
             if name not in known:
                 listed = ", ".join(dict.fromkeys(known))
-                raise HeaderError(str(fail(f"{self.path}, header", f"only the columns {listed}", repr(name))))
+                raise make(str(fail(place, f"only the columns {listed}", repr(name))))
         for name in (NODE, SEQUENCE, TIME):
             if name not in row:
-                raise HeaderError(str(fail(f"{self.path}, header", f"a column {name!r}", f"only {', '.join(row)}")))
+                raise make(str(fail(place, f"a column {name!r}", f"only {', '.join(row)}")))
         self._columns = row.keys()
 
     def _read_moment(self, cell: Any, name: str) -> tuple[Any, bool]:
         """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
         dated = isinstance(cell, str) and looks_like_date(cell)
         expected = "a number"
-        if self._table is not None and dated != (not self._table.numbers):
+        if self.numbers is not None and dated != (not self.numbers):
             expected = "a number, as the times before" if dated else "a date, as the times before"
             raise fail(name, expected, show_value(cell))
         if not dated:
@@ -154,9 +201,9 @@ class OwnMessages:
         """Return a time that is a number, counted from the first one where these are too large for a double."""
         number = _parse_number(cell, name)
         if isinstance(cell, int):
-            if self._zero is None:
-                self._zero = cell if abs(cell) >= EXACT else 0
-            number = float(cell - self._zero)
+            if self.zero is None:
+                self.zero = cell if abs(cell) >= EXACT else 0
+            number = float(cell - self.zero)
         if self.steps and TIME in name and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
         return number
@@ -195,7 +242,7 @@ def _parse_whole(cell: Any, name: str) -> int:
 
 def _parse_number(cell: Any, name: str, empty: bool = False, text: bool = False) -> float:
     """Return a number; NaN for what may be `empty` and is; a `text` that reads as one is one."""
-    if empty and (cell is None or cell == ""):
+    if empty and (cell is None or cell == "" or (isinstance(cell, str) and NO_VALUE.fullmatch(cell))):
         return np.nan
     expected = "a number or an empty cell" if empty else "a number"
     if isinstance(cell, str) and not text:

@@ -1,25 +1,23 @@
-"""Recordings and estimates in files: a table of times, inputs and measurements; one of means and covariances."""
+"""Recordings in files: a table of times, inputs and measurements, whose rows follow one another in time."""
 
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.table import TIME, columns_of, read_back_name, write_table
-from heliograph.model.estimate import Estimate, is_sound
+from heliograph.files.table import TIME, Rows, columns_of, read_back_name, read_rows, write_table
 from heliograph.model.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import fail, flag, instance
+from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.times.row_times import backwards, backwards_text
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.record import Record
 
 
 @readable
@@ -61,9 +59,31 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
     """
     instance("network", network, Network, "a Network")
     source = str(table) if isinstance(table, str | Path) else name
-    headers = _map_headers(network)
-    columns = columns_of(table, source, headers if flag("ignore_unknown", ignore_unknown) else None)
-    return _make_recording({headers.get(name, name): values for name, values in columns.items()}, network, source)
+    reader = RowReader(network, source, strict=True, ignore_unknown=flag("ignore_unknown", ignore_unknown))
+    columns = columns_of(table, source, reader.only)
+    rows = len(next(iter(columns.values()), ()))
+    return reader.read(Rows(columns, np.arange(1, rows + 1), []))
+
+
+def read_recording_file(
+    path: Path, network: Network, strict: bool, ignore_unknown: bool
+) -> tuple[Recording, list[str]]:
+    """Read a recording as `read_recording` does, of which a row that cannot be read is refused alone unless `strict`.
+
+    Where the network counts steps such a row is a step in which nothing arrived and inputs stayed as they were.
+
+    Returns:
+        The recording, and why rows were refused.
+
+    Raises:
+        ValueError: what `read_recording` refuses of a table as a whole; no row that can be read.
+    """
+    reader = RowReader(network, str(path), strict, ignore_unknown)
+    rows = read_rows(path, reader.only, strict)
+    recording = reader.read(rows)
+    if not len(recording.time):
+        raise reader.refused[0] if reader.refused else fail(str(path), "at least one row", "none")
+    return recording, [str(error) for error in reader.refused]
 
 
 def write_recording(recording: Recording, network: Network, path: str | Path) -> None:
@@ -114,9 +134,108 @@ def _map_headers(network: Network) -> dict[str, str]:
     )
 
 
-def _make_recording(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
-    """Make the recording from a table's columns: measurements by node, inputs, times, and the truth if there."""
-    inputs, received = network.inputs, _list_received_columns(network)
+class RowReader:
+    """Rows of time of a network, from columns, a part of a table at a time.
+
+    Args:
+        network: the network that the columns belong to.
+        source: name of the table, for errors.
+        strict: whether a row that cannot be read is an error, or is refused alone.
+        ignore_unknown: whether columns that the network does not know are left out.
+
+    Attributes:
+        only: the columns that are read; None for all.
+        refused: why rows were refused, in the order of the table.
+    """
+
+    def __init__(self, network: Network, source: str, strict: bool, ignore_unknown: bool):
+        self.network, self.source, self._strict = network, source, strict
+        self._headers = _map_headers(network)
+        self.only: Mapping[str, str] | None = self._headers if ignore_unknown else None
+        self.refused = list[InputError]()
+
+    @property
+    def names(self) -> set[str]:
+        """Return the names that a column may have."""
+        return {TIME, *self._headers}
+
+    def read(self, rows: Rows) -> Recording:
+        """Return the rows that can be read.
+
+        Raises:
+            ValueError: unknown, missing or doubled columns; times that go backwards; a row that cannot be read, where
+                reading is strict. One line that names the row, from 1, and the column.
+        """
+        cells = self.read_cells(rows)
+        kept = _keep_rows(cells.numbers, self.network)
+        time = kept.fill_times(cells.time)
+        u = _make_inputs(self.network, cells.inputs, time, kept, self.source)
+        measurements = {node: kept.fill(values) for node, values in cells.measurements.items()}
+        if not cells.truth:
+            return Recording(measurements, u, time)
+        unknown = np.full(len(cells.time), np.nan)
+        truth = [kept.fill(cells.truth.get(state, unknown)) for state in self.network.states]
+        return Recording(measurements, u, time, np.stack(truth, axis=1))
+
+    def read_cells(self, rows: Rows) -> "Cells":
+        """Return what stands in the rows that can be read, each by itself.
+
+        Raises:
+            ValueError: what `read` refuses, but for times that go backwards.
+        """
+        columns = {self._headers.get(name, name): values for name, values in rows.columns.items()}
+        checks = _RowChecks(self.source, rows.numbers, self._strict)
+        cells = _read_cells(columns, self.network, checks)
+        self.refused += [*rows.refused, *checks.refused]
+        return cells.of(checks.good)
+
+
+class Cells(NamedTuple):
+    """Rows of time: their numbers from 1, times, measurements by node, inputs and true states by name."""
+
+    numbers: np.ndarray
+    time: np.ndarray
+    measurements: dict[str, np.ndarray]
+    inputs: dict[str, np.ndarray]
+    truth: dict[str, np.ndarray]
+
+    def of(self, good: np.ndarray) -> "Cells":
+        """Return some of the rows."""
+        parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
+        return Cells(self.numbers[good], self.time[good], *parts)
+
+
+class _RowChecks:
+    """Checks of the rows of a table: the first that fails is an error, or each is refused with the reason.
+
+    Attributes:
+        good: of each row whether nothing was wrong so far.
+        refused: why rows were refused.
+    """
+
+    def __init__(self, source: str, numbers: np.ndarray, strict: bool):
+        self.source, self.numbers, self._strict = source, numbers, strict
+        self.good = np.ones(len(numbers), dtype=bool)
+        self.refused = list[InputError]()
+
+    def refuse(self, bad: np.ndarray, column: str, expected: str, came: Callable[[int], str]) -> None:
+        """Refuse rows.
+
+        Raises:
+            ValueError: one of them, where reading is strict.
+        """
+        for row in np.flatnonzero(bad & self.good).tolist():
+            where = f"{self.source}, row {self.numbers[row]}, column {column!r}"
+            error = fail(where, expected, came(row))
+            if self._strict:
+                raise error
+            self.refused.append(error)
+        self.good &= ~bad
+
+
+def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _RowChecks) -> Cells:
+    """Read what stands in the columns of a table, each row by itself."""
+    inputs, received, source = network.inputs, _list_received_columns(network), checks.source
     # A relay whose measurements are left out altogether loses its filter only.
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
@@ -126,100 +245,71 @@ def _make_recording(columns: Mapping[str, np.ndarray], network: Network, source:
     expected = [(TIME,), *((name,) for name in inputs), *(a for node in received.values() for a in node)]
     true = _truth_columns(network)
     _refuse_unknown(columns, [*expected, *((name,) for name in true.values())], source)
-
-    def find(names: tuple[str, ...]) -> str:
-        return _find(columns, names, source)
-
-    # Time must not go backwards.
-    time = _read_times(columns, find((TIME,)), source)
-    row = backwards(time)
-    if row is not None:
-        came = backwards_text(time, row)
-        raise fail(f"{source}, row {row + 1}, column {TIME!r}", "a time that does not go backwards", came)
-    _warn_of_equal_times(time, source)
+    time = _read_times(columns, _find(columns, (TIME,), source), checks)
     measurements = {
-        node: np.stack([_read_measurements(columns, find(names), source) for names in components], axis=1)
+        node: np.stack([_read_measurements(columns, _find(columns, a, source), checks) for a in components], axis=1)
         for node, components in received.items()
     }
-    # Inputs; a missing dt is the difference of the times.
-    u = np.zeros((len(time), len(inputs)))
-    for i, name in enumerate(inputs):
-        fill = name == TIME_STEP and name not in columns
-        u[:, i] = seconds_between(time) if fill else _complete(columns, find((name,)), source)
+    # An input dt may be left out.
+    given = {
+        name: _complete(columns, _find(columns, (name,), source), checks)
+        for name in inputs
+        if name != TIME_STEP or name in columns
+    }
+    known = {state: name for state, name in true.items() if name in columns}
+    truth = {state: _read_measurements(columns, name, checks) for state, name in known.items()}
+    return Cells(checks.numbers, time, measurements, given, truth)
+
+
+def _make_inputs(
+    network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: "_KeptRows", source: str
+) -> np.ndarray:
+    """Return the inputs of rows whose times do not go backwards; a missing dt is the difference of the times."""
+    row = backwards(time)
+    if row is not None:
+        where = f"{source}, row {rows.numbers[row]}, column {TIME!r}"
+        raise fail(where, "a time that does not go backwards", backwards_text(time, row))
+    _warn_of_equal_times(time, source)
+    u = np.zeros((len(time), len(network.inputs)))
+    for i, name in enumerate(network.inputs):
+        u[:, i] = given[name][rows.of] if name in given else seconds_between(time)
         if name == TIME_STEP and (fault := find_time_step_fault(u[:, i])):
-            raise fail(f"{source}, row {fault.row + 1}, column {name!r}", fault.expected, fault.came)
-    if not any(name in columns for name in true.values()):
-        return Recording(measurements, u, time)
-    unknown = np.full(len(time), np.nan)
-    known = [true.get(state, "") for state in network.states]
-    truth = [_read_measurements(columns, name, source) if name in columns else unknown for name in known]
-    return Recording(measurements, u, time, np.stack(truth, axis=1))
+            raise fail(f"{source}, row {rows.numbers[fault.row]}, column {name!r}", fault.expected, fault.came)
+    return u
 
 
-def estimate_columns(record: Record) -> dict[str, np.ndarray]:
-    """Return the estimates of a recording as columns."""
-    columns = [(TIME, record.time)]
-    several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
-    for node, filters in record.estimates.items():
-        for name, estimate in filters.items():
-            prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
-            columns += [(prefix + key, values) for key, values in _make_columns(record.states, record.units, estimate)]
-            later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
-            if name in later:
-                known = _make_columns(record.states, record.units, later[name])
-                columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in known]
-    twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
-    if twice:
-        raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")
-    return dict(columns)
+class _KeptRows(NamedTuple):
+    """Rows that a recording has: their numbers in the table, which row each is of, and whether it arrived itself."""
+
+    numbers: np.ndarray
+    of: np.ndarray
+    arrived: np.ndarray
+
+    def fill(self, values: np.ndarray) -> np.ndarray:
+        """Return values of these rows, NaN where one did not arrive."""
+        filled = np.array(values[self.of], dtype=np.float64)
+        filled[~self.arrived] = np.nan
+        return filled
+
+    def fill_times(self, time: np.ndarray) -> np.ndarray:
+        """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
+        between = np.flatnonzero(~self.arrived)
+        filled = np.array(time[self.of])
+        before, after = self.of[between], np.minimum(self.of[between] + 1, len(time) - 1)
+        known = self.numbers[self.arrived]
+        share = np.maximum(self.numbers[between] - known[before], 0) / np.maximum(known[after] - known[before], 1)
+        moved = share * (time[after] - time[before]).astype(np.float64)
+        filled[between] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
+        return filled
 
 
-def write_estimates(record: Record, path: str | Path) -> None:
-    """Write `estimate_columns` to a CSV or Parquet file, as a whole or not at all; in CSV, valid is 1 or 0.
-
-    Args:
-        record: the result of `run`.
-        path: the file, ending in .csv or .parquet.
-
-    Raises:
-        ValueError: another format, or a folder that cannot be written.
-        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
-    """
-    instance("record", record, Record, "a Record")
-    write_table(estimate_columns(record), path)
-
-
-def make_header(name: str, unit: str | None) -> str:
-    """Return the name of a column, with its unit where there is one."""
-    return f"{name} ({unit})" if unit else str(name)
-
-
-def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
-    """Return the columns that show an estimate: means, standard deviations and covariances as claimed, and validity."""
-    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
-    if mean.ndim != 2:
-        raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
-    columns = []
-    for i, state in enumerate(states):
-        columns.append((make_header(state, units.get(state)), mean[:, i]))
-        if estimate.claim != "none":
-            variance = bound[:, i, i]
-            columns.append(
-                (make_header(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
-            )
-    # Covariances of two states have the product of their units.
-    if estimate.claim != "none":
-        for i, a in enumerate(states):
-            for j in range(i + 1, len(states)):
-                of = " ".join(units[name] for name in (a, states[j]) if name in units)
-                columns.append((make_header(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
-    return [*columns, ("valid", is_sound(estimate))]
-
-
-def _pad_start(values: np.ndarray, rows: int) -> np.ndarray:
-    """Extend a column at its start by NaN, or false, to a number of rows."""
-    none = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
-    return np.concatenate([none.astype(values.dtype), values])
+def _keep_rows(numbers: np.ndarray, network: Network) -> _KeptRows:
+    """Return the rows of these numbers; where each row is a step also those between them, as the ones before."""
+    if TIME_STEP in network.inputs or not len(numbers):
+        return _KeptRows(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
+    steps = np.arange(1, numbers[-1] + 1)
+    before = np.maximum(np.searchsorted(numbers, steps, side="right") - 1, 0)
+    return _KeptRows(steps, before, numbers[before] == steps)
 
 
 def _list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
@@ -257,12 +347,12 @@ def _find(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str
     return present[0]
 
 
-def _read_times(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+def _read_times(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
     """Return the times of the rows, dates where the column holds dates."""
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
-        return _complete(columns, name, source)
-    _refuse(np.isnat(values), np.full(len(values), np.nan), f"column {name!r}", "a date", source)
+        return _complete(columns, name, checks)
+    checks.refuse(np.isnat(values), name, "a date", lambda row: "an empty cell")
     return values.astype("datetime64[ns]")
 
 
@@ -274,26 +364,19 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         warnings.warn(
             f"{source}, column {TIME!r}: {shared} of {len(time)} rows share their time with another row, as stamps do "
             f"that lost their digits; {len(counts)} times in all",
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
-def _complete(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
-    values = columns[name] if columns[name].dtype.kind == "i" else _numbers(columns, name, source)
-    _refuse(~np.isfinite(values), values, f"column {name!r}", "a finite number", source)
+def _complete(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
+    values = columns[name] if columns[name].dtype.kind == "i" else _numbers(columns, name, checks.source)
+    checks.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
     return values
 
 
-def _read_measurements(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
-    """Return a column of measurements, NaN where none arrived; an infinite one is refused."""
-    values = _numbers(columns, name, source)
-    _refuse(
-        np.isinf(values),
-        values,
-        f"column {name!r}",
-        "a finite number, or none where it did not arrive",
-        source,
-    )
+def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: _RowChecks) -> np.ndarray:
+    values = _numbers(columns, name, checks.source)
+    checks.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
     return values
 
 
@@ -303,8 +386,5 @@ def _numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.nd
     return np.asarray(columns[name], dtype=np.float64)
 
 
-def _refuse(bad: np.ndarray, values: np.ndarray, what: str, expected: str, source: str) -> None:
-    if np.any(bad):
-        row = int(np.argmax(bad))
-        came = "an empty cell" if np.isnan(values[row]) else f"{values[row]}"
-        raise fail(f"{source}, row {row + 1}, {what}", expected, came)
+def _describe_cell(values: np.ndarray) -> Callable[[int], str]:
+    return lambda row: "an empty cell" if np.isnan(values[row]) else f"{values[row]}"

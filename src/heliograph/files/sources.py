@@ -147,6 +147,12 @@ class Sources:
         counted = {node for source, places in mapped for node in places if source.sequence is not None}
         return {node for _, places in mapped for node in places} - counted
 
+    @property
+    def columns(self) -> set[str]:
+        """Return the columns, of rows of a table, of which the sources say what they mean."""
+        mapped = [single.source for several in self._table.values() for single in several]
+        return {name for source in mapped for path in source.fields for name in (path, path.split(".")[0])}
+
     def list_fields(self, topic: str) -> set[str]:
         """Return the fields of a topic's messages of which a source says what they mean, by the first of their path."""
         if topic not in self._asked:

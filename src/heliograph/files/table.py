@@ -1,31 +1,40 @@
 """Tables in files: columns of numbers in CSV or Parquet; the file extension selects the format."""
 
 import csv
-import gzip
 import os
 import re
-from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from heliograph.disk.quoting import quote_for_cell, unquote_cell
 from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
+from heliograph.files.text.csv_text import CsvRow, csv_rows, parse_cell
+from heliograph.files.text.dialects import NO_VALUE, check_distinct
+from heliograph.files.text.text_file import kind_of, until_cut_off
 from heliograph.numerics.check import InputError, fail, file_path, show_value, table
 from heliograph.numerics.masked import fill_masked, is_absent
-from heliograph.numerics.times.dates import dates, format_dates, looks_like_date
+from heliograph.numerics.times.dates import MISSING as NAT
+from heliograph.numerics.times.dates import dates, format_dates, looks_like_date, moment_of
 from heliograph.numerics.types import Shaped
 
 TIME = "time"
-PACKED = ".gz"
 EXACT = 2**53  # up to here doubles hold every whole number
 WITH_EXPONENT = 1e-5, 1e-4  # sizes of numbers that Python writes with an exponent, and JSON without
 LARGE = 1e16  # size from which on Python writes a sign before the exponent
+WHOLE = re.compile(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}")  # numbers that 64 bits hold
 BLOCK = 4096  # rows whose cells are in memory as texts at a time
+
+
+class Rows(NamedTuple):
+    """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read."""
+
+    columns: dict[str, np.ndarray]
+    numbers: np.ndarray
+    refused: list[InputError]
 
 
 def columns_of(table: object, name: str = "table", only: Container[str] | None = None) -> dict[str, np.ndarray]:
@@ -34,20 +43,21 @@ def columns_of(table: object, name: str = "table", only: Container[str] | None =
     Whole numbers that float64 cannot tell apart stay int64. Columns that are not among `only` are left out unread.
     """
     if isinstance(table, str | os.PathLike):
-        return _read_table(Path(table), only)
+        return read_rows(Path(table), only, strict=True).columns
     if isinstance(table, Mapping):
         named = dict(table)
     elif hasattr(table, "columns") and hasattr(table, "__getitem__"):
         frame: Any = table
         index = getattr(frame, "index", None)
         header = list(getattr(frame, "column_names", frame.columns))  # of pyarrow, whose columns are arrays
-        _check_distinct(name, header)
+        check_distinct(name, header)
         named = {TIME: index} if getattr(index, "name", None) == TIME and TIME not in header else {}
         named |= {column: frame[column] for column in header}
     else:
         raise fail(name, "a file, a DataFrame, or a dictionary of columns", show_value(table))
-    for column in [column for column in named if not isinstance(column, str)]:
-        raise fail(f"{name}, columns", "names that are text", show_value(column))
+    for column in named:
+        if not isinstance(column, str):
+            raise fail(f"{name}, columns", "names that are text", show_value(column))
     kept = {column: values for column, values in named.items() if only is None or column in only}
     return {column: _convert_column(values, f"{name}, column {column!r}") for column, values in kept.items()}
 
@@ -102,13 +112,9 @@ def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
             raise TypeError
         return np.array([np.nan if value is None else float(value) for value in column])
     except (TypeError, ValueError, OverflowError):
-        came = str(texts[0]) if texts and isinstance(texts[0], str) else some
-        raise fail(name, "numbers or dates", show_value(came)) from None
-
-
-SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
-COMMENTS = ("#", "%")
-MISSING = ("na", "n/a", "null", "none", "nil", "-", "?")
+        raise fail(
+            name, "numbers or dates", show_value(str(texts[0]) if texts and isinstance(texts[0], str) else some)
+        ) from None
 
 
 def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
@@ -128,20 +134,24 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
             Rows count from 1.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    return _read_table(file_path("table", path), None)
+    return read_rows(file_path("table", path), None, strict=True).columns
 
 
-def _read_table(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
-    """Read the columns of a file, or those of them that are among `only`."""
+def read_rows(path: Path, only: Container[str] | None, strict: bool) -> Rows:
+    """Read the rows of a file, or those of its columns that are among `only`.
+
+    Raises:
+        ValueError: what `read_table` refuses; where reading is not strict, a row alone is none of that.
+    """
     kind = kind_of(path) if kind_of(path) in FORMATS else format_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if path.stat().st_size == 0:
         raise fail(str(path), "a table with a header and rows", "an empty file")
-    columns = _read_csv(path, only) if kind == ".csv" else _read_parquet(path, only)
-    if not columns or not len(next(iter(columns.values()))):
-        raise fail(str(path), "at least one row", "none")
-    return columns
+    rows = _read_csv(path, only, strict) if kind == ".csv" else _read_parquet(path, only)
+    if not len(rows.numbers):
+        raise rows.refused[0] if rows.refused else fail(str(path), "at least one row", "none")
+    return rows
 
 
 def write_table(columns: Mapping[str, Shaped[np.ndarray, "..."]], path: str | Path) -> None:
@@ -173,154 +183,104 @@ def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
         raise fail("columns of a table", "at least one, all of one length", lengths)
 
 
-def _check_distinct(source: object, header: Sequence[object]) -> None:
-    if twice := [name for name, count in Counter(header).items() if count > 1]:
-        raise fail(f"{source}, header", "distinct columns", f"{twice[0]!r} more than once")
+class CsvColumns:
+    """Rows of CSV to columns, a part of a table at a time: a column is of dates if its first cell is one.
+
+    Args:
+        source: the name of the table, for errors.
+        path: the file, if it can be read again.
+        only: the columns that are read; None for all.
+        strict: whether what cannot be read is an error, or is refused alone.
+    """
+
+    def __init__(self, source: str, path: Path | None, only: Container[str] | None, strict: bool):
+        self.source, self.path, self._only, self._strict = source, path, only, strict
+        self.header: list[str] = []
+        self._dated = dict[str, bool]()  # by column whether it is of dates, once a cell has said so
+        self._zoned = dict[str, bool]()  # whether these have a zone
+
+    def read(self, rows: Iterable[CsvRow | InputError]) -> "Rows":
+        """Return the rows that can be read, as columns; why the others cannot.
+
+        Raises:
+            ValueError: another header than before; where reading is strict, a row that cannot be read.
+        """
+        refused, numbers = list[InputError](), list[int]()
+        texts, values = list[list[str]](), list[list[float | int]]()
+        for row in rows:
+            try:
+                if isinstance(row, InputError):
+                    raise row
+                self._check_header(row)
+                values.append(self._read_numbers(row))
+            except InputError as error:
+                if self._strict:
+                    raise
+                refused.append(error)
+            else:
+                numbers.append(row.number)
+                texts.append(row.cells)
+        columns = dict[str, np.ndarray]()
+        for i, name in enumerate(self.header):
+            if self._only is None or name in self._only:
+                columns[name] = self._make_column(name, [row[i] for row in values], [cells[i] for cells in texts])
+        return Rows(columns, np.array(numbers, dtype=np.int64), refused)
+
+    def _check_header(self, row: CsvRow) -> None:
+        if not self.header:
+            self.header = row.header
+        if row.header != self.header:
+            raise fail(row.where, f"the columns {', '.join(self.header)}", ", ".join(row.header))
+
+    def _read_numbers(self, row: CsvRow) -> list[float | int]:
+        """Return the number of each cell, nanoseconds of dates; of a column its first cell says what all are."""
+        dated = dict[str, bool]()
+        numbers: list[float | int] = []
+        for name, cell in zip(row.header, row.cells, strict=True):
+            if self._only is not None and name not in self._only:
+                numbers.append(np.nan)
+                continue
+            known = self._dated.get(name)
+            if (looks_like_date(cell) if known is None else known) and not self._is_missing(cell):
+                numbers.append(self._read_moment(row, name, cell))
+                dated[name] = True
+            elif known:
+                numbers.append(NAT)
+            else:
+                numbers.append(parse_cell(row.where, name, cell, self.path))
+                dated |= {name: False} if cell else {}
+        self._dated |= dated
+        return numbers
+
+    @staticmethod
+    def _is_missing(cell: str) -> bool:
+        return not cell or NO_VALUE.fullmatch(cell) is not None
+
+    def _read_moment(self, row: CsvRow, name: str, cell: str) -> int:
+        where = f"{row.where}, column {name!r}"
+        moment, zoned = moment_of(cell, where)
+        if self._zoned.setdefault(name, zoned) != zoned:
+            raise fail(where, "a zone with every date or with none", show_value(cell))
+        return moment
+
+    def _make_column(self, name: str, values: list[float | int], cells: list[str]) -> np.ndarray:
+        """Return a column as dates, or as int64 if its cells are whole numbers that doubles cannot tell apart."""
+        if self._dated.get(name):
+            whole = [NAT if value != value else int(value) for value in values]  # before the first date all are empty
+            return np.array(whole, dtype=np.int64).view("datetime64[ns]")
+        numbers = np.array(values, dtype=np.float64)
+        if np.any(np.abs(numbers) >= EXACT) and all(map(WHOLE.fullmatch, cells)):
+            return np.array([int(cell) for cell in cells], dtype=np.int64)
+        return numbers
 
 
-def kind_of(path: Path) -> str:
-    """Return the extension of a file in small letters, without .gz where it is packed."""
-    return (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
+def _read_csv(path: Path, only: Container[str] | None, strict: bool) -> "Rows":
+    columns = CsvColumns(str(path), path, only, strict)
+    rows = csv_rows(path, marked=False)
+    return columns.read(rows if strict else until_cut_off(rows))
 
 
-@contextmanager
-def open_text(path: Path) -> Iterator[TextIO]:
-    """Open a file of text in UTF-8, packed or not; ValueError for what is none."""
-    try:
-        if path.suffix.lower() == PACKED:
-            with gzip.open(path, "rt", newline="", encoding="utf-8-sig") as file:
-                yield file
-        else:
-            with path.open(newline="", encoding="utf-8-sig") as file:
-                yield file
-    except (UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
-        raise fail(str(path), "a text in UTF-8", str(error)) from None
-
-
-@contextmanager
-def csv_lines(path: Path) -> Iterator[Iterator[list[str]]]:
-    """Return the lines of a CSV file that are not empty; ValueError for text that is no CSV in UTF-8."""
-    try:
-        with open_text(path) as file:
-            yield (line for line in csv.reader(file, strict=True) if line)
-    except csv.Error as error:
-        raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
-
-
-def read_csv_header(path: Path) -> list[str]:
-    """Return the names of the columns of a CSV file; none of a file that is none."""
-    try:
-        with csv_lines(path) as lines:
-            return [name.strip() for name in next(lines, [])]
-    except InputError:
-        return []
-
-
-def _read_csv(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
-    """Read a table of CSV: numbers by column (NaN where a cell is empty), or dates where the first row has one."""
-    # Cells as text; every row must have as many as the header.
-    with csv_lines(path) as lines:
-        header = [unquote_cell(name.strip()) for name in next(lines, [])]
-        _check_header(path, header)
-        rows = [_split_row(path, header, number, line) for number, line in enumerate(lines, 1)]
-    if only is not None:
-        kept = [i for i, name in enumerate(header) if name in only]
-        header, rows = [header[i] for i in kept], [[cells[i] for i in kept] for cells in rows]
-    # The first row decides which columns are dates; all others are numbers.
-    dated = {i for i, cell in enumerate(rows[0] if rows else []) if looks_like_date(cell)}
-    numbers = [
-        [np.nan if i in dated else _parse_number(path, header[i], row, cell) for i, cell in enumerate(cells)]
-        for row, cells in enumerate(rows, 1)
-    ]
-    values = np.array(numbers, dtype=np.float64).reshape(len(rows), len(header))
-    columns = {name: _keep_exact(values[:, i].copy(), [cells[i] for cells in rows]) for i, name in enumerate(header)}
-    return columns | {header[i]: dates((cells[i] for cells in rows), f"{path}, column {header[i]!r}") for i in dated}
-
-
-def _keep_exact(values: np.ndarray, cells: Sequence[str]) -> np.ndarray:
-    """Return a column as int64 if its cells are whole numbers that doubles cannot tell apart."""
-    if not np.any(np.abs(values) >= EXACT) or not all(
-        re.fullmatch(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}", c) for c in cells
-    ):
-        return values
-    return np.array([int(cell) for cell in cells], dtype=np.int64)
-
-
-def _split_row(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
-    """Return the cells of a row; raise one line if it is a comment or has more or fewer than the header."""
-    if line[0].lstrip().startswith("#"):
-        remedy = _rewriting(path, comment="#")
-        raise fail(f"{path}, row {number}", "numbers", f"a comment, {show_value(line[0])}: {remedy}")
-    if len(line) != len(header):
-        hint = ": numbers have a decimal point" if len(line) > len(header) else ""
-        raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
-    return [cell.strip() for cell in line]
-
-
-def _parse_number(path: Path, name: str, number: int, cell: str) -> float:
-    """Return the number of a cell, NaN if it is empty; else raise one line that says how to write it."""
-    try:
-        if "_" in cell:  # Python's own way to write a number, and nobody else's
-            raise ValueError
-        return float(cell) if cell else np.nan
-    except ValueError:
-        hint = ""
-        if re.fullmatch(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", cell):
-            hint = f": thousands have no comma: {_rewriting(path, thousands=',')}"
-        elif re.fullmatch(r"[+-]?\d+,\d+", cell):
-            hint = f": numbers have a decimal point: {_rewriting(path, decimal=',')}"
-        if re.fullmatch(r"[-+.\de]+(?: +[-+.\de]+)+", cell):
-            hint = ": several numbers: " + _rewriting(path, sep="\\s+")
-        if cell.lower() in MISSING:
-            hint = ": a cell is empty where nothing arrived"
-        expected = "a number or an empty cell"
-        raise fail(f"{path}, row {number}, column {name!r}", expected, f"{show_value(cell)}{hint}") from None
-
-
-def _check_header(path: Path, header: Sequence[str]) -> None:
-    """Raise one line if the header is a comment, has other separators, or a name twice."""
-    line = ",".join(header)
-    if line.startswith(COMMENTS):
-        remedy = _suggest_without_comments(path)
-        raise fail(f"{path}, header", "names of columns", f"a comment, {show_value(line)}: {remedy}")
-    check_separators(path, header)
-    _check_distinct(path, header)
-
-
-def check_separators(path: Path, header: Sequence[str]) -> None:
-    """Raise ValueError, with what rewrites the file, where the only column is several names with other separators."""
-    line = ",".join(header)
-    for mark, name in SEPARATORS.items() if len(header) == 1 else ():
-        if mark in line:
-            with open_text(path) as file:
-                commas = re.search(r"\d,\d", file.read(10_000))
-            remedy = _rewriting(path, sep=mark, decimal=",") if commas else _rewriting(path, sep=mark)
-            raise fail(f"{path}, header", "names separated by commas", f"{name} in {show_value(line)}: {remedy}")
-
-
-def _suggest_without_comments(path: Path) -> str:
-    """Return the pandas call that converts a table whose first lines are comments, the last maybe its header."""
-    with open_text(path) as file:
-        lines = [line.strip() for line in file.read(100_000).splitlines() if line.strip()]
-    comments = next((i for i, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
-    following = lines[comments] if comments < len(lines) else "0"
-    mark = next((mark for mark in (",", *SEPARATORS) if mark in following), r"\s+")
-    first = re.split(mark if mark == r"\s+" else re.escape(mark), following)[0]
-    sep = {} if mark == "," else {"sep": mark}
-    if not re.match(r"[-+.\d]", first):  # names of their own
-        return _rewriting(path, comment=lines[0][0], **sep)
-    title = lines[comments - 1].lstrip("".join(COMMENTS) + " ")
-    split = [part.strip() for part in re.split(mark if mark == r"\s+" else re.escape(mark), title) if part.strip()]
-    return _rewriting(path, skiprows=comments, names=split, **sep)
-
-
-def _rewriting(path: Path, **how: object) -> str:
-    """Return the pandas call that converts a table written in another dialect."""
-    given = "".join(f", {name}={value!r}" for name, value in how.items())
-    return f"pandas.read_csv({str(path)!r}{given}).to_csv({str(path)!r}, index=False) rewrites it"
-
-
-def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
+def _read_parquet(path: Path, only: Container[str] | None) -> Rows:
     """Read a Parquet table: numbers by column (NaN where null), times in nanoseconds."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -330,7 +290,7 @@ def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarr
         table = pq.ParquetFile(path).read()
     except pa.ArrowInvalid as error:
         raise fail(str(path), "a Parquet file", str(error).splitlines()[0]) from None
-    _check_distinct(path, table.column_names)
+    check_distinct(path, table.column_names)
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         if only is not None and name not in only:
@@ -350,12 +310,12 @@ def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarr
         if not ((pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_null(kind)):
             raise fail(f"{path}, row 1, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
         columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
-    return columns
+    return Rows(columns, np.arange(1, table.num_rows + 1), [])
 
 
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
-        _check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
+        check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
         csv.writer(file).writerow(map(quote_for_cell, columns))
         for start in range(0, len(next(iter(columns.values()))), BLOCK):
             cells = [_format_cells(column[start : start + BLOCK]) for column in columns.values()]  # they need no quotes

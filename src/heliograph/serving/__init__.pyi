@@ -40,6 +40,9 @@ from .brokers.transport import (
 from .brokers.translator import (
     Translator as Translator,
 )
+from .brokers.line_reader import (
+    LineReader as LineReader,
+)
 from .brokers.pipe import (
     Pipe as Pipe,
 )

@@ -87,7 +87,7 @@ class UnreadMessage(NamedTuple):
 
 AnyMessage: TypeAlias = Message | NumberedMessage
 Read: TypeAlias = AnyMessage | UnreadMessage | str  # a message, as far as it could be read; only why it could not
-Payload: TypeAlias = bytes | Message | UnreadMessage | str  # a line of JSON; what was read already
+Payload: TypeAlias = bytes | Read  # a line of JSON; what was read already
 _READER, _FAST = TypeAdapter(Message), msgspec.json.Decoder(NumberedMessage)
 
 

@@ -12,6 +12,7 @@ from typing import Protocol
 from heliograph.live.fleet import Fleet
 from heliograph.live.network_program import NetworkProgram
 from heliograph.numerics.check import fail, instance
+from heliograph.serving.brokers.line_reader import LineReader, redirected_file
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport
@@ -24,6 +25,7 @@ from heliograph.serving.storage.store_protocol import AwayError, InMemoryStore, 
 from heliograph.serving.words import LastWordsService
 from heliograph.simulation.network import Network
 
+STANDARD_INPUT = 0
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
 
 
@@ -202,7 +204,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look:
         try:
             service.resume()
             broker = settings.broker
-            transport = Pipe(translator=reads) if broker is None else make_transport(broker, translator=reads)
+            transport = _open_pipe(settings, reads) if broker is None else make_transport(broker, translator=reads)
             patience = None if step is None else max(step, SHORTEST)
             looked = look(service) if reads is None else LastWordsService(look(service), reads.sources.words, store)
             await serve_until(stop, WaitingService(looked, stop), transport, patience)
@@ -214,6 +216,12 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look:
     if resumed and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
         _say(f"{service.known} messages were known already or came after what was final; {anew}")
+
+
+def _open_pipe(settings: ServiceSettings, reads: Translator | None) -> Pipe:
+    """Return the transport from standard input to standard output."""
+    path = redirected_file(STANDARD_INPUT)
+    return Pipe(STANDARD_INPUT, reader=LineReader(settings.network, reads, path, settings.ignore_unknown))
 
 
 def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.ExitStack | None = None) -> StoreProtocol:

@@ -35,6 +35,7 @@ class ServiceSettings:
         anew: names of plants that begin anew.
         sources: sources of messages that others make, by topic; None reads messages in our own form alone.
         others: nodes that other processes are, whose messages are left out.
+        ignore_unknown: whether columns that the network does not know are left out, of a table on standard input.
         name: name of the network on the page.
         accept_changes: whether the plants of a store whose network has changed go on with what fits.
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
@@ -57,6 +58,7 @@ class ServiceSettings:
     anew: tuple[str, ...] = ()
     sources: object = None
     others: tuple[str, ...] = ()
+    ignore_unknown: bool = False
     name: str = ""
     accept_changes: bool = False
     every: float | None = None

@@ -21,6 +21,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 import heliograph as hg
 from heliograph import cli
+from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.message import Message
 from heliograph.serving.running import make_transport
@@ -113,13 +114,20 @@ def test_what_cannot_be_read_is_one_line(translator, payload, line):
     assert isinstance(said, str) and said.startswith(line) and "\n" not in said
 
 
-def test_lines_with_a_topic_are_those_of_mosquitto_sub(translator):
-    (message,) = translator.line(b'{"topic": "shed/temperature", "payload": "21.5", "retain": 0}')
-    (other,) = translator.line(b'{"topic": "zigbee2mqtt/garden", "payload": {"temperature": 3}}')
+def test_lines_with_a_topic_are_those_of_mosquitto_sub(translator, file):
+    from tests.files.module import load_module
+
+    lines = LineReader(load_module(str(file))[0], translator)
+    (message,) = lines.read([b'{"topic": "shed/temperature", "payload": "21.5", "retain": 0}'])
+    (other,) = lines.read([b'{"topic": "zigbee2mqtt/garden", "payload": {"temperature": 3}}'])
     assert message.values == [21.5] and other.values == [3.0]
-    (dated,) = translator.line(b"1700000000.25 shed/temperature 21.5")  # mosquitto_sub -F "%U %t %p"
+    (dated,) = lines.read([b"1700000000.25 shed/temperature 21.5"])  # mosquitto_sub -F "%U %t %p"
     assert isinstance(dated, Message) and dated.time == datetime(2023, 11, 14, 22, 13, 20, 250_000, UTC)
-    assert translator.line(b'{"node": "garden"}') == [b'{"node": "garden"}'] and translator.line(b"x") == [b"x"]
+    (nobody, none) = lines.read([b'{"node": "garden"}', b"x"])
+    assert (
+        nobody == "standard input, line 4: expected a message in our own form, or a topic of the sources, got neither"
+    )
+    assert none.startswith("standard input, line 5: expected JSON, got 'x'")
 
 
 def test_lines_without_a_topic_are_of_the_only_one(file):
@@ -128,15 +136,21 @@ def test_lines_without_a_topic_are_of_the_only_one(file):
 
     network, _ = load_module(str(file))
     source = hg.files.json_field("t", node="garden", time="time", sequence=hg.files.Count("count", 8))
-    alone = Translator({"lines.jsonl": source}, network)
-    (message,) = alone.line(b'{"t": 20.5, "time": 1700000000, "count": 255}')
+    alone = LineReader(network, Translator({"lines.jsonl": source}, network))
+    (message,) = alone.read([b'{"t": 20.5, "time": 1700000000, "count": 255}'])
     assert isinstance(message, Message) and (message.sequence, message.values) == (255, [20.5])
-    (bad,) = alone.line(b'{"t": "warm", "time": 1700000001}')
-    assert isinstance(bad, str) and bad.startswith("lines.jsonl, field 't': expected a number")
+    (bad,) = alone.read([b'{"t": "warm", "time": 1700000001}'])
+    assert isinstance(bad, str) and bad.startswith("standard input, line 2, field 't': expected a number")
     own = b'{"node": "garden", "sequence": 0, "time": 1, "values": [1]}'
-    assert alone.line(own) == [own]
-    several = Translator({"lines.jsonl": source, "other.jsonl": source}, network)
-    assert several.line(b'{"t": 20.5, "time": 1700000000}') == [b'{"t": 20.5, "time": 1700000000}']
+    (event,) = alone.read([own])
+    assert (event.node, event.sequence, event.values) == ("garden", 0, [1.0])
+    table = {"lines.jsonl": source, "other.jsonl": source}
+    several = LineReader(network, Translator(table, network))
+    (neither,) = several.read([b'{"t": 20.5, "time": 1700000000}'])
+    assert "expected a message in our own form, or a topic of the sources, got neither" in neither
+    named = LineReader(network, Translator(table, network), Path("here/other.jsonl"))
+    (message,) = named.read([b'{"t": 20.5, "time": 1700000000}'])
+    assert message.values == [20.5]
 
 
 def test_sources_and_parts_exclude_each_other():

@@ -10,8 +10,8 @@ import numpy as np
 from heliograph.numerics.check import fail, show_value
 
 DATE = re.compile(
-    r"(?P<day>\d{4}-\d\d-\d\d)(?:[T ](?P<clock>\d\d:\d\d(?::\d\d(?:[.]\d{1,9})?)?))?"
-    r" ?(?P<zone>Z?[+-]\d\d(?::?\d\d)?|Z|UTC)?"  # mosquitto_sub writes Z+0100
+    r"(?P<day>\d{4}-\d\d-\d\d)(?:[T ](?P<clock>\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?))?"
+    r" ?(?P<zone>Z?[+-]\d\d(?::?\d\d)?|Z|UTC|GMT)?"  # mosquitto_sub writes Z+0100
 )
 MONTH = re.compile(r"(?P<year>\d{4})-(?:(?P<month>\d\d)|Q(?P<quarter>[1-4]))|(?P<of>\d{4})Q(?P<quarter_of>[1-4])")
 UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
@@ -53,7 +53,7 @@ def moment_of(text: str, name: str) -> tuple[int, bool]:
     if month := MONTH.fullmatch(text):
         quarter = month["quarter"] or month["quarter_of"]
         text = f"{month['year'] or month['of']}-{month['month'] or f'{3 * int(quarter) - 2:02}'}-01"
-    match = DATE.fullmatch(text)
+    match = DATE.fullmatch(text.upper())
     try:
         if match is None:
             raise ValueError
@@ -67,7 +67,7 @@ def _convert_to_nanoseconds(match: re.Match[str]) -> int:
     """Return the nanoseconds since 1970 in UTC."""
     if int(match["day"][:4]) not in YEARS:
         raise ValueError
-    nanoseconds = int(np.datetime64(f"{match['day']}T{match['clock'] or '00:00'}", "ns").astype(np.int64))
+    nanoseconds = int(np.datetime64(_local(match), "ns").astype(np.int64))
     zone = _offset(match["zone"])
     if zone == "Z":
         return nanoseconds
@@ -78,18 +78,23 @@ def _convert_to_nanoseconds(match: re.Match[str]) -> int:
     return nanoseconds - ahead if zone[0] == "+" else nanoseconds + ahead
 
 
+def _local(match: re.Match[str]) -> str:
+    """Return day and clock of a date, of which the fraction of a second may have a comma, with a point."""
+    return f"{match['day']}T{(match['clock'] or '00:00').replace(',', '.')}"
+
+
 def _offset(zone: str | None) -> str:
     """Return the zone of a date as an offset, Z for UTC and for none."""
-    return "Z" if zone in (None, "Z", "UTC") else str(zone).removeprefix("Z")
+    return "Z" if zone in (None, "Z", "UTC", "GMT") else str(zone).removeprefix("Z")
 
 
 def instant(text: str) -> datetime:
     """Return a date of ISO 8601 with its zone, to the microsecond."""
-    match = DATE.fullmatch(text)
+    match = DATE.fullmatch(text.upper())
     if match is None or match["zone"] is None or int(match["day"][:4]) not in YEARS:
         raise ValueError
     zone = _offset(match["zone"]).replace("Z", "+00:00")
-    return datetime.fromisoformat(f"{match['day']}T{match['clock'] or '00:00'}{zone}")
+    return datetime.fromisoformat(f"{_local(match)}{zone}")
 
 
 def seconds_between(time: np.ndarray) -> np.ndarray:

@@ -2,14 +2,16 @@
 
 import asyncio
 import os
+import re
 import select
 import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from typing import Protocol
 
 from heliograph.disk.whole_file import naming
-from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import Batch, nothing
+from heliograph.files.text.text_stream import TextStream
+from heliograph.serving.brokers.transport import LOG, Batch, nothing
 from heliograph.serving.message import LONGEST, Payload
 from heliograph.serving.output import Output
 
@@ -21,36 +23,56 @@ FULL, MORE = (
 AT_ONCE = 4096  # bytes that a pipe takes without waiting, once it takes any
 
 
+class Reader(Protocol):
+    """What makes messages of lines."""
+
+    source: str
+
+    def read(self, lines: Sequence[bytes]) -> list[Payload]:
+        """Return the messages of lines that are not empty."""
+
+    def end(self) -> list[Payload]:
+        """Return the messages of what is left at the end."""
+
+
 class Pipe:
     """Messages from one file descriptor, outputs to another, one a line. Empty lines are ignored.
 
-    A line longer than LONGEST bytes is cut there, and the rest of it is skipped.
+    What is packed (gzip) is unpacked, and UTF-16 read where its mark is there. A line longer than LONGEST bytes is cut
+    there, and the rest of it is skipped.
 
     Args:
         source: file descriptor of the messages (default 0, standard input).
         target: file descriptor of the outputs (default 1, standard output).
-        translator: what reads lines with a topic of others; None takes every line for a message.
+        reader: what makes messages of lines; None takes every line for a message.
     """
 
-    def __init__(self, source: int = 0, target: int = 1, translator: Translator | None = None):
-        self.source, self.target, self._translator = source, target, translator
-        self._rest, self._skipping = b"", False
+    def __init__(self, source: int = 0, target: int = 1, reader: Reader | None = None):
+        self.source, self.target, self._reader = source, target, reader
+        self._rest, self._skipping, self._said = b"", False, False
+        self._newline: bytes | None = None  # what ends a line; known once something follows one
+        self._text = TextStream("standard input" if reader is None else reader.source)
 
     async def receive(self) -> Batch | None:
         """Wait for lines of standard input, and return their messages; None at its end."""
         loop = asyncio.get_running_loop()
         while True:
-            await _wait_until_ready(self.source, loop.add_reader, loop.remove_reader)
-            with naming("standard input"):
-                data = self._read()
-            lines = self._split_lines(data)
-            if self._translator is None:
-                payloads: list[Payload] = list(lines)
-            else:
-                payloads = [payload for line in lines for payload in self._translator.line(line)]
+            data, ended = b"", False
+            if not self._text.more:
+                await _wait_until_ready(self.source, loop.add_reader, loop.remove_reader)
+                with naming("standard input"):
+                    data = self._read()
+                ended = not data
+            lines = self._split_lines(self._text.feed(data, ended), ended and not self._text.more)
+            payloads: list[Payload] = list(lines) if self._reader is None else self._reader.read(lines)
+            if ended and self._reader is not None:
+                payloads += self._reader.end()
+            if ended and self._text.broken and not self._said:
+                self._said = True
+                LOG.warning("%s", self._text.broken)
             if payloads:
                 return Batch(payloads, nothing)
-            if not data:
+            if ended:
                 return None
 
     def _read(self) -> bytes:
@@ -63,9 +85,13 @@ class Pipe:
             data += more
         return data
 
-    def _split_lines(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete with these bytes; at the end of the file, the incomplete last one."""
-        *lines, rest = (self._rest + data).split(b"\n") if data else [self._rest, b""]
+    def _split_lines(self, data: bytes, ended: bool) -> list[bytes]:
+        """Return the lines that are complete with these bytes; at the end of the file, also the incomplete last one."""
+        if self._newline is None and re.search(rb"[\r\n].", data, re.DOTALL):
+            self._newline = b"\n" if b"\n" in data else b"\r"
+        *lines, rest = (self._rest + data).split(self._newline or b"\n")
+        if ended:
+            lines, rest = [*lines, rest], b""
         if self._skipping and lines:
             del lines[0]
             self._skipping = False

@@ -1,19 +1,21 @@
 """Replay of a recording: the messages that its nodes would have sent, and the effects of a link on them."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.recording import read_recording
+from heliograph.files.recording import Recording, read_recording_file
 from heliograph.files.table import columns_of
 from heliograph.live.event import INPUTS, Event
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import check_seed, fail, file_path, instance, items, scalar
+from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
+SAME = 1e-3  # share by which a time step may differ from the difference of two times, which are rounded
 FAR = 1e12  # a mean delay of more is no time
 DELAY = "delay"  # the column of a trace: seconds or steps on the way, nan where a message was lost
 
@@ -52,7 +54,12 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     """
     path = file_path("recording", path)
     instance("network", network, Network, "a Network")
-    table = read_recording(path, network)
+    table, _ = read_recording_file(path, network, strict=True, ignore_unknown=False)
+    return events_of_recording(table, network)
+
+
+def events_of_recording(table: Recording, network: Network) -> tuple[list[Event], np.datetime64 | None]:
+    """Return the events of rows of time, in order, and the date of time 0, as `recorded` does."""
     # Time of each row: its index if the network counts steps, else seconds.
     dated = table.time.dtype.kind == "M"
     origin = table.time[0] if dated else None
@@ -60,14 +67,59 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     time = (table.time - origin).astype(np.int64) / 1e9 if dated else np.asarray(table.time, dtype=float)
     time = np.arange(float(len(time))) if steps else time
     given = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
-    # An event for the inputs of each row, and for each node that measured something in it.
-    events = []
-    for k, at in enumerate(time.tolist()):
-        if given and (steps or k):
-            events.append(Event(INPUTS, k, at if steps else float(time[k - 1]), table.inputs[k, given]))
-        received = {node: z[k] for node, z in table.measurements.items() if not np.isnan(z[k]).all()}
-        events += [Event(node, k, at, z) for node, z in received.items()]
-    return events, None if steps else origin
+    if not steps:
+        check_time_steps(
+            table.inputs[:, network.inputs.index(TIME_STEP)], time, np.arange(1, len(time) + 1), "recording"
+        )
+    events = row_events(np.arange(len(time)), time, table.inputs[:, given], table.measurements, None, steps)
+    return list(events), None if steps else origin
+
+
+def check_time_steps(dt: np.ndarray, time: np.ndarray, numbers: np.ndarray, source: str) -> None:
+    """Raise ValueError where a time step is not the time since the row before, which is all that messages say.
+
+    The first row has none before it.
+
+    Args:
+        dt: the time steps of the rows.
+        time: their times, in the same unit.
+        numbers: their numbers, for errors.
+        source: name of the table, for errors.
+    """
+    since = np.diff(time)
+    wrong = np.flatnonzero(~np.isclose(dt[1:], since, rtol=SAME, atol=1e-3 * SAME))
+    if wrong.size:
+        row = int(wrong[0])
+        expected = f"the time since the row before, {since[row]:.10g}, which is all that messages say"
+        raise fail(f"{source}, row {numbers[row + 1]}, column {TIME_STEP!r}", expected, f"{dt[row + 1]:.10g}")
+
+
+def row_events(
+    numbers: np.ndarray,
+    time: np.ndarray,
+    inputs: Float[np.ndarray, "rows given"],
+    measurements: Mapping[str, Float[np.ndarray, "rows received"]],
+    before: float | None,
+    steps: bool,
+) -> Iterator[Event]:
+    """Yield an event for the inputs of each row, and for each node that measured something in it.
+
+    Args:
+        numbers: counts of the rows, from 0.
+        time: the times of the rows: steps, or seconds.
+        inputs: the plant's inputs without dt.
+        measurements: values of each node, NaN where one did not arrive.
+        before: time of the row before the first; None if there is none.
+        steps: whether times are steps.
+    """
+    for i, (k, at) in enumerate(zip(numbers.tolist(), time.tolist(), strict=True)):
+        since = at if steps else before
+        if inputs.shape[1] and since is not None:
+            yield Event(INPUTS, k, since, inputs[i])
+        for node, z in measurements.items():
+            if not np.isnan(z[i]).all():
+                yield Event(node, k, at, z[i])
+        before = at
 
 
 def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
@@ -147,13 +199,16 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
     """
     for event in events:
         arrival = event.time if event.arrival is None else event.arrival
-        values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]
-        parts = {"plant": plant} if plant else {}
-        moments = {"time": _format_time(event.time, origin), "arrival": _format_time(arrival, origin)}
-        yield (
-            arrival,
-            json.dumps(parts | {"node": event.node, "sequence": int(event.sequence)} | moments | {"values": values}),
-        )
+        said = {"arrival": _format_time(arrival, origin)}
+        yield arrival, json.dumps(encode_event(event, plant, origin) | said)
+
+
+def encode_event(event: Event, plant: str, origin: np.datetime64 | None) -> dict[str, object]:
+    """Return an event as the fields of a message, without its arrival."""
+    values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]
+    name = {"plant": plant} if plant else {}
+    moment = {"time": _format_time(event.time, origin)}
+    return name | {"node": event.node, "sequence": int(event.sequence)} | moment | {"values": values}
 
 
 def _delay_event(event: Event, delay: float) -> Event:

@@ -1,12 +1,13 @@
 """Messages of topics that others make, to messages of a network by its sources."""
 
 from collections import Counter, OrderedDict
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 from heliograph.files.event_columns import YEAR
 from heliograph.files.fields import decode_json, parse_arrival
-from heliograph.files.message_files import log_line, read_log_entry
+from heliograph.files.message_files import FileMessage, message_name
 from heliograph.files.sources import Reading, Sources, Unread
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.serving.brokers.transport import LOG
@@ -60,34 +61,50 @@ class Translator:
             arrival: when it arrived.
             stored: whether the broker had stored it for new subscribers.
         """
-        return self._read(topic, payload, arrival, stored, again=True)
+        return self._read(topic, payload, arrival, stored, again=True, where=topic)
 
-    def line(self, payload: bytes) -> list[bytes | Message | UnreadMessage | str]:
-        """Return a line of a pipe as it is, or the messages in it if it has a topic and a payload.
+    def topic_of(self, path: Path | None) -> str | None:
+        """Return the topic of messages that name none: that of their file, or the only one; None if there is neither.
 
-        So MQTT clients print, `mosquitto_sub -F %j`, `-F "%I %t %p"` or `-v` for example. What a line says of its
-        arrival is used; one that says nothing arrives when it was measured, and at the present at the latest. A line
-        that names neither a topic nor a node is of the only topic of the sources, such as a line of a file.
+        Args:
+            path: the file; None of a pipe.
         """
+        names = () if path is None else (path.name, message_name(path))
+        return next((name for name in names if name in self.sources.topics), self._alone)
+
+    def topic_of_rows(self, path: Path | None, header: Sequence[str]) -> str | None:
+        """Return the topic of the rows of a table; None of one that the sources do not know.
+
+        Args:
+            path: the file; None of a pipe.
+            header: the names of the columns.
+        """
+        topic = self.topic_of(path)
+        if topic is None or (path is not None and topic in (path.name, message_name(path))):
+            return topic
+        fields = [field for mapped in self.sources.of(topic) for field in mapped.source.fields]
+        return topic if all(field in header or field.split(".")[0] in header for field in fields) else None
+
+    def decode(self, message: FileMessage, topic: str | None) -> list[Message | UnreadMessage | str]:
+        """Return the messages in a line or a row, or why it cannot be read; nothing of unknown topics.
+
+        What it says of its arrival is used; one that says nothing arrives when it was measured, and at the present at
+        the latest.
+
+        Args:
+            message: the line or the row.
+            topic: topic of one that names none.
+        """
+        name = topic if message.topic is None else message.topic
+        if name is None:
+            return [str(fail(message.where, "a message in our own form, or a topic of the sources", "neither"))]
         try:
-            content = decode_json(payload[:LONGEST], "line")
-        except InputError:
-            content = None
-        logged = read_log_entry(content)
-        if logged is None and content is None:
-            parts = log_line(payload.decode(errors="replace"))
-            logged = parts and (*parts, False)
-        if logged is None and self._alone is not None and not (isinstance(content, dict) and "node" in content):
-            came = content.get("arrival") if isinstance(content, dict) else None
-            logged = self._alone, payload.decode(errors="replace"), came, False
-        if logged is None:
-            return [payload]
-        topic, inner, came, stored = logged
-        try:
-            arrival = None if came is None else date_of(parse_arrival(came, f"{topic}, arrival"))
+            arrival = None
+            if message.arrival is not None:
+                arrival = date_of(parse_arrival(message.arrival, f"{message.where}, arrival"))
         except InputError as error:
             return [str(error)]
-        return list(self._read(topic, inner.encode(), arrival, stored, again=False))
+        return self._read(name, message.content, arrival, message.stored, again=False, where=message.where)
 
     def left_out(self) -> list[str]:
         """Return lines on messages that were not used: of unknown topics, and stored ones."""
@@ -104,25 +121,25 @@ class Translator:
         return lines
 
     def _read(
-        self, topic: str, payload: bytes, arrival: datetime | None, stored: bool, again: bool
+        self, topic: str, payload: object, arrival: datetime | None, stored: bool, again: bool, where: str
     ) -> list[Message | UnreadMessage | str]:
         """Read a payload; `again`: a message may be sent again."""
         results: list[Message | UnreadMessage | str] = []
         try:
-            if self.sources.hear(topic, payload, topic):
+            if self.sources.hear(topic, payload, where):
                 return []
             if not self.sources.of(topic):  # whatever it is
                 self.sources.unknown[topic] += 1
                 return []
-            content = _decode(payload, topic)
-            for reading in self.sources.read(topic, content, topic):
+            content = _decode(payload, where)
+            for reading in self.sources.read(topic, content, where):
                 if isinstance(reading, Unread):
-                    results.append(self._explain_unread(topic, reading, arrival, again))
+                    results.append(self._explain_unread(where, reading, arrival, again))
                     continue
                 if stored and reading.time is None:
                     self._stored += 1
                     continue
-                results.append(self._make_message(topic, reading, arrival, again))
+                results.append(self._make_message(where, reading, arrival, again))
                 self.sources.senders.note(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
                 for said in self.sources.senders.news():
                     LOG.warning("%s", said)
@@ -199,7 +216,10 @@ def date_of(nanoseconds: int) -> datetime:
         raise fail("time", "a date of these thousand years", nanoseconds) from None
 
 
-def _decode(payload: bytes, topic: str) -> object:
+def _decode(payload: object, where: str) -> object:
+    """Return the content of a payload; of a row what its columns say."""
+    if not isinstance(payload, bytes | str):
+        return payload
     if len(payload) > LONGEST:
-        raise fail(topic, f"at most {LONGEST} bytes", len(payload))
-    return decode_json(payload, topic)
+        raise fail(where, f"at most {LONGEST} bytes", len(payload))
+    return decode_json(payload, where)

@@ -3,8 +3,7 @@
 import numpy as np
 
 import heliograph as hg
-from heliograph.files import read_table
-from heliograph.files.forecasts import write_forecast
+from heliograph.files import read_table, write_forecast
 
 
 def test_rows_of_forecasts_are_marked(tmp_path):

@@ -1,0 +1,1 @@
+"""Estimates in tables: of a recording, and forecasts below them."""

@@ -1,0 +1,78 @@
+"""Estimates in files: a table of means, deviations and covariances, a row for each of the recording."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.files.table import TIME, write_table
+from heliograph.model.estimate import Estimate, is_sound
+from heliograph.numerics.check import fail, instance
+from heliograph.simulation.results.record import Record
+
+
+def estimate_columns(record: Record) -> dict[str, np.ndarray]:
+    """Return the estimates of a recording as columns."""
+    columns = [(TIME, record.time)]
+    several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
+    for node, filters in record.estimates.items():
+        for name, estimate in filters.items():
+            prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
+            columns += [(prefix + key, values) for key, values in _make_columns(record.states, record.units, estimate)]
+            later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
+            if name in later:
+                known = _make_columns(record.states, record.units, later[name])
+                columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in known]
+    twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
+    if twice:
+        raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")
+    return dict(columns)
+
+
+def write_estimates(record: Record, path: str | Path) -> None:
+    """Write `estimate_columns` to a CSV or Parquet file, as a whole or not at all; in CSV, valid is 1 or 0.
+
+    Args:
+        record: the result of `run`.
+        path: the file, ending in .csv or .parquet.
+
+    Raises:
+        ValueError: another format, or a folder that cannot be written.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    instance("record", record, Record, "a Record")
+    write_table(estimate_columns(record), path)
+
+
+def make_header(name: str, unit: str | None) -> str:
+    """Return the name of a column, with its unit where there is one."""
+    return f"{name} ({unit})" if unit else str(name)
+
+
+def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
+    """Return the columns that show an estimate: means, standard deviations and covariances as claimed, and validity."""
+    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    if mean.ndim != 2:
+        raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
+    columns = []
+    for i, state in enumerate(states):
+        columns.append((make_header(state, units.get(state)), mean[:, i]))
+        if estimate.claim != "none":
+            variance = bound[:, i, i]
+            columns.append(
+                (make_header(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
+            )
+    # Covariances of two states have the product of their units.
+    if estimate.claim != "none":
+        for i, a in enumerate(states):
+            for j in range(i + 1, len(states)):
+                of = " ".join(units[name] for name in (a, states[j]) if name in units)
+                columns.append((make_header(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
+    return [*columns, ("valid", is_sound(estimate))]
+
+
+def _pad_start(values: np.ndarray, rows: int) -> np.ndarray:
+    """Extend a column at its start by NaN, or false, to a number of rows."""
+    none = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
+    return np.concatenate([none.astype(values.dtype), values])

@@ -1,0 +1,162 @@
+"""Text of CSV, a line at a time, to rows of cells: of a file, and of a pipe whose lines come when they come."""
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from heliograph.disk.quoting import unquote_cell
+from heliograph.files.text.dialects import NO_VALUE, check_header, hint_of_cell, recoding, rewriting
+from heliograph.files.text.text_file import is_text, open_text
+from heliograph.numerics.check import InputError, fail, show_value
+
+ANNOTATIONS = ("#group", "#datatype", "#default", "#constant")  # of Influx's annotated CSV
+OPEN = 100  # lines that a cell in quotes may have
+
+
+class CsvRow(NamedTuple):
+    """Row of a table.
+
+    Attributes:
+        where: its place, for errors.
+        number: its number, from 1.
+        header: the names of its columns.
+        cells: a text for each column, without margins.
+    """
+
+    where: str
+    number: int
+    header: list[str]
+    cells: list[str]
+
+
+class CsvText:
+    """Reader of a table of CSV, to which lines are given one after another.
+
+    The first line that is not empty has the names of the columns; annotations of Influx begin a table with a header of
+    its own. Rows count from 1 over all of them. What is no row is an error in its place, and the rest goes on: a
+    comment, more or fewer cells than columns, bytes that are no text, a quote that is not closed.
+
+    Args:
+        source: the name of the table, for errors.
+        path: the file, if it can be read again.
+        marked: whether the first of several names may begin with a mark of comments.
+    """
+
+    def __init__(self, source: str, path: Path | None, marked: bool):
+        self.source, self.path, self._marked = source, path, marked
+        self.header: list[str] = []
+        self.number = 0
+        self._open: list[str] = []  # lines since one with a quote that is not closed
+
+    def add(self, line: str) -> list[CsvRow | InputError]:
+        """Return the rows that a line completes, or why one cannot be read.
+
+        Raises:
+            ValueError: a header that names no columns, or one of them twice; one line.
+        """
+        if not self._open and '"' not in line:
+            return self._row(line.rstrip("\r\n").split(","))
+        self._open.append(line)
+        return self._close(ended=False)
+
+    def end(self) -> list[CsvRow | InputError]:
+        """Return what is left at the end of the text."""
+        return self._close(ended=True)
+
+    def _close(self, ended: bool) -> list[CsvRow | InputError]:
+        """Read the lines since a quote was opened, if it is closed; one that never is costs its own line alone."""
+        rows: list[CsvRow | InputError] = []
+        while self._open:
+            try:
+                cells = next(csv.reader(["".join(self._open)], strict=True))
+            except csv.Error as error:
+                if "unexpected end" in str(error) and not ended and len(self._open) < OPEN:
+                    return rows
+                lines, self._open = self._open, []
+                rows += self._row(lines[:1], str(error))
+                for line in lines[1:]:
+                    rows += self.add(line)
+                if not ended:
+                    return rows
+            else:
+                self._open = []
+                rows += self._row(cells)
+        return rows
+
+    def _row(self, cells: list[str], broken: str = "") -> list[CsvRow | InputError]:
+        """Return the row of these cells; nothing of a header and of an empty line."""
+        if not broken and not any(cell.strip() for cell in cells):
+            return []
+        if cells[0].strip() in ANNOTATIONS:
+            self.header = []
+            return []
+        if not self.header:
+            if broken:
+                raise fail(f"{self.source}, header", "names separated by commas", f"{show_value(cells[0])}: {broken}")
+            header = [unquote_cell(name.strip()) for name in cells]
+            check_header(self.source, header, self.path, self._marked)
+            self.header = header
+            return []
+        self.number += 1
+        where = f"{self.source}, row {self.number}"
+        why = fail(where, "a row of CSV", broken) if broken else self._fault(where, cells)
+        return [CsvRow(where, self.number, self.header, [c.strip() for c in cells]) if why is None else why]
+
+    def _fault(self, where: str, cells: list[str]) -> InputError | None:
+        """Return why cells are no row of this table; None if they are."""
+        line = ",".join(cells)
+        if not is_text(line):
+            return fail(where, "a text in UTF-8 or UTF-16", f"{show_value(line)}{recoding(self.path, line)}")
+        if line.lstrip().startswith("#") and not (self._marked and len(cells) == len(self.header)):
+            remedy = "" if self.path is None else f": {rewriting(self.path, comment='#')}"
+            return fail(where, "numbers", f"a comment, {show_value(cells[0])}{remedy}")
+        if len(cells) != len(self.header):
+            hint = ": numbers have a decimal point" if len(cells) > len(self.header) else ""
+            return fail(where, f"{len(self.header)} cells, one for each column", f"{len(cells)}{hint}")
+        return None
+
+
+def csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
+    """Yield the rows of a file of CSV, or why one cannot be read; `marked` is as of `CsvText`.
+
+    Raises:
+        ValueError: a header that names no columns; a packed file that is damaged, from there on.
+    """
+    text = CsvText(str(path), path, marked)
+    with open_text(path) as file:
+        for line in file:
+            yield from text.add(line)
+    yield from text.end()
+
+
+def read_csv_header(path: Path) -> list[str]:
+    """Names of the columns of a CSV file; none of a file that is none."""
+    text = CsvText(str(path), path, marked=True)
+    try:
+        with open_text(path) as file:
+            for line in file:
+                text.add(line)
+                if text.header:
+                    break
+    except (InputError, OSError):
+        return []
+    return text.header
+
+
+def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
+    """Return the number of a cell, NaN of one that is empty or says that there is no value.
+
+    Raises:
+        ValueError: no number; one line with what is probably meant.
+    """
+    try:
+        if "_" in cell:  # Python's own way to write a number, and nobody else's
+            raise ValueError
+        return float(cell) if cell else float("nan")
+    except ValueError:
+        if NO_VALUE.fullmatch(cell):
+            return float("nan")
+        hint = hint_of_cell(cell, name, path)
+        expected = "a number or an empty cell"
+        raise fail(f"{where}, column {name!r}", expected, f"{show_value(cell)}{hint}") from None

@@ -1,0 +1,94 @@
+"""Bytes of a pipe to text in UTF-8, as they come: unpacked, and out of UTF-16."""
+
+import codecs
+import zlib
+
+from heliograph.files.text.text_file import GZIP, WIDE, encoding_of
+from heliograph.numerics.check import fail
+
+AT_ONCE = 1 << 23  # bytes that are unpacked at a time
+NO_TEXT = {
+    b"PAR1": "a Parquet file",
+    b"\x89MCAP": "a bag",
+    b"SQLite format 3": "a bag",
+    b"#ROSBAG": "a bag",
+    b"PK\x03\x04": "a file of zip",
+}
+LONGEST_START = max(map(len, NO_TEXT))
+
+
+class TextStream:
+    """Bytes to text in UTF-8. What they are is said by the first of them.
+
+    Args:
+        source: where they come from, for errors.
+
+    Attributes:
+        broken: why the text ended before its end; "" if it did not.
+    """
+
+    def __init__(self, source: str):
+        self.source, self.broken = source, ""
+        self._start: bytes | None = b""  # bytes of which it is not known yet what they are
+        self._packed: bytes | None = None  # packed bytes that are not unpacked yet; None of what is not packed
+        self._unpack, self._begun = zlib.decompressobj(16 + zlib.MAX_WBITS), False
+        self._inside: TextStream | None = None  # of what was packed
+        self._decode: codecs.IncrementalDecoder | None = None
+
+    @property
+    def more(self) -> bool:
+        """Return whether there is text that no more bytes are needed for."""
+        return bool(self._packed) and not self.broken
+
+    def feed(self, data: bytes, ended: bool = False) -> bytes:
+        """Return text that is complete with these bytes; `ended`: there will be no more.
+
+        Raises:
+            ValueError: bytes that are those of no text.
+        """
+        if self._start is not None:
+            self._start += data
+            if len(self._start) < LONGEST_START and not ended and self._may_be_no_text(self._start):
+                return b""
+            data, self._start = self._begin(self._start), None
+        if self._inside is not None:
+            return self._inside.feed(self._unpacked(data, ended), ended and not self.more)
+        if self._decode is not None:
+            return self._decode.decode(data, ended).encode("utf-8", "replace")
+        return data
+
+    @staticmethod
+    def _may_be_no_text(start: bytes) -> bool:
+        """Return whether more bytes may show that these are no text in UTF-8."""
+        marks = (*NO_TEXT, GZIP, *WIDE, codecs.BOM_UTF8)
+        return any(mark.startswith(start) for mark in marks if len(start) < len(mark))
+
+    def _begin(self, start: bytes) -> bytes:
+        """Choose how the bytes are read; return those that are read so."""
+        for mark, kind in NO_TEXT.items():
+            if start.startswith(mark):
+                came = f"{kind}: heliograph replay sends it as messages"
+                raise fail(self.source, "text: CSV, lines of JSON, a log", came)
+        if start.startswith(GZIP):
+            self._packed, self._inside = b"", TextStream(self.source)
+        elif encoding_of(start) == "utf-16":
+            self._decode = codecs.getincrementaldecoder("utf-16")("replace")
+        return start.removeprefix(codecs.BOM_UTF8)
+
+    def _unpacked(self, data: bytes, ended: bool) -> bytes:
+        """Return what is packed in these bytes, a part of it at a time; nothing after damage."""
+        packed, results = (self._packed or b"") + data, b""
+        try:
+            while packed and len(results) < AT_ONCE and not self.broken:
+                self._begun = True
+                results += self._unpack.decompress(packed, AT_ONCE)
+                packed = self._unpack.unconsumed_tail
+                if self._unpack.eof:  # files one after another are one
+                    packed, self._begun = self._unpack.unused_data.lstrip(b"\0"), False
+                    self._unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
+        except zlib.error as error:
+            self.broken = str(fail(self.source, "a packed file without damage", error))
+        self._packed = packed
+        if ended and self._begun and not packed and not self.broken:
+            self.broken = str(fail(self.source, "a packed file without damage", "one that was cut off"))
+        return results

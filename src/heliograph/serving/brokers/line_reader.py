@@ -1,0 +1,145 @@
+"""Lines of a pipe to messages: JSON, logs of MQTT clients, or a table of CSV, as the first lines say."""
+
+import json
+import os
+import re
+import stat
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from heliograph.files.fields import decode_json
+from heliograph.files.message_files import FileMessage, convert_line, convert_object, flatten
+from heliograph.files.own_messages import OwnReader, is_own
+from heliograph.numerics.check import InputError, file_path, flag, instance
+from heliograph.serving.brokers.table_lines import TableLines, read_own
+from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
+from heliograph.simulation.network import Network
+
+OPENS = re.compile(rb"\s*(?:\[(?!.*\]\s*$)|\{\s*$)")  # the first line of a document of JSON that has several
+CLOSES = re.compile(rb"[\]}]")  # the last one, which is not indented
+
+
+class LineReader:
+    """Lines of a pipe, to messages of a network.
+
+    Args:
+        network: the network.
+        translator: the sources of the network's file; None if it has none.
+        path: the file that is redirected, whose name may be a topic; None of any other pipe.
+        ignore_unknown: whether columns that the network does not know are left out (default False).
+
+    Attributes:
+        source: where the lines come from, for errors.
+
+    Raises:
+        ValueError: no network, translator or path.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        translator: Translator | None = None,
+        path: Path | None = None,
+        ignore_unknown: bool = False,
+    ):
+        instance("network", network, Network, "a Network")
+        if translator is not None:
+            instance("translator", translator, Translator, "a Translator, or None")
+        path = None if path is None else file_path("path", path)
+        ignore_unknown = flag("ignore_unknown", ignore_unknown)
+        self.source = "standard input" if path is None else str(path)
+        self._translator = translator
+        self._topic = None if translator is None else translator.topic_of(path)
+        self._own = OwnReader(network, self.source, ignore_unknown, table=False)
+        self._table = TableLines(network, translator, path, ignore_unknown)
+        self._is_table: bool | None = None  # known once a message or the names of columns came
+        self._document: list[bytes] | None = None  # lines of a document that has not ended
+        self._number = 0
+
+    def read(self, lines: Sequence[bytes]) -> list[Payload]:
+        """Return the messages of lines, which are not empty.
+
+        Raises:
+            ValueError: a table whose header names no columns, or others than expected; one line.
+        """
+        payloads, rows = list[Payload](), list[str]()
+        for line in lines:
+            if self._is_table is None:
+                self._is_table = self._table.names_columns(_text(line)) or None
+            if self._is_table:
+                rows.append(_text(line))
+            else:
+                self._number += 1
+                payloads += self._line(line)
+        return payloads + (self._table.read(rows) if rows else [])
+
+    def end(self) -> list[Payload]:
+        """Return the messages of what is left at the end."""
+        if self._is_table:
+            return self._table.end()
+        return [] if self._document is None else self._read_document(self._document)
+
+    def _line(self, line: bytes) -> list[Payload]:
+        """Return the messages of a line that is none of a table."""
+        if self._document is not None:
+            self._document.append(line)
+            return self._read_document(self._document) if CLOSES.match(line) else []
+        if self._is_table is None and OPENS.match(line):
+            self._document = [line]
+            return []
+        if len(line) > LONGEST:
+            return [line]
+        (read,) = read_messages([line])
+        if not isinstance(read, str | UnreadMessage):
+            self._is_table = False
+            return [read]
+        messages = convert_line(f"{self.source}, line {self._number}", _text(line))
+        return [payload for message in messages for payload in self._message(message, read)]
+
+    def _read_document(self, lines: list[bytes]) -> list[Payload]:
+        """Return the messages of a document of several lines; of its lines, where these are none together."""
+        self._document = None
+        with suppress(InputError):
+            content = decode_json(b"\n".join(lines), self.source)
+            items = enumerate(flatten(content), 1)
+            found = [convert_object(f"{self.source}, message {number}", item) for number, item in items]
+            return [payload for message in found for payload in self._message(message, None)]
+        self._is_table, self._number = False, self._number - len(lines)
+        payloads = list[Payload]()
+        for line in lines:
+            self._number += 1
+            payloads += self._line(line)
+        return payloads
+
+    def _message(self, message: FileMessage | InputError, read: Read | None) -> list[Payload]:
+        """Return the messages of a line or of a part of it; `read` is why the line is none in our own form as it is."""
+        if isinstance(message, InputError):
+            return [str(message)]
+        own = message.topic is None and is_own(message.content)
+        if self._translator is not None and not own:
+            self._is_table = False
+            return [*self._translator.decode(message, self._topic)]
+        if read is None:  # a part of a document
+            (read,) = read_messages([json.dumps(message.content).encode()])
+        if not own:
+            return [read]
+        self._is_table = False
+        if not isinstance(read, str | UnreadMessage):
+            return [read]
+        payloads = read_own(self._own, message.where, message.content)
+        return payloads if any(isinstance(payload, Message) for payload in payloads) else [read]
+
+
+def redirected_file(descriptor: int) -> Path | None:
+    """Return the file that a descriptor reads, where the system says it; None of a pipe."""
+    with suppress(OSError):
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+            return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    return None
+
+
+def _text(line: bytes) -> str:
+    return line.decode("utf-8", "surrogateescape")

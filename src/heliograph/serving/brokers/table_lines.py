@@ -1,0 +1,184 @@
+"""Lines of a table of CSV that come through a pipe, to messages: rows of time, events, and rows that sources map."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.files.message_files import PAYLOAD, TOPIC, convert_row, typed_cells
+from heliograph.files.own_messages import NODE, OWN, SEQUENCE, OwnReader
+from heliograph.files.recording import RowReader
+from heliograph.files.sources import Reading, Unread
+from heliograph.files.table import CsvColumns
+from heliograph.files.text.csv_text import ANNOTATIONS, CsvRow, CsvText
+from heliograph.files.text.dialects import COMMENTS, names_in
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError
+from heliograph.serving.brokers.replay import check_time_steps, encode_event, row_events
+from heliograph.serving.brokers.translator import Translator, date_of
+from heliograph.serving.message import Message, Payload, UnreadMessage
+from heliograph.simulation.network import Network
+
+SECOND = np.timedelta64(1_000_000_000, "ns")
+
+
+class TableLines:
+    """Lines of a table, to messages. What the table has is said by its header, as of a file.
+
+    Args:
+        network: the network.
+        translator: the sources of the network's file; None if it has none.
+        path: the file that is redirected, whose name may be a topic; None of any other pipe.
+        ignore_unknown: whether columns that the network does not know are left out.
+    """
+
+    def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
+        self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
+        self._source = "standard input" if path is None else str(path)
+        self._text = CsvText(self._source, path, marked=translator is not None)
+        self._reader: EventRows | MappedRows | TimeRows | None = None
+
+    def names_columns(self, line: str) -> bool:
+        """Return whether a line is the first of a table: it names a column that the network or its sources know."""
+        text = line.strip()
+        if not text or text[0] in "[{" or not (names := names_in(text)):
+            return False
+        if text.startswith(ANNOTATIONS):
+            return True
+        known = {*OWN, TOPIC, PAYLOAD, *RowReader(self._network, self._source, False, False).names}
+        fields = set() if self._translator is None else self._translator.sources.columns
+        return (len(names) > 1 or text.startswith(COMMENTS)) and bool(names & (known | fields))
+
+    def read(self, lines: Sequence[str]) -> list[Payload]:
+        """Return the messages of lines.
+
+        Raises:
+            ValueError: a header that names no columns, or others than expected; one line.
+        """
+        return self._convert([row for line in lines for row in self._text.add(f"{line}\n")])
+
+    def end(self) -> list[Payload]:
+        """Return the messages of what is left at the end."""
+        return self._convert(self._text.end())
+
+    def _convert(self, rows: list[CsvRow | InputError]) -> list[Payload]:
+        if self._reader is None and self._text.header:
+            self._reader = self._choose(self._text.header)
+        return [] if self._reader is None or not rows else self._reader.read(rows)
+
+    def _choose(self, header: list[str]) -> "EventRows | MappedRows | TimeRows":
+        """Return the reader of rows with these columns."""
+        if {NODE, SEQUENCE} <= set(header):
+            return EventRows(OwnReader(self._network, self._source, self._ignore, table=True))
+        if self._translator is not None:
+            topic = self._translator.topic_of_rows(self._path, header)
+            if topic is not None or TOPIC in header:
+                return MappedRows(self._translator, topic)
+        return TimeRows(self._network, header, self._text, self._ignore)
+
+
+class MappedRows:
+    """Rows of which the sources say what they mean: of a log with a column `topic`, or all of one topic."""
+
+    def __init__(self, translator: Translator, topic: str | None):
+        self._translator, self._topic = translator, topic
+
+    def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
+        """Return the messages of rows."""
+        payloads = list[Payload]()
+        for row in rows:
+            if isinstance(row, InputError):
+                payloads.append(str(row))
+            else:
+                payloads += self._translator.decode(convert_row(row.where, typed_cells(row)), self._topic)
+        return payloads
+
+
+class EventRows:
+    """Rows that are events in our own form."""
+
+    def __init__(self, reader: OwnReader):
+        self._reader = reader
+
+    def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
+        """Return the messages of rows."""
+        payloads = list[Payload]()
+        for row in rows:
+            if isinstance(row, InputError):
+                payloads.append(str(row))
+            else:
+                payloads += read_own(self._reader, row.where, typed_cells(row))
+        return payloads
+
+
+class TimeRows:
+    """Rows of time, as `heliograph.files.read_recording` reads them."""
+
+    def __init__(self, network: Network, header: list[str], text: CsvText, ignore_unknown: bool):
+        self._network, self._steps = network, TIME_STEP not in network.inputs
+        self._rows = RowReader(network, text.source, strict=False, ignore_unknown=ignore_unknown)
+        self._columns = CsvColumns(text.source, text.path, self._rows.only, strict=False)
+        self._columns.header = header
+        self._given = [name for name in network.inputs if name != TIME_STEP]
+        self._origin: np.datetime64 | None = None
+        self._before: float | None = None  # time of the row before
+
+    def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
+        """Return the messages of rows, as a replay of them has them, and why others cannot be read."""
+        cells = self._rows.read_cells(self._columns.read(rows))
+        refused, self._rows.refused = [str(error) for error in self._rows.refused], []
+        count = len(cells.numbers)
+        if not count:
+            return [*refused]
+        time = self._seconds(cells.time, cells.numbers)
+        if TIME_STEP in cells.inputs:
+            dt, first = cells.inputs[TIME_STEP], [] if self._before is None else [self._before]
+            numbers = np.concatenate([cells.numbers[: len(first)], cells.numbers])
+            steps = np.concatenate([dt[: len(first)], dt])
+            check_time_steps(steps, np.concatenate([first, time]), numbers, self._rows.source)
+        inputs = np.stack([cells.inputs[name] for name in self._given], axis=1) if self._given else np.zeros((count, 0))
+        events = row_events(cells.numbers - 1, time, inputs, cells.measurements, self._before, self._steps)
+        lines = [json.dumps(encode_event(event, "", self._origin)).encode() for event in events]
+        self._before = float(time[-1])
+        return [*lines, *refused]
+
+    def _seconds(self, time: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return the times in the unit of messages: steps, numbers, or seconds since the first date."""
+        if self._steps:
+            return np.asarray(numbers - 1.0)
+        if time.dtype.kind != "M":
+            return np.asarray(time, dtype=float)
+        self._origin = time[0] if self._origin is None else self._origin
+        return np.asarray((time - self._origin) / SECOND)
+
+
+def read_own(reader: OwnReader, where: str, content: dict[str, object]) -> list[Payload]:
+    """Return the messages of an event in our own form, or why it cannot be read, with its count and time if known."""
+    try:
+        found = reader.read(where, content)
+    except InputError as error:
+        return [str(error)]
+    payloads = list[Payload]()
+    for reading, arrival in found:
+        if not isinstance(reading, Unread):
+            payloads.append(_message(reader, reading, arrival))
+        elif reading.counted is not None:
+            payloads.append(UnreadMessage(_message(reader, reading.counted, arrival), str(reading.error)))
+    return payloads
+
+
+def _message(reader: OwnReader, reading: Reading, arrival: float) -> Message:
+    """Return the message of an event; where it arrived when it was measured, as far as is known, it says no arrival."""
+    assert reading.time is not None
+    moments = [reading.time, *([] if arrival == reading.time else [arrival])]
+    said = [moment if reader.numbers else date_of(int(moment)) for moment in moments]
+    return Message.model_construct(
+        plant=reading.plant,
+        node=reading.node,
+        sequence=reading.sequence,
+        time=said[0],
+        values=[None if value != value else value for value in reading.values.tolist()],
+        inputs=None,
+        arrival=said[1] if len(said) > 1 else None,
+    )
