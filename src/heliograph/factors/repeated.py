@@ -24,6 +24,10 @@ from heliograph.factors.columns import (
 from heliograph.numerics.linalg import WRITTEN, outer, scale
 from straightline import operation
 
+# Noise, in variances that count as rounding, beside which slopes say nothing: an innovation as large as its deviation
+# then moves a mean by 2^-70 of its own. A number of single precision too.
+IMMENSE = 2.0**120
+
 
 def triangularise_noise(noise: Columns) -> Columns:
     """`triangularise` of the noises of m components, in which those that repeat others leave nothing but their own.
@@ -47,11 +51,6 @@ def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     below = jnp.tril(lower, -1)
     least: jax.Array = own**2 * whole + max(own, RANK) ** 2 * (below**2 @ whole)
     return least
-
-
-def immense(variance: jax.Array) -> float:
-    """Return a variance beside which slopes say nothing: a power of two, whose reciprocal is exact."""
-    return float(2.0 ** (np.finfo(np.dtype(variance.dtype)).maxexp // 2))
 
 
 def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
