@@ -201,7 +201,7 @@ def json_field(
             unit of time, a step that is not positive.
     """
     paths = read_paths(path)
-    outputs = () if output is None else _texts("output", output)
+    outputs = () if output is None else read_texts("output", output)
     if not paths or (outputs and len(outputs) != len(paths)):
         raise fail("json_field, output", f"{max(len(paths), 1)} names, one for each path", show_value(output))
     if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
@@ -265,7 +265,8 @@ def _split_conditions(where: object) -> tuple[Containers, tuple[Available, ...]]
     return values, available
 
 
-def _texts(name: str, value: object) -> tuple[str, ...]:
+def read_texts(name: str, value: object) -> tuple[str, ...]:
+    """Return one text or several, checked."""
     items = [value] if isinstance(value, str) else value
     if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
         raise fail(f"json_field, {name}", "a text, or a list of texts", show_value(value))

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from heliograph.files.computed import Computed, Yaw, ZeroIfAbsent
-from heliograph.files.json_field import Count, Name, Paths, Source, Texts, json_field, read_paths
+from heliograph.files.json_field import Count, Name, Paths, Source, Texts, json_field, read_paths, read_texts
 from heliograph.numerics.check import fail, show_value
 
 COUNT_BITS = 16  # of a frame
@@ -24,13 +24,13 @@ class _Uplinks(NamedTuple):
         self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float, radio: "Texts"
     ) -> "dict[str, Source]":
         """Return the source of its topic, a plant for each device."""
-        told = [] if radio is None else [radio] if isinstance(radio, str) else list(radio)
+        told = () if radio is None else read_texts("radio", radio)
         unknown = [name for name in told if name not in RADIO]
         if unknown:
             raise fail("radio of an uplink", f"some of {', '.join(RADIO)}", show_value(unknown[0]))
         values = _below(self.values, path)
         reception = [ZeroIfAbsent(f"{self.reception}.{name}") for name in told]
-        outputs = None if output is None else [*([output] if isinstance(output, str) else output), *told]
+        outputs = None if output is None else [*read_texts("output", output), *told]
         source = json_field(
             [*values, *reception],
             node,
