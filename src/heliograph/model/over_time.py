@@ -95,10 +95,12 @@ def over_time(items: Sequence[object]) -> OverTime:
     return OverTime(stack(align_memories_over_time(items)))
 
 
-def at(tree: PyTree, k: int | np.integer | np.ndarray | Int[Array, ""]) -> PyTree:
-    """Return `tree` as it is at step k: every `OverTime` inside is replaced by its k-th values.
+def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTree:
+    """Return a model as it is at step k: every `OverTime` inside is replaced by its k-th values.
 
-    NumPy arrays stay NumPy arrays unless k is traced.
+    Args:
+        tree: a plant, a sensor, a channel or any tree of arrays. NumPy arrays stay NumPy arrays unless k is traced.
+        k: the step, from 0. Shape ().
     """
 
     def read(leaf: object) -> PyTree:
@@ -117,7 +119,11 @@ def _entry(values: PyTree, k: PyTree) -> object:
 
 
 def steps_covered(tree: object) -> int | None:
-    """Return the smallest number of steps that the time-varying parts of `tree` cover; None if nothing varies."""
+    """Return the smallest number of steps that the time-varying parts of a model cover; None if nothing varies.
+
+    Args:
+        tree: a plant, a sensor, a channel or any tree of arrays.
+    """
     leaves = jax.tree.leaves(tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
     steps = [leaf.steps for leaf in leaves if isinstance(leaf, OverTime)]
     return min(steps) if steps else None

@@ -67,7 +67,7 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
 
     Args:
         figure: a figure of matplotlib.
-        dots_per_inch: how fine it is.
+        dots_per_inch: how fine it is (default 150).
 
     Raises:
         ValueError: what is no figure, or no whole number of dots.

@@ -34,10 +34,17 @@ LEAST_CORRELATION = 0.1  # below which memory is not worth a warning: it predict
 
 @dataclass(frozen=True)
 class FilterHealth:
-    """Innovations of one filter in units of its claim (time, m), and the test of their whiteness.
+    """Innovations of one filter in units of its claim, and the test of their whiteness.
 
-    Both are None for a filter without a claim, the test also if there are too few rows. declared: the judgement of
-    variances that messages declare; None where they declare none. unit: of the plant's time.
+    Args:
+        node: the node that it listens to, or "fused".
+        filter: its name.
+        claim: what its covariance claims to be.
+        white: innovations in units of their claim (time, m); None for a filter without a claim.
+        test: of their whiteness; None also where there are too few rows.
+        trusted: whether the network relies on it (default True).
+        declared: the judgement of variances that messages declare; None where they declare none.
+        unit: of the plant's time (default "steps").
     """
 
     node: str
@@ -45,7 +52,7 @@ class FilterHealth:
     claim: str
     white: np.ndarray | None
     test: MemoryTest | None
-    trusted: bool = True  # whether the network relies on it
+    trusted: bool = True
     declared: DeclaredJudgement | None = None
     unit: str = "steps"
 
@@ -255,7 +262,7 @@ def examine(
         network: the network.
         record: what `run` of this network returned.
         inputs: inputs of the plant, as they were given to `run`. Shape (steps, inputs); None for a plant without.
-        advance: called with a few words before each filter is tested.
+        advance: called with a few words before each filter is tested; nothing is called by default.
 
     Returns:
         The diagnosis; its `warnings()` are one line for each reason to doubt the network.

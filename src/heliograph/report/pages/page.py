@@ -14,23 +14,38 @@ VERDICTS = {"fails": "fails", "does_not_apply": "does not apply", "holds_vacuous
 
 @dataclass(frozen=True)
 class Text:
-    """Paragraphs; `**strong**` and backquoted code are marked up, all other text is literal."""
+    """Text in paragraphs.
+
+    Args:
+        paragraphs: one text each; `**strong**` and backquoted code are marked up, all other text is literal.
+    """
 
     paragraphs: Sequence[str]
-    kind: str = "text"
+    kind = "text"  # of block, for the template
 
 
 @dataclass(frozen=True)
 class Points:
-    """A list of points, with the markup of paragraphs."""
+    """A list of points.
+
+    Args:
+        points: one text each, with the markup of paragraphs.
+    """
 
     points: Sequence[str]
-    kind: str = "points"
+    kind = "points"  # of block, for the template
 
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """A number to remember: its name, the number with its unit, and its colour in the figures."""
+    """A number to remember.
+
+    Args:
+        label: its name.
+        value: the number with its unit.
+        note: what is said below it.
+        colour: its colour in the figures.
+    """
 
     label: str
     value: str
@@ -40,19 +55,27 @@ class KeyFigure:
 
 @dataclass(frozen=True)
 class KeyFigures:
-    """Numbers to remember, side by side."""
+    """Numbers to remember, side by side.
+
+    Args:
+        figures: the numbers, from left to right.
+    """
 
     figures: Sequence[KeyFigure]
-    kind: str = "key_figures"
+    kind = "key_figures"  # of block, for the template
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under headers; the first column names the row, with a dot in its colour if `colours` are given.
+    """Rows of cells under headers. On a phone a table that is too wide is moved sideways under its first column.
 
-    Cells are numbers, set to the right, unless `wordy`: then they are set to the left and broken into lines. On a phone
-    a table that is too wide is moved sideways under its first column, which stays. `links` are addresses of what the
-    rows are about.
+    Args:
+        headers: one for each column.
+        rows: cells of each row; the first names it.
+        caption: what is said below ("" for nothing).
+        colours: of a dot before the name of each row; None for no dots.
+        wordy: whether cells are words, set to the left and broken into lines, not numbers, set to the right.
+        links: addresses of what the rows are about; None for none.
     """
 
     headers: Sequence[str]
@@ -61,14 +84,19 @@ class Table:
     colours: Sequence[str] | None = None
     wordy: bool = False
     links: Sequence[str] | None = None
-    kind: str = "table"
+    kind = "table"  # of block, for the template
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A statement, its place in a paper, the printed value, the value found, and the verdict.
+    """A statement of a publication, judged.
 
-    `verdict` is one of VERDICTS.
+    Args:
+        text: the statement.
+        source: its place in the publication.
+        printed: the printed value.
+        result: the value found.
+        verdict: one of VERDICTS.
     """
 
     text: str
@@ -85,20 +113,30 @@ class Judged:
 
 @dataclass(frozen=True)
 class Statements:
-    """Statements with their verdicts, in the order of the publication, readable at any width."""
+    """Statements with their verdicts, readable at any width.
+
+    Args:
+        statements: in the order of the publication.
+    """
 
     statements: Sequence[Judged]
-    kind: str = "statements"
+    kind = "statements"  # of block, for the template
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An SVG figure with a caption, and a description for those who do not see it."""
+    """A figure.
+
+    Args:
+        svg: the figure as SVG.
+        description: for those who do not see it.
+        caption: what is said below ("" for nothing).
+    """
 
     svg: bytes
     description: str
     caption: str = ""
-    kind: str = "picture"
+    kind = "picture"  # of block, for the template
 
     @property
     def address(self) -> str:
@@ -108,20 +146,30 @@ class Picture:
 
 @dataclass(frozen=True)
 class Choice:
-    """Pictures of which one is shown, chosen from a list by its name; all of them in print and where no script runs."""
+    """Pictures of which one is shown, chosen from a list; all of them in print and where no script runs.
+
+    Args:
+        label: what is chosen.
+        names: one for each picture.
+        pictures: the pictures.
+    """
 
     label: str
     names: Sequence[str]
     pictures: Sequence[Picture]
-    kind: str = "choice"
+    kind = "choice"  # of block, for the template
 
 
 @dataclass(frozen=True)
 class Code:
-    """Lines to type or to read."""
+    """Lines to type or to read.
+
+    Args:
+        text: the lines.
+    """
 
     text: str
-    kind: str = "code"
+    kind = "code"  # of block, for the template
 
 
 Block = TypeAliasType("Block", Text | Points | KeyFigures | Table | Statements | Picture | Choice | Code)
@@ -129,7 +177,13 @@ Block = TypeAliasType("Block", Text | Points | KeyFigures | Table | Statements |
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part of the page; `kind` is its CSS class."""
+    """A titled part of the page.
+
+    Args:
+        title: its title.
+        blocks: what stands in it, from above.
+        kind: its CSS class ("" for none).
+    """
 
     title: str
     blocks: Sequence[Block]
@@ -138,7 +192,15 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A page: a kicker above its title, a lead below, sections, and a footer."""
+    """A page of sections.
+
+    Args:
+        kicker: what stands above the title.
+        title: the title.
+        lead: what stands below it.
+        sections: the parts of the page.
+        footer: what stands at its end ("" for nothing).
+    """
 
     kicker: str
     title: str
