@@ -27,7 +27,7 @@ from heliograph.factors.columns import (
     unit_of,
     zero_covariance,
 )
-from heliograph.factors.repeated import IMMENSE, rounding_of_slopes, triangularise_noise
+from heliograph.factors.repeated import noise_beside_rounding, rounding_of_slopes, triangularise_noise
 from heliograph.factors.scalar_update import measure_parts, measure_product, revise_columns
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.traced import is_traced, library
@@ -363,9 +363,8 @@ def _measure_row(
     if least is None:
         return measure_product(root, d, f, (product, power), noise)
     nothing = jnp.sum(power) <= least
-    root, d, gain, total = measure_product(
-        root, d, f, (product, power), jnp.where(nothing, noise + IMMENSE * least, noise)
-    )
+    beside = jnp.where(nothing, noise + noise_beside_rounding(len(d), least), noise)
+    root, d, gain, total = measure_product(root, d, f, (product, power), beside)
     return root, d, gain, jnp.where(nothing, noise, total)
 
 

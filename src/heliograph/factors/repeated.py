@@ -24,10 +24,6 @@ from heliograph.factors.columns import (
 from heliograph.numerics.linalg import WRITTEN, outer, scale
 from straightline import operation
 
-# Noise, in variances that count as rounding, beside which slopes say nothing: an innovation as large as its deviation
-# then moves a mean by 2^-70 of its own. A number of single precision too.
-IMMENSE = 2.0**120
-
 
 def triangularise_noise(noise: Columns) -> Columns:
     """`triangularise` of the noises of m components, in which those that repeat others leave nothing but their own.
@@ -51,6 +47,14 @@ def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     below = jnp.tril(lower, -1)
     least: jax.Array = own**2 * whole + max(own, RANK) ** 2 * (below**2 @ whole)
     return least
+
+
+def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
+    """Return a noise beside which n slopes of a variance up to `least` say nothing: 1,024 times what they round.
+
+    An innovation as large as its deviation moves a mean by n eps / 256 of its own, and single precision holds the noise.
+    """
+    return 1024 / (UNITS * n * unit_of(least)) ** 2 * least
 
 
 def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
