@@ -22,7 +22,7 @@ def prepare(p: Arrays) -> Contender:
 
     def one_run(z: Any) -> tuple[Any, Any]:
         last, means = jax.lax.scan(step, start, z)
-        return means, last.gaussian.covariance
+        return means, last.covariance
 
     how = f"over_runs, all cores; {hg.engine.engine_of(one_run, p['z'])}"
     return Contender(lambda: hg.simulation.over_runs(one_run, p["z"]), lambda result: result[0], how)

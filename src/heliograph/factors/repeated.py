@@ -52,7 +52,7 @@ def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
 def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
     """Return a noise beside which n slopes of a variance up to `least` say nothing: 1,024 times what they round.
 
-    An innovation as large as its deviation moves a mean by n eps / 256 of its own, and single precision holds the noise.
+    An innovation as large as its deviation moves a mean by n eps / 256 of its own; single precision holds the noise.
     """
     return 1024 / (UNITS * n * unit_of(least)) ** 2 * least
 
