@@ -79,6 +79,28 @@ def test_a_filter_made_for_another_world_claims_nothing_and_the_part_is_named(ca
     assert f"f (nominal, believes another {part})" in repr(network)
 
 
+def test_a_node_that_refuses_values_by_their_size_claims_nothing_and_a_code_costs_nothing():
+    blind = hg.filters.open_loop_filter(PLANT)
+    nodes = {
+        "a": hg.Node(SENSOR, hg.perfect(), {"f": KALMAN, "open": blind}, limits=(-2, None)),
+        "b": hg.Node(SENSOR, hg.perfect(), {"f": KALMAN}, limits=(None, None), invalid=-999),
+    }
+    joint = hg.kalman_filter(PLANT, hg.model.joint_sensor({"a": SENSOR, "b": SENSOR}))
+    network = hg.Network(PLANT, nodes, fused={"all": joint, "cross": hg.Fusion("f", hg.fusion.MatrixWeights())})
+    fused = {"all": "nominal", "cross": "nominal"}
+    assert network.claims() == {"a": {"f": "nominal", "open": "exact"}, "b": {"f": "exact"}, "fused": fused}
+    why = "believes another range of values"
+    assert [belief.words for belief in network.beliefs()] == [
+        f"filter 'f' {why} than node 'a', where limits refuse some",
+        f"filter 'all' {why} than all nodes together, where limits refuse some",
+    ]
+    assert f"f (nominal, {why})" in repr(network) and f"(nominal, {why})" in repr(network).split("fused all")[1]
+    said = [doubt.words for doubt in hg.simulation.doubts_before_data(network)]
+    assert f"another world: {network.beliefs()[0].words}, so that its claim is nominal" in said
+    record = hg.run(network, {"a": [[0.1], [1.0]], "b": [[0.2], [0.3]]})
+    assert record.estimates["a"]["f"].claim == "nominal" and record.estimates["b"]["f"].claim == "exact"
+
+
 def rebuilt():
     """The same world, written again: other objects, equal numbers."""
     return hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)

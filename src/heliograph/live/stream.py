@@ -1,6 +1,7 @@
 """One filter on live data: push a measurement, read the estimate."""
 
 import warnings
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_s
 from heliograph.live.stored.old_layout import can_read, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim
+from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.faults import find_function_fault
 from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
@@ -45,7 +46,7 @@ class Stream:
     Args:
         filter: the filter to run.
         limits: greatest and smallest plausible values, as of a `Node`; numbers beyond them count as not arrived, and
-            `dropped` counts them by component.
+            `dropped` counts them by component. What is refused then depends on the state: the claim is nominal.
         invalid: codes for a missing value, as of a `Node`.
 
     A filter that was sure of a wrong start, behind a gate, leaves out all that comes: where BEYOND measurements in a
@@ -120,6 +121,8 @@ class Stream:
             for _, line in self._angles.said_of(np.diagonal(stepper.estimate[1])[None]):
                 warnings.warn(f"stream, step {k}: {line}", stacklevel=2)
         estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
+        if self.limits is not None and self.limits.bounded:
+            estimate = replace(estimate, claim=weakest([estimate.claim, "nominal"]))
         return lower_unsound_claim(estimate) if nis != nis else estimate
 
     @property

@@ -52,6 +52,11 @@ class Limits(Module):
             raise fail("invalid values", "a finite number or several", show_value(invalid))
         self.invalid = np.atleast_1d(codes)
 
+    @property
+    def bounded(self) -> bool:
+        """Whether a number may count as missing for its size, which tells of the state as a code does not."""
+        return bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
+
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
         """Return True for each number that counts as missing; NaN is not one of them."""
         return np.asarray((z < self.low) | (z > self.high) | is_code(z, self.invalid))

@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim
-from heliograph.model.premises.agreement import join_premises, list_differences, part_of
+from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, part_of
 from heliograph.model.premises.premise import Kept, Premise
 from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 
@@ -37,7 +37,9 @@ class Belief(NamedTuple):
     def words(self) -> str:
         """The same as a sentence: "filter 'f' believes another channel than node 'a'"."""
         where = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
-        return f"filter {self.filter!r} believes {self.another}{' at' if self.parts == (UNSAID,) else ' than'} {where}"
+        why = ", where limits refuse some" * (RANGE in self.parts)
+        at = " at" if self.parts == (UNSAID,) else " than"
+        return f"filter {self.filter!r} believes {self.another}{at} {where}{why}"
 
 
 def lower_claim(claim: Claim) -> Claim:
@@ -125,10 +127,11 @@ def parts_apart(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
 
 
 def premise_at(network: HasNodes, name: str) -> Premise:
-    """Return plant, sensor, channel and trigger of a node."""
+    """Return plant, sensor, channel and trigger of a node, and its limits where they refuse values."""
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
-        return Premise(plant, node.sensor, node.channel, node.trigger)
+        range = node.limits if node.limits is not None and node.limits.bounded else None
+        return Premise(plant, node.sensor, node.channel, node.trigger, range=range)
     if network.common is not None:
         return part_of(Premise(plant, network.common.sensor, network.common.channel), network.rows[name])
     if network.relays is None:  # a node without a sensor

@@ -332,7 +332,7 @@ class Network(Module):
         claims = {(name, f): filter.claim for name, node in self.nodes.items() for f, filter in node.filters.items()}
         for name, mesh in self.meshes.items():
             claims |= dict.fromkeys(((node, name) for node in self.mesh_nodes(name)), mesh_claim(name, mesh, self))
-        by_data = any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values())
+        by_data = any(isinstance(node, Node) and node.chosen_by_value for node in self.nodes.values())
         for name, fusion in self.fused.items():
             claim = self._find_claim_of_fusion(fusion)
             claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim

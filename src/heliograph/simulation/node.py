@@ -84,7 +84,7 @@ class Node(Module):
         filters: filters by name.
         limits: range of an honest received number, (low, high) for all of them or a pair for each, None where there
             is no limit; or another node's `limits`, which hold its codes too. Recorded and live data outside count as
-            not arrived, are counted and named. Claims stand as far as no honest number is among them.
+            not arrived, are counted and named. What is refused then depends on the state, so that claims are nominal.
         invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
         trigger: when the sender transmits, such as `SendOnDelta(0.5)`; at each step by default. The filter for it is
             `event_filter`; all others take what was not sent for missing.
@@ -135,6 +135,11 @@ class Node(Module):
                 f"no filter with measurements besides {self.informed_by!r}",
                 observation,
             )
+
+    @property
+    def chosen_by_value(self) -> bool:
+        """Whether what a filter uses depends on what was measured: by a rule of the sender, or by limits."""
+        return self.trigger is not None or (self.limits is not None and self.limits.bounded)
 
     @property
     def predictor(self) -> str | None:

@@ -30,14 +30,15 @@ from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.outliers import has_bounded_noise
 
 PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"
+RANGE = "range of values"
 
 
 def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
-    """Return the parts of what is believed that are not the world's own: plant, sensor, channel, trigger, relays.
+    """Return the parts of what is believed that are not the world's own: plant, sensor, channel, trigger, relays, range.
 
     Args:
         believed: what the filter was made for.
-        own: plant, sensor, channel and trigger of the place where it stands.
+        own: plant, sensor, channel and trigger of the place where it stands, and limits of what it uses.
     """
     order, own = believed.order, _enlarge_own(believed, own)
     parts = [] if _test_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
@@ -50,6 +51,8 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         return (*parts, SENSOR)
     if not _same_trigger(believed.trigger, own.trigger):
         parts.append(TRIGGER)
+    if own.range is not None:  # what is refused for its value tells of the state
+        parts.append(RANGE)
     sensors = _test_all_steps(_same_sensor, believed.sensor, own.sensor, order)
     channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
     if sensors and channels:
@@ -77,11 +80,13 @@ def join_premises(premises: Sequence[Premise]) -> Premise:
     sensors = [premise.sensor for premise in premises if premise.sensor is not None]
     channels = [premise.channel for premise in premises if premise.channel is not None]
     triggers = [p.trigger for p in premises if p.trigger is not None and not isinstance(p.trigger, Periodic)]
+    ranges = [premise.range for premise in premises if premise.range is not None]
     sensor, channel = join_links({str(i): s for i, s in enumerate(sensors)}, channels)
     return premises[0].replaced(
         sensor=sensor,
         channel=channel,
         trigger=triggers[0] if triggers else None,
+        range=ranges[0] if ranges else None,
         order=None if any(premise.order is None for premise in premises) else MEAN_AND_COVARIANCE,
     )
 

@@ -9,6 +9,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from heliograph.model.channel import Channel, perfect
+from heliograph.model.limits import Limits
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
@@ -35,6 +36,7 @@ class Premise:
         order: order of the moments of noises and gains on which the claim rests; None for one that rests on their laws.
         relays: relays whose sums of hops are received, in place of sensor and channel; None by default.
         gains: gains of these relays by name, (steps, n, received).
+        range: limits of the numbers that are used, of a node that refuses others; None where all are, as filters believe.
     """
 
     def __init__(
@@ -46,9 +48,10 @@ class Premise:
         order: int | None = MEAN_AND_COVARIANCE,
         relays: RelayNetwork | None = None,
         gains: Mapping[str, np.ndarray] | None = None,
+        range: Limits | None = None,
     ):
         self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
-        self.relays, self.gains = relays, {} if gains is None else dict(gains)
+        self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range
 
     def replaced(self, **parts: Any) -> "Premise":
         """Return the premise with other parts, by name."""

@@ -76,11 +76,11 @@ def mesh_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
     Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
-    sender by what it measured, a quantizer by what it cannot send.
+    sender by what it measured, limits by what they refuse, a quantizer by what it cannot send.
     """
     known = error_claim(name, fusion, network)
     senders = [n for node in network.mesh_nodes(name) if isinstance(n := network.nodes[node], Node)]
-    by_data = fusion.quantizer is not None or any(n.trigger is not None for n in senders)
+    by_data = fusion.quantizer is not None or any(n.chosen_by_value for n in senders)
     if by_data or isinstance(fusion.rule, FrozenWeights):
         return weakest([known, "nominal"])
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
