@@ -97,7 +97,19 @@ def test_data_that_are_reproduced_exactly_leave_no_variance():
     """Of an exact line the likelihood grows as all variances fall, to where rounding is all: 0, below some eps^2."""
     found = hg.fit(lambda: trend(1.0), 0.3 * np.arange(100.0)[:, None], starts=1)
     assert all(row.estimate == 0 and 0 < row.high < 1e-26 for row in found.rows())
-    assert "level: 0, below" in found.sentences[0]
+    assert "level: 0, below" in found.sentences[1]
+    assert not found.converged and "the likelihood grows for ever" in str(found)
+
+
+def test_an_alternation_that_is_reproduced_exactly_has_no_maximum():
+    """A climb ends where rounding is all that is left, which is no maximum of the likelihood."""
+
+    def network():
+        plant = hg.LinearPlant([[hg.free(0.5, "a")]], hg.free(1.0, "q"), [0.0], 1.0)
+        return hg.Network(plant, {"a": hg.Node(hg.LinearSensor([[1.0]], hg.free(1.0, "r")), hg.perfect(), {})})
+
+    found = hg.fit(network, (-1.0) ** np.arange(60)[:, None], starts=1)
+    assert not found.converged and "the likelihood grows for ever" in str(found)
 
 
 def test_a_variance_of_measuring_at_zero_has_an_end_above():

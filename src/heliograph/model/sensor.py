@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.numerics.angle import Angles, angles_named
+from heliograph.numerics.angle import Angles, angles_at, angles_named
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, function, instance, name_list, names, show_error
 from heliograph.numerics.module import Module, readable, unwritten
@@ -232,6 +232,16 @@ def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail(name, "a LinearPlant and a LinearSensor", got)
     refuse_angles(name, plant, sensor)
+
+
+def angles_of_outputs(angles: "Sequence[int] | AnySensor", outputs: int) -> Angles:
+    """Return which of so many outputs are angles, from their places or from the sensor whose outputs they are."""
+    sensor = first(angles)
+    if not isinstance(sensor, AbstractSensor):
+        return angles_at(angles, outputs)
+    if len(sensor.outputs) != outputs:
+        raise fail("angles", f"those of a sensor of {outputs} outputs", f"one of {list(sensor.outputs)}")
+    return sensor.angles
 
 
 def refuse_angles(name: str, *models: AnyPlant | AnySensor) -> None:

@@ -72,6 +72,27 @@ def test_a_false_claim_is_seen_and_correlation_too():
     assert result.autocorrelation[0] > 5 * result.autocorrelation_bound
 
 
+def test_errors_and_innovations_across_a_full_turn_are_judged_by_the_shorter_way():
+    """A heading about pi, once by place and once by the model: 2,000 values of two degrees of freedom each."""
+    rng = np.random.default_rng(3)
+    truth = np.column_stack([np.pi + 0.1 * rng.normal(size=2000), rng.normal(size=2000)])
+    mean = truth + rng.normal(size=truth.shape) * [0.1, 1.0]
+    truth[:, 0], mean[:, 0] = (np.angle(np.exp(1j * heading)) for heading in (truth[:, 0], mean[:, 0]))
+    claimed = np.diag([0.01, 1.0])
+    plant = hg.Plant(lambda x: x, np.eye(2), [0.0, 0.0], np.eye(2), states=["heading", "x"], circular=["heading"])
+    sensor = hg.Sensor(lambda x: x, np.eye(2), outputs=["heading", "x"], circular=["heading"])
+    assert not hg.consistency(hg.nees(truth, mean, claimed), 2).consistent
+    for values in (
+        hg.nees(truth, mean, claimed, plant),
+        hg.nees(truth, mean, claimed, [0]),
+        hg.nis(truth - mean, claimed, sensor),
+        hg.nis(truth - mean, claimed, [0]),
+    ):
+        assert hg.consistency(values, 2).consistent
+    with pytest.raises(ValueError, match="angles: expected those of a sensor of 3 outputs, got one of"):
+        hg.nis(np.zeros(3), np.eye(3), sensor)
+
+
 def test_each_value_may_have_its_degrees_of_freedom():
     values = np.array([1.0, 2.0, np.nan])
     result = hg.consistency(values, [1, 2, 1])

@@ -100,8 +100,9 @@ class Search:
         top = _top(climbed, none)
         for _ in range(ROUNDS):
             top = self._move_to_limits(top)
-            again, reason = self._choose_restarts(top) if top.converged else (None, self._explain_failure(top))
+            again, reason = self._choose_restarts(top) if top.converged else (None, top.reason)
             if again is None:
+                reason = self._say_that_it_grows(top) or reason
                 return top._replace(converged=not reason, reason=reason)
             top = _top(self._climb(again, none), none)
         return top._replace(converged=False, reason="the search went to and fro between two points")
@@ -165,13 +166,16 @@ class Search:
             return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
         return None, ""
 
-    def _explain_failure(self, top: Top) -> str:
-        """Why a climb did not arrive: of data that the network reproduces exactly the likelihood has no maximum."""
+    def _say_that_it_grows(self, top: Top) -> str:
+        """Say that the likelihood has no maximum: of data that the network reproduces exactly; "" of all others.
+
+        A climb may end there all the same, where rounding is what is left.
+        """
         z = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         size = np.log(np.nanmax(np.abs(z)))
         if top.total / np.count_nonzero(~np.isnan(z)) + size > EXACTLY:
             return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
-        return top.reason
+        return ""
 
     def _inwards(self, top: Top, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Points on the way from the end of a domain inwards (INWARDS, p), and how much higher the likelihood is."""

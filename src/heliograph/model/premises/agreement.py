@@ -34,7 +34,7 @@ RANGE = "range of values"
 
 
 def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
-    """Return the parts of what is believed that are not the world's own: plant, sensor, channel, trigger, relays, range.
+    """Return the parts of what is believed that are not the world's own: plant, sensor, channel, trigger and others.
 
     Args:
         believed: what the filter was made for.

@@ -36,7 +36,7 @@ class Premise:
         order: order of the moments of noises and gains on which the claim rests; None for one that rests on their laws.
         relays: relays whose sums of hops are received, in place of sensor and channel; None by default.
         gains: gains of these relays by name, (steps, n, received).
-        range: limits of the numbers that are used, of a node that refuses others; None where all are, as filters believe.
+        range: limits of what a node uses, which refuses other numbers; None where all are used, as filters believe.
     """
 
     def __init__(

@@ -10,7 +10,8 @@ import scipy
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.model.plant import AnyPlant, angles_among
-from heliograph.numerics.angle import angles_at, wrap_angles
+from heliograph.model.sensor import AnySensor, angles_of_outputs
+from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import readable
@@ -83,7 +84,9 @@ def nees(
 
 
 def nis(
-    innovation: Float[ArrayLike, "*steps m"], covariance: Float[ArrayLike, "*steps m m"], angles: Sequence[int] = ()
+    innovation: Float[ArrayLike, "*steps m"],
+    covariance: Float[ArrayLike, "*steps m m"],
+    angles: "Sequence[int] | AnySensor" = (),
 ) -> Float[np.ndarray, "*steps"]:
     """Return the normalised innovation squared (NIS), e' S^-1 e of an innovation e: one number a step, without a truth.
 
@@ -93,8 +96,8 @@ def nis(
     Args:
         innovation: z - E[z | earlier z], NaN for what did not arrive: `filter.run(z).innovations`.
         covariance: its covariance, one (m, m) or one a step: `filter.run(z).innovation_covariances`.
-        angles: which components are angles in radians, by place; none by default, as a filter's own innovations are
-            between -pi and pi already.
+        angles: which components are angles in radians, by place, or the sensor whose outputs they are; none by default,
+            as a filter's own innovations are between -pi and pi already.
 
     Raises:
         ValueError: shapes that do not fit, infinite numbers, angles that are no places in the innovation.
@@ -104,7 +107,7 @@ def nis(
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
     return _normalise_square(
-        wrap_angles(e, angles_at(angles, e.shape[-1])), _broadcast_to_steps(covariance, e), np.zeros_like(e)
+        wrap_angles(e, angles_of_outputs(angles, e.shape[-1])), _broadcast_to_steps(covariance, e), np.zeros_like(e)
     )
 
 
@@ -144,6 +147,8 @@ def consistency(
     lags: int = 10,
 ) -> Consistency:
     """Compare NEES or NIS values with the chi-squared law that a true claim implies.
+
+    Angles count where errors are squared, which `angles` of `hg.nees` and `hg.nis` says; a value is a number already.
 
     Values of N steps and runs with nu degrees of freedom each: N times their mean has a chi-squared law with N nu
     degrees where they are independent.
