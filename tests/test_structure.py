@@ -27,6 +27,7 @@ ORDER = [
         "filters.calls",
         "filters.base",
         "filters.plausibility",
+        "filters.chunks",
         "filters.filter_data",
         "filters.smoother_step",
         "filters.gaussian.transform",

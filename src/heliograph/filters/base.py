@@ -125,7 +125,9 @@ class AbstractFilter(Module):
     def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
         """Run the filter over rows of data from its initial state: for each row predict, then correct.
 
-        Every number is used as it is; `hg.run` leaves out those that are implausible, and warns.
+        Every number is used as it is; `hg.run` leaves out those that are implausible, and warns. A linear filter takes
+        from 32,768 rows on in chunks side by side where it forgets its start within 512 rows (of 131,072 rows within
+        2,048), equal to the pass row by row to 1e-10 of a deviation; every other filter goes row by row.
 
         Args:
             z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.

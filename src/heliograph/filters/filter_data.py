@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compute_once
+from heliograph.filters.chunks import filter_in_chunks
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
 from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_spacing
@@ -116,7 +118,9 @@ def scan_with_last_state(
 def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> Filtered:
     """Run a filter over rows of data, by native code where the filter has it; return estimates and innovations."""
     rows_z, rows_u = check_data(filter, z, u)
-    state, (mean, covariance, innovation) = compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u))
+    whole = filter_in_chunks(filter, rows_z, rows_u, _tell_estimate)
+    state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u))
+    mean, covariance, innovation = outputs
     lost = ~np.isfinite(mean).all(axis=1)
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
@@ -132,12 +136,13 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> F
 
 def _compute_filtered(filter: SteppedFilter, z: Array, u: Array) -> PyTree:
     """Compiled body of `run_over_data`."""
+    return scan_with_last_state(filter, z, u, partial(_tell_estimate, filter))
 
-    def outputs_of(state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
-        estimate = filter.after_step(state, k)
-        return estimate.mean, estimate.covariance, innovation
 
-    return scan_with_last_state(filter, z, u, outputs_of)
+def _tell_estimate(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+    """Return the estimate of a row, and its innovation."""
+    estimate = filter.after_step(state, k)
+    return estimate.mean, estimate.covariance, innovation
 
 
 _by_xla = quickly_compiled(_compute_filtered)

@@ -1,10 +1,14 @@
 """Log-likelihood of recorded data under a filter's model: the sum over its innovations."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.chunks import filter_in_chunks
 from heliograph.filters.filter_data import check_data
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import instance
@@ -22,7 +26,7 @@ def log_likelihood(
 
     Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere.
     `jax.grad` passes through it, with respect to any array of the filter, in the precision of the trace
-    (`jax.enable_x64`).
+    (`jax.enable_x64`). Many rows are taken in chunks side by side, as by `filter.run`.
 
     Args:
         filter: the filter.
@@ -41,16 +45,20 @@ def log_likelihood(
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
         return _sum(*arguments)
+    whole = filter_in_chunks(*arguments, _judge_likelihood)
+    if whole is not None:
+        return float(np.sum(whole.outputs))
     return float(compute_once(_sum, _by_xla, arguments))
 
 
 def _sum(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
-    def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:
-        """NaN where the estimate is no number, whose innovations would look like silence."""
-        lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
-        return jnp.where(lost, jnp.nan, innovation.log_likelihood)
+    return jnp.sum(filter.scan(z, u, partial(_judge_likelihood, filter)))
 
-    return jnp.sum(filter.scan(z, u, judged))
+
+def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:
+    """Log-likelihood of a row; NaN where the estimate is no number, whose innovations would look like silence."""
+    lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
+    return jnp.where(lost, jnp.nan, innovation.log_likelihood)
 
 
 _by_xla = compile_in_float64(_sum)
