@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import pytest
 
+from tests.influx import influxd
 from tests.postgres import programs
 from tests.widths import program
 
@@ -41,6 +42,7 @@ def broker(client: str) -> bool:
 LIVE = f"{Path(sys.executable).name} -m pip install '{ROOT}[live]'"
 PARTS = {
     "PostgreSQL": Part(lambda: programs() is not None, "apt-get install postgresql"),
+    "InfluxDB": Part(lambda: influxd() is not None, "apt-get install influxdb"),
     "MQTT": Part(lambda: broker("paho"), LIVE),
     "NATS": Part(lambda: broker("nats"), LIVE),
     "OPC UA": Part(lambda: find_spec("asyncua") is not None, LIVE.replace("live", "opcua")),

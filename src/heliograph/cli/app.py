@@ -3,11 +3,14 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter, Token
 
 import heliograph
+
+if TYPE_CHECKING:
+    from heliograph.files.stores.address import StoreAddress
 
 app = App(
     name="heliograph",
@@ -25,6 +28,24 @@ def number(text: str) -> Parameter:
 def path_option(text: str = "") -> Parameter:
     """Declare an option that is a file or folder."""
     return Parameter(help=text, converter=_path)
+
+
+MEASURED = "CSV or Parquet: rows or events; messages in lines of JSON; a bag; influx:// or postgresql://...?query=."
+
+
+def measured_option(text: str = MEASURED) -> Parameter:
+    """Declare an option that is measured data: a file, or the URL of a store."""
+    return Parameter(help=text, converter=_path_or_store, accepts_keys=False, n_tokens=1)
+
+
+def estimates_option() -> Parameter:
+    """Declare an option that is where estimates go: a file, or the URL of a store."""
+    return Parameter(
+        help="CSV, Parquet or MCAP to write, or influx:// or postgresql://...?table=: estimates with their claims.",
+        converter=_path_or_store,
+        accepts_keys=False,
+        n_tokens=1,
+    )
 
 
 def folder(command: str, out: Path | None, name: str) -> Path:
@@ -49,6 +70,12 @@ def _path(_: type, tokens: Sequence[Token]) -> Path:
     if not tokens[0].value or "\0" in tokens[0].value:
         raise ValueError(f"expected a path, got {tokens[0].value!r}")
     return Path(tokens[0].value)
+
+
+def _path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
+    from heliograph.files.stores.address import is_store, parse_store
+
+    return parse_store(tokens[0].value) if is_store(tokens[0].value) else _path(kind, tokens)
 
 
 def completion(

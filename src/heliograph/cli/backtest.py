@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import folder, path_option
+from heliograph.cli.app import folder, measured_option, path_option
 from heliograph.cli.reading import ReadingOptions, read_measured
+from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
     from heliograph.report.progress import Advance
@@ -20,7 +21,7 @@ def backtest(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; messages in lines of JSON; or a bag.")],
+    measurements: Annotated[Path | StoreAddress, measured_option()],
     out: Annotated[Path, path_option("Folder for the page and its figure; made if missing.")],
     horizons: Annotated[str, Parameter(help="Rows ahead, as 1,3,12.")] = "1,2,5,10",
     skip: Annotated[int, Parameter(help="Rows at the start from which nothing is forecast.")] = 10,

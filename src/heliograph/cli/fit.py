@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import number, path_option
+from heliograph.cli.app import measured_option, number, path_option
 from heliograph.cli.reading import Measured, ReadingOptions, read_measured, take_only_plant
 from heliograph.cli.stopping import GentleStop
+from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,7 +31,7 @@ def fit(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; messages in lines of JSON; or a bag.")],
+    measurements: Annotated[Path | StoreAddress, measured_option()],
     out: Annotated[Path, path_option("Folder of fitted.json, fitted_network.py, figures and page; made if missing.")],
     starts: Annotated[int, number("From how many points to climb.")] = 6,
     seed: Annotated[int, number("Seed of the starts.")] = 0,
@@ -73,7 +74,7 @@ def fit(
 
 def learn(
     network: str,
-    measurements: Path,
+    measurements: Path | StoreAddress,
     starts: int,
     seed: int,
     held_out: float,
@@ -138,7 +139,12 @@ def _find_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]
 
 
 def _read_data(
-    measurements: Path, reference: str, network: "Network", advance: "Advance", truth: bool, reading: ReadingOptions
+    measurements: Path | StoreAddress,
+    reference: str,
+    network: "Network",
+    advance: "Advance",
+    truth: bool,
+    reading: ReadingOptions,
 ) -> Measured:
     """Read rows of a table, or messages, which are rows in the order of measuring; say what was left out."""
     from heliograph.disk.quoting import visible

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
+    from heliograph.files.stores.address import StoreAddress
+    from heliograph.files.stores.tables import StoreTable
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
 
@@ -74,7 +76,7 @@ class Measured:
 
 
 def read_measured(
-    path: Path,
+    location: "Path | StoreAddress",
     reference: str,
     network: "Network",
     module: Mapping[str, object],
@@ -88,6 +90,7 @@ def read_measured(
     """
     from heliograph.numerics.check import fail
 
+    path = open_measured(location)
     events = read_events(path, reference, network, module, options, advance)
     if events is None:
         if options.of_messages:
@@ -101,7 +104,16 @@ def read_measured(
     return measured
 
 
-def take_only_plant(path: Path, measured: list[Measured]) -> Measured:
+def open_measured(location: "Path | StoreAddress") -> "Path | StoreTable":
+    """Return the file, or what a store answers."""
+    if isinstance(location, Path):
+        return location
+    from heliograph.files.stores.tables import ask_store
+
+    return ask_store(location)
+
+
+def take_only_plant(path: object, measured: list[Measured]) -> Measured:
     """Return the measured data of the only plant.
 
     Raises:
@@ -116,38 +128,39 @@ def take_only_plant(path: Path, measured: list[Measured]) -> Measured:
 
 
 def read_events(
-    path: Path,
+    path: "Path | StoreTable",
     reference: str,
     network: "Network",
     module: Mapping[str, object],
     options: ReadingOptions,
     advance: "Advance",
 ) -> "EventTable | None":
-    """Read the messages of a bag or a file; None for rows of time."""
+    """Read the messages of a bag, a file or a store; None for rows of time."""
     from heliograph.files.bags.bag import is_bag
-    from heliograph.files.messages import is_mapped, read_messages
+    from heliograph.files.messages import is_mapped
+    from heliograph.files.messages import read_events as read_mapped
     from heliograph.numerics.check import fail
 
     sources = module.get("sources")
     if not is_mapped(path, sources):
         return None
-    if sources is None and is_bag(path):
+    if sources is None and isinstance(path, Path) and is_bag(path):
         hint = f"heliograph inspect {path} --network {reference} suggests them"
         raise fail(f"network {reference}", f"sources, for the topics of {path} ({hint})", "none")
 
     def progress(done: int, total: int) -> None:
-        advance(f"reading {path.name}", done, total)
+        advance(f"reading {path}", done, total)
 
-    return read_messages(path, network, sources, progress, options.strict, options.ignore_unknown)
+    return read_mapped(path, network, sources, progress, options.strict, options.ignore_unknown)
 
 
-def read_rows(path: Path, network: "Network", options: ReadingOptions) -> Measured:
+def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOptions) -> Measured:
     """Read rows of time, and say which of them could not be read."""
-    from heliograph.files.recording import read_recording_file
+    from heliograph.files.recording import read_recording_rows
 
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
-        recording, refused = read_recording_file(path, network, options.strict, options.ignore_unknown)
+        recording, refused = read_recording_rows(path, network, options.strict, options.ignore_unknown)
     lines = [describe_refused(path, "rows", len(refused), refused[:SAID])] if refused else []
     return Measured("", recording, warnings=[*lines, *(str(doubt.message) for doubt in doubts)])
 
@@ -170,7 +183,7 @@ def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -
     return Measured(plant, recording, rows, events, lines)
 
 
-def describe_unread(path: Path, events: "EventTable") -> list[str]:
+def describe_unread(path: object, events: "EventTable") -> list[str]:
     """Say how many messages could not be read, and why, of the first of them; and where the reading ended."""
     lines = [events.broken] if events.broken else []
     if events.refused:
@@ -178,7 +191,7 @@ def describe_unread(path: Path, events: "EventTable") -> list[str]:
     return lines
 
 
-def describe_refused(path: Path, what: str, count: int, reasons: Sequence[str]) -> str:
+def describe_refused(path: object, what: str, count: int, reasons: Sequence[str]) -> str:
     """Say how many rows or messages could not be read, and why, of the first of them."""
     more = count - len(reasons)
     others = f"; and {more} more" if more > 0 else ""

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import number, path_option
-from heliograph.cli.reading import ReadingOptions, read_events, read_rows
+from heliograph.cli.app import measured_option, number, path_option
+from heliograph.cli.reading import ReadingOptions, open_measured, read_events, read_rows
+from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,7 +22,9 @@ LONGEST = 1e6  # seconds that the system sleeps at once
 
 
 def replay(
-    recording: Annotated[Path, path_option("What `run` takes: rows of time, events, messages, or a bag.")],
+    recording: Annotated[
+        Path | StoreAddress, measured_option("What `run` takes: rows of time, events, messages, a bag, or a store.")
+    ],
     /,
     *,
     network: Annotated[str, Parameter(help="Whose recording it is: my_network.py, or my_network.py:name.")],
@@ -75,7 +78,7 @@ def replay(
 
 
 def _read_events(
-    path: Path, reference: str, options: ReadingOptions
+    location: Path | StoreAddress, reference: str, options: ReadingOptions
 ) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
     """Yield the events of each plant with its name, and the date of time 0, which is that of all."""
     from heliograph.disk.quoting import visible
@@ -83,6 +86,7 @@ def _read_events(
     from heliograph.serving.brokers.replay import events_of_recording
 
     network, module = load_module(reference)
+    path = open_measured(location)
     table = read_events(path, reference, network, module, options, lambda *_: None)
     if table is None:
         rows = read_rows(path, network, options)

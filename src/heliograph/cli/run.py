@@ -10,8 +10,9 @@ from urllib.parse import quote
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import path_option
+from heliograph.cli.app import estimates_option, measured_option, path_option
 from heliograph.cli.reading import Measured, ReadingOptions, read_measured
+from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from heliograph.files.estimates.forecasts import ByFilter
-    from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.report.progress import Advance
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
-    Write = Callable[[Record, Path], None]
+    Write = Callable[[Record, Path | StoreAddress], None]
     Horizons = int | list[float | np.timedelta64 | np.datetime64]
 
 
@@ -38,8 +38,8 @@ def run(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; messages in lines of JSON; or a bag.")],
-    out: Annotated[Path | None, path_option("CSV, Parquet or MCAP to write: estimates with their claims.")] = None,
+    measurements: Annotated[Path | StoreAddress, measured_option()],
+    out: Annotated[Path | StoreAddress | None, estimates_option()] = None,
     report: Annotated[Path | None, path_option("Folder of figures, and a page on estimates and links.")] = None,
     smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
     lag: Annotated[float | None, Parameter(help="Of messages: also estimates given what came so much later.")] = None,
@@ -52,7 +52,8 @@ def run(
     A bag (.mcap, .db3, .bag, or a folder), a log or a table of somebody else's making is events too, by the `sources`
     of the network's file. The estimates are those of the events that a timeline uses, in the order of measuring; with
     --lag, those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT, and
-    a page of its own behind the report's overview, which has the most doubted first.
+    a page of its own behind the report's overview, which has the most doubted first; in a store each has its name in
+    the column `plant`, and those of a lag go to the table TABLE_lagged.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def run(
     later, options = _parse_smoothing(smooth), reading or ReadingOptions()
     _check_options(measurements, out, report, lag, options)
     ahead = horizons_in(forecast) if forecast else None
-    if ahead is not None and out is not None and out.suffix.lower() == ".mcap":
+    if ahead is not None and isinstance(out, Path) and out.suffix.lower() == ".mcap":
         raise fail("--forecast", "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
     with progress(4) as advance:
         advance("starting")
@@ -91,8 +92,8 @@ def run(
             future = _make_forecasts(record, ahead, lines)
             if place is not None:
                 advance(f"writing {place}")
-                write = _choose_writer(data.events, module)
-                _write_rows(write, written, future, place)
+                write = _choose_writer(data, module)
+                _write_rows(write, written, future, place, data)
                 lines += _write_lagged(loaded, data, lag, options, place, write)
             done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines, future))
     # Report, then warnings and a summary.
@@ -117,8 +118,10 @@ def _parse_smoothing(word: str) -> "AbstractSmoothing | None":
     return FixedLag(int(word))
 
 
-def _place(out: Path, plant: str, several: bool) -> Path:
-    """Return the file of a plant's estimates: of several, each has one of its name."""
+def _place(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
+    """Return where a plant's estimates go: of several, each has a file of its name."""
+    if isinstance(out, StoreAddress):
+        return out
     return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
 
 
@@ -167,18 +170,30 @@ def _make_forecasts(record: "Record", ahead: "Horizons | None", lines: list[str]
     return forecasts
 
 
-def _write_rows(write: "Write", record: "Record", forecasts: "ByFilter", place: Path) -> None:
+def _write_rows(
+    write: "Write", record: "Record", forecasts: "ByFilter", place: Path | StoreAddress, data: "Measured"
+) -> None:
     """Write estimates, with rows of forecasts below them where there are any."""
     if not forecasts:
         write(record, place)
         return
-    from heliograph.files.estimates.forecasts import write_forecast
+    from heliograph.files.estimates.forecasts import forecast_columns, write_forecast
 
-    write_forecast(record, forecasts, place)
+    if isinstance(place, Path):
+        write_forecast(record, forecasts, place)
+        return
+    from heliograph.files.stores.tables import write_columns
+
+    write_columns(place, forecast_columns(record, forecasts), data.plant, _find_origin(data))
 
 
 def _write_lagged(
-    network: "Network", data: "Measured", lag: float | None, options: ReadingOptions, place: Path, write: "Write"
+    network: "Network",
+    data: "Measured",
+    lag: float | None,
+    options: ReadingOptions,
+    place: Path | StoreAddress,
+    write: "Write",
 ) -> list[str]:
     """Write the estimates of a lag later beside the others, and say so; nothing without a lag."""
     if lag is None or data.events is None:
@@ -192,7 +207,11 @@ def _write_lagged(
     played = play(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
     if played is None:
         return []
-    path = place.with_suffix(f".lagged{place.suffix}")
+    path = (
+        place.with_suffix(f".lagged{place.suffix}")
+        if isinstance(place, Path)
+        else place.named(f"{place.written_table}_lagged")
+    )
     write(played, path)
     return [f"{path}: {len(played.time)} rows, each given what came {lag:g} later"]
 
@@ -207,7 +226,11 @@ def _print_lines(warnings: list[str], summary: list[str]) -> None:
 
 
 def _check_options(
-    measurements: Path, out: Path | None, report: Path | None, lag: float | None, options: ReadingOptions
+    measurements: Path | StoreAddress,
+    out: Path | StoreAddress | None,
+    report: Path | None,
+    lag: float | None,
+    options: ReadingOptions,
 ) -> None:
     """Check that the options fit together and files can be written."""
     from heliograph.numerics.check import fail, scalar
@@ -224,15 +247,24 @@ def _check_options(
     _check_places(measurements, out, report)
 
 
-def _choose_writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Write":
-    """Return the function that writes estimates: to a table, or to MCAP with the pose that the network's file names."""
+def _find_origin(data: "Measured") -> "np.datetime64 | None":
+    """Return the date of time 0, of messages whose times are dates."""
+    messages = data.events
+    return None if messages is None or messages.steps or messages.numbers else messages.date
+
+
+def _choose_writer(data: "Measured", module: "Mapping[str, object]") -> "Write":
+    """Return what writes estimates: to a store, a table, or to MCAP with the pose that the network's file names."""
     from heliograph.files.bags.output import write_bag
-    from heliograph.files.estimates.table import write_estimates
+    from heliograph.files.estimates.table import estimate_columns, write_estimates
+    from heliograph.files.stores.tables import write_columns
 
-    origin = None if messages is None or messages.steps or messages.numbers else messages.date
+    origin = _find_origin(data)
 
-    def write(record: "Record", path: Path) -> None:
-        if path.suffix.lower() == ".mcap":
+    def write(record: "Record", path: Path | StoreAddress) -> None:
+        if isinstance(path, StoreAddress):
+            write_columns(path, estimate_columns(record), data.plant, origin)
+        elif path.suffix.lower() == ".mcap":
             write_bag(record, path, origin, module.get("pose"))  # type: ignore[arg-type]  # it says what it expects
         else:
             write_estimates(record, path)
@@ -250,7 +282,7 @@ def _filter_rows(
     return record, [str(doubt.message) for doubt in doubts]
 
 
-def _describe_results(record: "Record", out: Path | None, report: Path | None) -> list[str]:
+def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
     """Describe what was written where in a line, and the errors of each filter."""
     filters = [
         f"{node}/{name} ({_claim(estimate)})"
@@ -288,19 +320,23 @@ def _claim(estimate: "Estimate") -> str:
     return estimate.claim if estimate.claim == "none" or not lost else f"{estimate.claim}, none of {lost} rows"
 
 
-def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
+def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None) -> None:
     """Check before the work starts that files can be read and written, and that what that takes is installed."""
     from heliograph.disk.whole_file import FORMATS, check_output
     from heliograph.numerics.check import fail
     from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results import NEEDS
 
-    kinds = {path.suffix.lower() for path in (measurements, out) if path is not None}
+    kinds = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
     needs = [*(["rosbags"] if kinds & BAGS else []), *(["pyarrow"] if ".parquet" in kinds else [])]
     check_installed([*needs, *(NEEDS if report is not None else ())])
-    if out is not None:
+    if isinstance(out, StoreAddress):
+        from heliograph.files.stores.tables import check_store
+
+        check_store(out)
+    elif out is not None:
         check_output(out, (*FORMATS, ".mcap"))
-        if out.resolve() == measurements.resolve():
+        if isinstance(measurements, Path) and out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
         from heliograph.disk.whole_file import check_replaceable

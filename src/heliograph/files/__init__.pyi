@@ -48,6 +48,10 @@ from .recording import (
 from .sources import (
     Reading as Reading,
 )
+from .stores.tables import (
+    read_store as read_store,
+    store_estimates as store_estimates,
+)
 from .table import (
     read_table as read_table,
     write_table as write_table,

@@ -1,12 +1,13 @@
 """Messages of a recording, a bag or a file of someone else's making, to events by the sources of a network."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
 from heliograph.files.fields import parse_arrival
 from heliograph.files.message_files import (
+    TOPIC,
     FileMessage,
     decode_payload,
     is_message_file,
@@ -14,8 +15,10 @@ from heliograph.files.message_files import (
     read_message_file,
     table_has_topics,
 )
-from heliograph.files.own_messages import OwnMessages, holds_events, is_own
+from heliograph.files.own_messages import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
 from heliograph.files.sources import Sources, Unread
+from heliograph.files.stores.address import is_store, parse_store
+from heliograph.files.stores.tables import StoreTable, ask_store
 from heliograph.files.text.text_file import CutOffError, kind_of
 from heliograph.numerics.check import InputError, check_progress, fail, file_path, flag, instance
 from heliograph.simulation.network import Network
@@ -29,7 +32,7 @@ def read_messages(
     strict: bool = False,
     ignore_unknown: bool = False,
 ) -> EventTable:
-    """Read the events of a network from a bag, or from a file of messages.
+    """Read the events of a network from a bag, a file of messages, or a store.
 
     A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2 or of such files; each event has the
     time of its source and the time when it was logged. A file of messages is CSV or Parquet, of which each row is a
@@ -37,13 +40,14 @@ def read_messages(
     .txt), also those that MQTT clients print; CSV and lines may be packed (.gz). A message has the topic in its field
     `topic`, with JSON in `payload` if there is such a field, else that named as the file. It arrives at the time in
     `arrival` or `tst`, beside a payload also in `timestamp`, `time` or `ts` (a date with a zone, or seconds), else at
-    its own. Messages in our own form, with node, sequence, time and values, need no sources.
+    its own. Messages in our own form, with node, sequence, time and values, need no sources. Rows of a store, of a URL
+    as `read_store` takes it, are messages as rows of CSV are; the topic is the measurement's or the database's name.
 
     A message that cannot be read is refused alone: `refused` of the result counts them, `reasons` has the first.
     Where a bag is damaged what came before stays, and `broken` says where.
 
     Args:
-        path: the bag or the file.
+        path: the bag or the file, or the URL of a store.
         network: the network.
         sources: sources by topic, as `json_field` makes them; None for messages in our own form.
         progress: called with the numbers of messages read and to be read (default none).
@@ -55,29 +59,44 @@ def read_messages(
         ValueError: no such file, no bag, sources that do not fit the network or the file, nothing that can be read.
         ModuleNotFoundError: a bag without rosbags (extra "bags").
     """
-    path = file_path("recording", path)
+    source = ask_store(parse_store(str(path))) if is_store(path) else file_path("recording", path)
+    return read_events(source, network, sources, progress, strict, ignore_unknown)
+
+
+def read_events(
+    source: Path | StoreTable,
+    network: Network,
+    sources: object,
+    progress: Progress | None,
+    strict: bool,
+    ignore_unknown: bool,
+) -> EventTable:
+    """Read the events of a bag, a file or a store's table, as `read_messages` says."""
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
     strict, ignore_unknown = flag("strict", strict), flag("ignore_unknown", ignore_unknown)
     known = None if sources is None else Sources(sources, network)
-    if is_bag(path):
+    if isinstance(source, Path) and is_bag(source):
         if known is None:
-            raise fail("sources", f"a source for the topics of {path}", "none")
+            raise fail("sources", f"a source for the topics of {source}", "none")
         events = EventTable(network, known.step)
-        for part in parts_of(path) or [path]:
+        for part in parts_of(source) or [source]:
             read_bag(part, known, events, progress, strict)
-    elif holds_events(path):
-        events = _read_own_table(path, network, strict, ignore_unknown)
+    elif _holds_own_rows(source):
+        events = _read_own_table(source, network, strict, ignore_unknown)
     else:
-        events = _map_messages(path, network, known, strict)
+        events = _map_messages(source, network, known, strict)
     if known is not None:
-        _warn_of_left_out(path, known, events)
-    events.finish(str(path))
+        _warn_of_left_out(source, known, events)
+    events.finish(str(source))
     return events
 
 
-def is_mapped(path: Path, sources: object) -> bool:
+def is_mapped(path: Path | StoreTable, sources: object) -> bool:
     """Return whether a recording has messages or events, and not rows of time: a bag, a log, a table with a topic."""
+    if isinstance(path, StoreTable):
+        named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
+        return named or _holds_own_rows(path)
     if is_bag(path) or holds_events(path) or is_message_file(path):
         return True
     if kind_of(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
@@ -85,20 +104,30 @@ def is_mapped(path: Path, sources: object) -> bool:
     return message_name(path) in sources or path.name in sources or table_has_topics(path)
 
 
-def _read_own_table(path: Path, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
+def _holds_own_rows(source: Path | StoreTable) -> bool:
+    """Return whether a table has events in our own form: it has the columns `node` and `sequence`."""
+    return holds_events(source) if isinstance(source, Path) else {NODE, SEQUENCE} <= source.columns.keys()
+
+
+def _list_messages(source: Path | StoreTable) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a file or a store's table."""
+    return read_message_file(source) if isinstance(source, Path) else source.messages()
+
+
+def _read_own_table(path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
     """Read a table of events in our own form."""
-    own = OwnMessages(network, path, ignore_unknown)
-    for message in read_message_file(path):
+    own = OwnMessages(network, path, True, ignore_unknown)
+    for message in _list_messages(path):
         own.add(message, strict)
     return own.events()
 
 
-def _map_messages(path: Path, network: Network, sources: Sources | None, strict: bool) -> EventTable:
+def _map_messages(path: Path | StoreTable, network: Network, sources: Sources | None, strict: bool) -> EventTable:
     """Read messages by their topics, and those in our own form among them."""
     events = None if sources is None else EventTable(network, sources.step)
-    own = OwnMessages(network, path, False)
+    own = OwnMessages(network, path, isinstance(path, StoreTable) or is_table(path), False)
     broken = ""
-    for message in read_message_file(path):
+    for message in _list_messages(path):
         if isinstance(message, CutOffError) and not strict:
             broken = str(message)
             continue
@@ -118,11 +147,13 @@ def _map_messages(path: Path, network: Network, sources: Sources | None, strict:
     return events
 
 
-def _append_message(path: Path, message: FileMessage, sources: Sources, events: EventTable, strict: bool) -> None:
+def _append_message(
+    path: Path | StoreTable, message: FileMessage, sources: Sources, events: EventTable, strict: bool
+) -> None:
     """Append what a message says; what cannot be read is refused alone."""
     topic = message.topic
     if topic is None:
-        topic = path.name if sources.of(path.name) else message_name(path)
+        topic = path.topic if isinstance(path, StoreTable) else _name_topic(path, sources)
     try:
         if sources.hear(topic, message.content, message.where):
             return
@@ -148,7 +179,12 @@ def _append_message(path: Path, message: FileMessage, sources: Sources, events: 
         events.refuse(error, strict)
 
 
-def _warn_of_left_out(path: Path, sources: Sources, events: EventTable) -> None:
+def _name_topic(path: Path, sources: Sources) -> str:
+    """Return the topic of a file's messages that name none."""
+    return path.name if sources.of(path.name) else message_name(path)
+
+
+def _warn_of_left_out(path: Path | StoreTable, sources: Sources, events: EventTable) -> None:
     """Say which messages were left out.
 
     Raises:

@@ -49,12 +49,13 @@ class OwnMessages:
 
     Args:
         network: the network that the names belong to.
-        path: the file.
+        source: the file, or what else prints as its name.
+        table: whether it has rows, of which all have the same columns.
         ignore_unknown: whether columns that nobody knows are left out.
     """
 
-    def __init__(self, network: Network, path: Path, ignore_unknown: bool):
-        self.path, self._reader = path, OwnReader(network, str(path), ignore_unknown, is_table(path))
+    def __init__(self, network: Network, source: object, table: bool, ignore_unknown: bool):
+        self.source, self._reader = source, OwnReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
         self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
 
@@ -87,9 +88,9 @@ class OwnMessages:
             ValueError: none could be read; why the first could not.
         """
         if self._table is None:
-            raise InputError(self.reasons[0]) if self.reasons else fail(str(self.path), "at least one row", "none")
+            raise InputError(self.reasons[0]) if self.reasons else fail(str(self.source), "at least one row", "none")
         if self._reader.zero:
-            self._table.notes.append(f"{self.path}: times are counted from {self._reader.zero}")
+            self._table.notes.append(f"{self.source}: times are counted from {self._reader.zero}")
         self._table.refused, self._table.reasons, self._table.broken = self.refused, self.reasons, self.broken
         return self._table
 

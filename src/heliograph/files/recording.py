@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.times.row_times import backwards, backwards_text
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
+
+if TYPE_CHECKING:
+    from heliograph.files.stores.tables import StoreTable
 
 
 @readable
@@ -65,8 +68,8 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
     return reader.read(Rows(columns, np.arange(1, rows + 1), []))
 
 
-def read_recording_file(
-    path: Path, network: Network, strict: bool, ignore_unknown: bool
+def read_recording_rows(
+    source: "Path | StoreTable", network: Network, strict: bool, ignore_unknown: bool
 ) -> tuple[Recording, list[str]]:
     """Read a recording as `read_recording` does, of which a row that cannot be read is refused alone unless `strict`.
 
@@ -78,11 +81,11 @@ def read_recording_file(
     Raises:
         ValueError: what `read_recording` refuses of a table as a whole; no row that can be read.
     """
-    reader = RowReader(network, str(path), strict, ignore_unknown)
-    rows = read_rows(path, reader.only, strict)
+    reader = RowReader(network, str(source), strict, ignore_unknown)
+    rows = read_rows(source, reader.only, strict) if isinstance(source, Path) else source.rows(reader.only)
     recording = reader.read(rows)
     if not len(recording.time):
-        raise reader.refused[0] if reader.refused else fail(str(path), "at least one row", "none")
+        raise reader.refused[0] if reader.refused else fail(str(source), "at least one row", "none")
     return recording, [str(error) for error in reader.refused]
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.recording import Recording, read_recording_file
+from heliograph.files.recording import Recording, read_recording_rows
 from heliograph.files.table import columns_of
 from heliograph.live.event import INPUTS, Event
 from heliograph.model.plant import TIME_STEP
@@ -54,7 +54,7 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     """
     path = file_path("recording", path)
     instance("network", network, Network, "a Network")
-    table, _ = read_recording_file(path, network, strict=True, ignore_unknown=False)
+    table, _ = read_recording_rows(path, network, strict=True, ignore_unknown=False)
     return events_of_recording(table, network)
 
 

@@ -1,0 +1,87 @@
+"""Addresses of stores: a URL with a query or a table; secrets are never printed."""
+
+import os
+from dataclasses import dataclass, field, replace
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+SHAPE = "influx://HOST:PORT/DATABASE or postgresql://HOST/DATABASE, with ?table=NAME or ?query=SELECT..."
+INFLUX, POSTGRES = ("influx", "influxs"), ("postgresql",)
+USER, PASSWORD = "HELIOGRAPH_STORE_USER", "HELIOGRAPH_STORE_PASSWORD"
+ESTIMATES = "estimates"  # the table that is written, unless the URL names another
+
+
+@dataclass(frozen=True)
+class StoreAddress:
+    """Where a table is kept, or what asks for one; printed it is the URL without user, password and query.
+
+    Attributes:
+        kind: scheme of the URL: "influx", "influxs" (TLS) or "postgresql".
+        url: the URL without table and query, with its secrets.
+        database: name of the database; of InfluxDB 2 that of a bucket.
+        table: table (of InfluxDB a measurement) that is read or written; "" if the URL names none.
+        query: statement that is asked instead; "" if the URL has none.
+    """
+
+    kind: str
+    url: str = field(repr=False)
+    database: str
+    table: str
+    query: str = field(repr=False)
+
+    def __str__(self) -> str:
+        parts = urlsplit(self.url)
+        host = f"{parts.hostname or ''}{'' if parts.port is None else f':{parts.port}'}"
+        return f"{self.kind}://{host}/{self.database}{f'?table={self.table}' if self.table else ''}"
+
+    @property
+    def written_table(self) -> str:
+        """Return the table that estimates are written to."""
+        return self.table or ESTIMATES
+
+    def named(self, table: str) -> "StoreAddress":
+        """Return the address of another table there."""
+        return replace(self, table=table)
+
+    @property
+    def login(self) -> tuple[str, str]:
+        """Return user and password, or token, of InfluxDB: those of the environment, else of the URL; "" for none."""
+        parts = urlsplit(self.url)
+        user = os.environ.get(USER) or unquote(parts.username or "")
+        return user, os.environ.get(PASSWORD) or unquote(parts.password or "")
+
+
+def is_store(location: object) -> bool:
+    """Return whether a text is the URL of a store, and not the name of a file."""
+    return isinstance(location, str) and location.split("://")[0] in (*INFLUX, *POSTGRES) and "://" in location
+
+
+def parse_store(url: str) -> StoreAddress:
+    """Read the URL of a store: SCHEME://user:password@host:port/database?table=NAME, or ...?query=SELECT ....
+
+    What follows `query=` is the statement to its end, & included; a % in it is written %25. Of PostgreSQL other
+    parameters, as sslmode=require, are the server's.
+
+    Raises:
+        ValueError: another kind of URL, no database, both table and query; one line without the password.
+    """
+    from heliograph.numerics.check import fail, text  # not before a command needs it
+
+    text("store", url)
+    before, asks, query = url.partition("query=")
+    try:
+        parts = urlsplit(before)
+        host, _ = parts.hostname, parts.port
+    except ValueError:
+        raise fail("store", SHAPE, "an address that cannot be read") from None
+    database = unquote(parts.path).strip("/")
+    influx = parts.scheme in INFLUX
+    if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (influx and not host):
+        raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
+    options = [option for option in parts.query.split("&") if option]
+    tables = [unquote(option.removeprefix("table=")) for option in options if option.startswith("table=")]
+    others = [option for option in options if not option.startswith("table=")]
+    if (influx and others) or len(tables) > 1 or (asks and (tables or not query.strip())):
+        came = others[0].split("=")[0] if influx and others else "both, or one without a value" if asks else "several"
+        raise fail(f"store {parts.scheme}://{host or ''}/{database}", "one of table=NAME and query=SELECT...", came)
+    plain = urlunsplit((parts.scheme, parts.netloc, parts.path, "&".join(others), ""))
+    return StoreAddress(parts.scheme, plain, database, tables[0] if tables else "", unquote(query))

@@ -1,0 +1,94 @@
+"""PostgreSQL, and so TimescaleDB: the rows of a query in, a table of estimates out, in one transaction."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import psycopg
+from psycopg import sql
+
+from heliograph.files.stores.address import StoreAddress
+from heliograph.numerics.check import InputError, fail
+
+LONGEST = 63  # bytes of a column's name; what is longer would be cut
+PLANT, TIME = "plant", "time"
+TYPES = {"b": "boolean", "f": "double precision", "M": "timestamptz", "i": "double precision", "u": "double precision"}
+
+
+def ask_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
+    """Ask for a table in a transaction that only reads; return the database's name and the columns, as lists.
+
+    Raises:
+        ValueError: the server is away or refuses; no rows; a name twice. One line.
+    """
+    table = sql.SQL("SELECT * FROM {} ORDER BY time").format(sql.Identifier(*address.table.split(".")))
+    query: Any = address.query.encode() or table
+    try:
+        with psycopg.connect(address.url) as connection:
+            connection.read_only = True
+            connection.execute("SET TIME ZONE 'UTC'")
+            cursor = connection.execute(query)
+            if cursor.description is None:
+                raise fail(str(address), "a query that returns rows", "one that returns none")
+            names = [column.name for column in cursor.description]
+            rows = cursor.fetchall()
+    except (psycopg.Error, OverflowError) as error:  # a date that Python has not
+        raise _explain(address, error) from None
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise fail(str(address), "columns of different names", f"{twice!r} more than once")
+    if not rows:
+        raise fail(str(address), "a query with rows", "none")
+    return address.database, {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], plant: str) -> None:
+    """Write rows to a table, which is made where there is none, in place of its rows of these times and this plant.
+
+    It has the columns `plant` (text) and `time` (timestamptz, or numbers), and those given: all or nothing is written.
+
+    Raises:
+        ValueError: the server is away or refuses, a table of other columns, a name that is too long; one line.
+    """
+    long = next((name for name in columns if len(name.encode()) > LONGEST), None)
+    if long is not None:
+        raise fail(str(address), f"columns whose names have at most {LONGEST} bytes", repr(long))
+    table = sql.Identifier(*address.written_table.split("."))
+    types = [sql.SQL("{} {}").format(sql.Identifier(n), sql.SQL(TYPES[c.dtype.kind])) for n, c in columns.items()]
+    names = sql.SQL(", ").join(map(sql.Identifier, (PLANT, *columns)))
+    cells = [_convert_cells(column) for column in columns.values()]
+    times = _convert_cells(np.sort(columns[TIME]))
+    try:
+        with psycopg.connect(address.url) as connection:
+            made = sql.SQL("CREATE TABLE IF NOT EXISTS {} (plant text NOT NULL, {})")
+            connection.execute(made.format(table, sql.SQL(", ").join(types)))
+            kept = sql.SQL("DELETE FROM {} WHERE plant = %s AND time BETWEEN %s AND %s").format(table)
+            connection.execute(kept, (plant, times[0], times[-1]))
+            with connection.cursor().copy(sql.SQL("COPY {} ({}) FROM STDIN").format(table, names)) as copy:
+                for row in zip(*cells, strict=True):
+                    copy.write_row((plant, *row))
+    except psycopg.Error as error:
+        raise _explain(address, error) from None
+
+
+def check_postgres(address: StoreAddress) -> None:
+    """Raise ValueError where no server answers there, or none for this user."""
+    try:
+        psycopg.connect(address.url, connect_timeout=10).close()
+    except psycopg.Error as error:
+        raise _explain(address, error) from None
+
+
+def _convert_cells(column: np.ndarray) -> list[Any]:
+    """Return the cells of a column as the server reads them: dates to the microsecond, what is no number as NULL."""
+    if column.dtype.kind == "M":
+        moments = np.datetime_as_string(column.astype("datetime64[us]")).tolist()
+        return [f"{moment}Z" for moment in moments]
+    return [value if value == value else None for value in column.tolist()]
+
+
+def _explain(address: StoreAddress, error: Exception) -> InputError:
+    """Return the error of one line: what the server said first."""
+    said = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    away = isinstance(error, psycopg.OperationalError)
+    return fail(str(address), "a server that answers" if away else "what the server accepts", said)

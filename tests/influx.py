@@ -1,0 +1,95 @@
+"""An InfluxDB server for the tests, in a new folder: version 1, as distributions have it."""
+
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from http.client import HTTPConnection
+from pathlib import Path
+from urllib.parse import urlencode
+
+SECONDS = 60  # until a server that starts must answer
+CONFIGURATION = """
+reporting-disabled = true
+bind-address = "127.0.0.1:{rpc}"
+[meta]
+dir = "{folder}/meta"
+[data]
+dir = "{folder}/data"
+wal-dir = "{folder}/wal"
+index-version = "inmem"
+[http]
+bind-address = "127.0.0.1:{port}"
+log-enabled = false
+[monitor]
+store-enabled = false
+"""
+
+
+def influxd() -> str | None:
+    """The program, where it is on the path."""
+    return shutil.which("influxd")
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+class Influx:
+    """A server with one database, `plant`, in a folder that goes with it; use it in a `with`."""
+
+    def __init__(self) -> None:
+        self.folder, self.port = Path(tempfile.mkdtemp(prefix="heliograph-influx-")), free_port()
+        configuration = self.folder / "influxdb.conf"
+        configuration.write_text(CONFIGURATION.format(folder=self.folder, port=self.port, rpc=free_port()))
+        program = influxd()
+        assert program is not None
+        environment = {**os.environ, "HOME": str(self.folder)}
+        with (self.folder / "log").open("wb") as log:
+            command = [program, "-config", configuration]
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+        self._wait()
+        assert self.send("POST", f"/query?{urlencode({'q': 'CREATE DATABASE plant'})}") == 200
+
+    @property
+    def url(self) -> str:
+        """Where the database is."""
+        return f"influx://127.0.0.1:{self.port}/plant"
+
+    def send(self, method: str, target: str, body: str = "") -> int:
+        """Send a request; the status of its answer."""
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=20)
+        try:
+            connection.request(method, target, body.encode())
+            return connection.getresponse().status
+        finally:
+            connection.close()
+
+    def write(self, lines: str) -> None:
+        """Write lines of the protocol, as any other program does."""
+        assert self.send("POST", "/write?db=plant&precision=ns", lines) == 204
+
+    def _wait(self) -> None:
+        last = time.monotonic() + SECONDS
+        while True:
+            try:
+                assert self.send("GET", "/ping") == 204
+                return
+            except OSError:
+                assert self.process.poll() is None and time.monotonic() < last, (self.folder / "log").read_text()
+                time.sleep(0.05)
+
+    def __enter__(self) -> "Influx":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.terminate()
+        try:
+            self.process.wait(10)
+        finally:
+            self.process.kill()
+            shutil.rmtree(self.folder, ignore_errors=True)
