@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 from typing import NamedTuple
 
 import pytest
@@ -43,6 +44,7 @@ LIVE = f"{Path(sys.executable).name} -m pip install '{ROOT}[live]'"
 PARTS = {
     "PostgreSQL": Part(lambda: programs() is not None, "apt-get install postgresql"),
     "InfluxDB": Part(lambda: influxd() is not None, "apt-get install influxdb"),
+    "Prometheus": Part(lambda: which("promtool") is not None, "apt-get install prometheus"),
     "MQTT": Part(lambda: broker("paho"), LIVE),
     "NATS": Part(lambda: broker("nats"), LIVE),
     "OPC UA": Part(lambda: find_spec("asyncua") is not None, LIVE.replace("live", "opcua")),

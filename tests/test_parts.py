@@ -43,6 +43,7 @@ def test_what_another_process_started_counts_and_the_last_line_names_every_part(
     assert [plugin.outcome(name) for name in parts.PARTS] == [
         "PostgreSQL ran",
         "InfluxDB left out",
+        "Prometheus left out",
         "MQTT left out",
         "NATS left out",
         "OPC UA left out",
