@@ -21,7 +21,7 @@ PARTS = {
 }
 ROOMS = {
     "ground": ["numerics", "engine", "disk", "factors"],
-    "description": ["random_affine", "model"],
+    "description": ["random_affine", "model", "models"],
     "estimation": [
         "linear",
         "relays",

@@ -3,6 +3,7 @@
 from . import (
     random_affine as random_affine,
     model as model,
+    models as models,
     linear as linear,
     relays as relays,
     h_infinity as h_infinity,

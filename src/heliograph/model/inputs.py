@@ -1,7 +1,7 @@
 """Inputs of a plant: a time step that does not go backwards, and what the plant's functions return for them."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, OfInputs, matrix_of
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
+from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import rounding
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.noise import AbstractNoise
@@ -125,8 +126,9 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
 
 def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
     """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
-    for name, function in _list_functions(first(plant)).items():
-        values = np.concatenate(list(_evaluate_in_parts(plant, function, u, step)))
+    functions = _list_functions(first(plant))
+    parts = list(_evaluate_in_parts(plant, tuple(functions.values()), u, step)) if functions else []
+    for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
         wrong = find_wrong_covariances(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
@@ -137,15 +139,23 @@ def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step
 
 
 def _evaluate_in_parts(
-    plant: AnyPlant, function: MatrixOfInputs, u: Float[np.ndarray, "steps inputs"], step: int
-) -> Iterator[Float[np.ndarray, "steps n m"]]:
-    """Yield what a function returns, some steps at a time."""
+    plant: AnyPlant, functions: tuple[MatrixOfInputs, ...], u: Float[np.ndarray, "steps inputs"], step: int
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yield what functions return, some steps at a time."""
     for start in range(0, len(u), ROWS):
         part = u[start : start + ROWS]
-        with jax.enable_x64(True):
-            yield np.asarray(
-                jax.vmap(lambda k, u_k: function(at(plant, k), u_k))(step + start + np.arange(len(part)), part)
-            )
+        yield _evaluate(plant, functions, part, step + start + np.arange(len(part)))
+
+
+@compile_in_float64
+def _evaluate(plant: AnyPlant, functions: tuple[MatrixOfInputs, ...], u: Array, steps: Array) -> Any:
+    """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
+
+    def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
+        now = at(plant, k)
+        return tuple(function(now, u_k) for function in functions)
+
+    return jax.vmap(of_step)(jnp.asarray(steps), jnp.asarray(u))
 
 
 def _shorten(value: np.ndarray) -> str:

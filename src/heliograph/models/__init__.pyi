@@ -1,0 +1,41 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .continuous_time import (
+    Discretized as Discretized,
+    continuous_plant as continuous_plant,
+    discretize as discretize,
+)
+from .runge_kutta import (
+    runge_kutta_plant as runge_kutta_plant,
+)
+from .motion import (
+    constant_acceleration as constant_acceleration,
+    constant_velocity as constant_velocity,
+    gauss_markov as gauss_markov,
+    known_turn as known_turn,
+    singer as singer,
+)
+from .vehicles import (
+    bicycle as bicycle,
+    coordinated_turn as coordinated_turn,
+    unicycle as unicycle,
+)
+from .series import (
+    Component as Component,
+    arma as arma,
+    cycle as cycle,
+    level as level,
+    seasonal as seasonal,
+    stationary as stationary,
+    trend as trend,
+    trigonometric_seasonal as trigonometric_seasonal,
+)
+from .joined import (
+    Structural as Structural,
+    join as join,
+    structural as structural,
+)
+from .parts_of_estimates import (
+    Components as Components,
+    components as components,
+)

@@ -1,0 +1,231 @@
+"""Plants from continuous time: dx = (A x + B u) dt + dW made x+ = F x + B u + w over a step of any length."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.model.plant import TIME_STEP, LinearPlant
+from heliograph.numerics.check import array, covariance, fail, name_list, names, scalar
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.types import Array, ArrayLike, Float, Names
+from heliograph.random_affine.noise import NoiseLike
+
+TERMS = 18  # of the series: (2 |A| h)^18 / 19! is below 1e-17 where |A| h is at most 1/2
+HALVINGS = 40  # of a step whose length is an input: up to |A| dt = 5e11
+Square = TypeAliasType("Square", Float[ArrayLike, "n n"])
+Start = TypeAliasType("Start", Float[ArrayLike, " n"])
+Columns = TypeAliasType("Columns", Float[ArrayLike, "n inputs"])
+Number = TypeAliasType("Number", Float[ArrayLike, ""])
+Drift = TypeAliasType("Drift", Callable[[jax.Array, jax.Array], ArrayLike])  # dx/dt of (x, u)
+
+
+@readable
+class Discretized(NamedTuple):
+    """A step of dx = (A x + B u) dt + dW: x+ = `matrix` x + `input_matrix` u + w with Cov w = `noise`.
+
+    Args:
+        matrix: F = exp(A dt) (n, n).
+        noise: Q, the integral of exp(A s) S exp(A s)' over the step (n, n).
+        input_matrix: the integral of exp(A s) over the step, times B (n, inputs): u is held meanwhile.
+    """
+
+    matrix: Array
+    noise: Array
+    input_matrix: Array
+
+
+def discretize(
+    A: "Float[ArrayLike, 'n n']",
+    intensity: "Float[ArrayLike, 'n n']",
+    dt: "Float[ArrayLike, '']",
+    B: "Float[ArrayLike, 'n inputs'] | None" = None,
+) -> Discretized:
+    """Return the step of length dt of dx = (A x + B u) dt + dW: F, Q and the matrix of an input that is held.
+
+    The series of all three over a short step, which is then doubled: Q(2h) = Q(h) + F(h) Q(h) F(h)', sums of what is
+    positive, so that no digits cancel however long or stiff the step is. F is right to 1e-13 of its norm.
+
+    Args:
+        A: matrix of the motion (n, n).
+        intensity: S, the covariance that W gains in a unit of time (n, n); a number for that in each state.
+        dt: length of the step.
+        B: matrix of the inputs (n, inputs); none by default.
+
+    Raises:
+        ValueError: matrices of other shapes, an intensity that is no covariance, a step that goes backwards.
+
+    Source: Van Loan, Computing integrals involving the matrix exponential (1978), its integrals.
+    """
+    model = _read_continuous(A, intensity, B)
+    step = scalar("length of a step", dt, 0.0)
+    return model.over(step)
+
+
+class Continuous(Module):
+    """Matrices of dx = (A x + B u) dt + dW with the intensity S of W."""
+
+    a: Array
+    b: Array
+    intensity: Array
+
+    def over(self, dt: Any) -> Discretized:
+        """Return the step of length dt, known or traced."""
+        xp = library(self.a, self.b, self.intensity, dt)
+        a = xp.asarray(self.a)
+        size = xp.max(xp.sum(xp.abs(a), axis=0)) * dt
+        # dt = h 2^count with |A| h <= 1/2.
+        count = xp.ceil(xp.log2(xp.maximum(2 * size, 1.0)))
+        short = dt / 2**count
+        integral, noise = self._series(xp, a, short)
+        growth = a @ integral
+        parts = growth, np.eye(len(a)) + growth, integral, noise
+        if is_traced(parts, count):
+            parts = jax.lax.fori_loop(0, HALVINGS, _double_where(count), parts)
+        else:
+            for _ in range(int(count)):
+                parts = _double(*parts)
+        growth, squared, integral, noise = parts
+        # I + growth has lost what is small beside 1, the squared F what rounding of 1 was doubled to.
+        decayed = xp.max(xp.abs(squared)) * 2**count < 1
+        matrix = xp.where(decayed, squared, np.eye(len(a)) + growth)
+        return Discretized(matrix, (noise + noise.T) / 2, integral @ self.b)
+
+    def _series(self, xp: Any, a: Any, h: Any) -> tuple[Any, Any]:
+        """Return the integral of exp(A s), and that of exp(A s) S exp(A s)', over a short step h."""
+
+        def add_term(k: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+            power, spread, integral, noise = parts
+            power, moved = a @ power * (h / k), a @ spread * (h / k)
+            spread = moved + moved.T
+            return power, spread, integral + power, noise + spread
+
+        power, spread = h * xp.eye(len(a)), h * xp.asarray(self.intensity)
+        parts = power, spread, power, spread
+        if is_traced(parts):
+            parts = jax.lax.fori_loop(2, TERMS + 2, add_term, parts)
+        else:
+            for k in range(2, TERMS + 2):
+                parts = add_term(k, parts)
+        return parts[2], parts[3]
+
+
+def _double(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[Any, Any, Any, Any]:
+    """From F - I, F, the integral of F and Q over a step to those over twice the step."""
+    moved = noise + growth @ noise
+    return (
+        2 * growth + growth @ growth,
+        matrix @ matrix,
+        2 * integral + growth @ integral,
+        noise + moved + moved @ growth.T,
+    )
+
+
+def _double_where(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
+    """Return the turn of a loop that doubles `count` times and then leaves all as it is."""
+
+    def turn(i: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        # What is not doubled any more is taken as zero, so that nothing overflows and derivatives stay finite.
+        goes_on = i < count
+        doubled = _double(*(jnp.where(goes_on, part, 0.0) for part in parts))
+        return tuple(jnp.where(goes_on, new, old) for new, old in zip(doubled, parts, strict=True))
+
+    return turn
+
+
+def _read_continuous(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> Continuous:
+    a = array("matrix of the motion", A, (None, None))
+    n = a.shape[0]
+    a = array("matrix of the motion", a, (n, n))
+    b = np.zeros((n, 0)) if B is None else array("input matrix", B, (n, "inputs"))
+    return Continuous(a, b, covariance("noise intensity", intensity, n))
+
+
+class MatrixOver(Module):
+    """F of the step that an input says; `place` is that of dt among the inputs."""
+
+    model: Continuous
+    place: int = eqx.field(static=True)
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return F (n, n)."""
+        return jnp.asarray(self.model.over(u[self.place]).matrix)
+
+
+class NoiseOver(MatrixOver):
+    """Q of the step that an input says."""
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return Q (n, n)."""
+        return jnp.asarray(self.model.over(u[self.place]).noise)
+
+
+class InputsOver(MatrixOver):
+    """Matrix of inputs that are held over the step that the last of them says."""
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return the matrix (n, inputs + 1), zero for dt."""
+        matrix = jnp.asarray(self.model.over(u[self.place]).input_matrix)
+        return jnp.concatenate([matrix, jnp.zeros((len(matrix), 1))], axis=1)
+
+
+def continuous_plant(
+    A: Square,
+    intensity: Square,
+    initial_mean: Start,
+    initial_covariance: NoiseLike,
+    B: Columns | None = None,
+    dt: Number | None = None,
+    states: Names | None = None,
+    inputs: Names | None = None,
+) -> LinearPlant:
+    """Return the plant of dx = (A x + B u) dt + dW, exact for steps of any length.
+
+    Without `dt` the plant has the input "dt" behind its others, the length of each step, which recorded data and live
+    clocks fill by themselves; rows may be as far apart as they like. With a number, all matrices are constants.
+
+    Args:
+        A: matrix of the motion (n, n).
+        intensity: S, the covariance that W gains in a unit of time (n, n); a number for that in each state.
+        initial_mean: mean of the state before the first step (n,).
+        initial_covariance: its covariance, a variance for all of it, or the law of its deviation.
+        B: matrix of inputs that are held over a step (n, inputs); none by default.
+        dt: length of every step; by default the input "dt" says it.
+        states: names of the states, or a mapping of names to units; x0, x1, ... by default.
+        inputs: names of the columns of B; u0, u1, ... by default.
+
+    Raises:
+        ValueError: matrices of other shapes, an intensity that is no covariance, a step that goes backwards, an input
+            that is called "dt" already.
+
+    Source: Van Loan, Computing integrals involving the matrix exponential (1978).
+    """
+    model = _read_continuous(A, intensity, B)
+    count = model.b.shape[1]
+    named = names("input names", inputs, count, "u")
+    if dt is not None:
+        step = model.over(scalar("length of a step", dt, 0.0))
+        return LinearPlant(step.matrix, step.noise, initial_mean, initial_covariance, step.input_matrix, states, named)
+    every = with_time_step(named)
+    return LinearPlant(
+        MatrixOver(model, count),
+        NoiseOver(model, count),
+        initial_mean,
+        initial_covariance,
+        InputsOver(model, count) if count else None,
+        states,
+        every,
+    )
+
+
+def with_time_step(inputs: Names) -> list[str]:
+    """Return the names of inputs with "dt" behind them."""
+    listed = name_list("input names", inputs)
+    if TIME_STEP in listed:
+        raise fail("input names", f"no {TIME_STEP!r}, which is added as the length of a step", listed)
+    return [*listed, TIME_STEP]

@@ -1,0 +1,160 @@
+"""Plants side by side as one, and a time series as the sum of its components."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInputs, Plant, matrix_of
+from heliograph.model.sensor import LinearSensor
+from heliograph.models.series import Component
+from heliograph.numerics.check import fail, instance, items
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.types import Array, Names
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, NoiseLike
+
+
+class SideBySide(Module):
+    """Transition of several plants, each with its own part of the state and its own inputs.
+
+    Args:
+        plants: the plants.
+        places: of each plant's inputs among all.
+    """
+
+    plants: tuple[AbstractPlant, ...]
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """Return the state after a step."""
+        parts, start = [], 0
+        for plant, own in self.each(u):
+            parts.append(plant.transition(x[start : start + len(plant.states)], own))
+            start += len(plant.states)
+        return jnp.concatenate(parts)
+
+    def each(self, u: jax.Array) -> list[tuple[Any, jax.Array]]:
+        """Pair each plant with its inputs."""
+        return [(p, jnp.asarray(u)[np.array(at, int)]) for p, at in zip(self.plants, self.places, strict=True)]
+
+
+class MatrixSideBySide(SideBySide):
+    """The block-diagonal matrix of linear plants."""
+
+    def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
+        """Return A (n, n)."""
+        return jnp.asarray(block_diagonal([jnp.asarray(p.transition_matrix(own)) for p, own in self.each(u)]))
+
+
+class InputsSideBySide(SideBySide):
+    """The input matrices of linear plants, one above the other."""
+
+    def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
+        """Return B (n, inputs)."""
+        rows = []
+        for (plant, own), at in zip(self.each(u), self.places, strict=True):
+            matrix = jnp.asarray(matrix_of(plant.input_matrix, own))
+            rows.append(jnp.zeros((len(plant.states), len(u))).at[:, np.array(at, int)].set(matrix))
+        return jnp.concatenate(rows)
+
+
+def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
+    """Return plants side by side as one: states and inputs keep their names, units and angles.
+
+    They start independently and are driven by independent noises. An input of one name, such as "dt", is one input of
+    all that have it. The result is linear where all are.
+
+    Args:
+        plants: plants that do not vary over time, no state of one named as another's.
+
+    Raises:
+        ValueError: no plants, one that varies over time, a state that two have.
+    """
+    parts = [
+        instance("plant to join", plant, AbstractPlant, "a plant that does not vary")
+        for plant in items("plants", plants, "plants")
+    ]
+    if not parts:
+        raise fail("plants", "at least one", "none")
+    states = [name for plant in parts for name in plant.states]
+    doubled = sorted({str(name) for name in states if states.count(name) > 1})
+    if doubled:
+        raise fail("states of joined plants", "each name once (components and axes take another name)", doubled)
+    inputs = list(dict.fromkeys(name for plant in parts for name in plant.inputs))
+    places = tuple(tuple(inputs.index(name) for name in plant.inputs) for plant in parts)
+    # Laws of the initial state and of the noises.
+    laws = [plant.deviation or Gaussian(plant.initial_covariance) for plant in parts]
+    centers = [plant.initial_mean - law.mean for plant, law in zip(parts, laws, strict=True)]
+    center, start = library(*centers).concatenate(centers), Independent(laws)
+    noises = [plant.noise for plant in parts if isinstance(plant.noise, AbstractNoise)]
+    noise = Independent(noises) if len(noises) == len(parts) else JointNoise(tuple(parts), places)
+    circular = [name for plant in parts for name in plant.circular]
+    if not all(isinstance(plant, LinearPlant) for plant in parts):
+        return Plant(SideBySide(tuple(parts), places), noise, center, start, states, inputs, circular)
+    matrix, driven = _matrices(parts, places, len(inputs))
+    return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular)
+
+
+def _matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:
+    """Return A and B of linear plants side by side: constants, or functions of the inputs where some part is one."""
+    if any(isinstance(value, OfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):
+        every = tuple(parts), places
+        return MatrixSideBySide(*every), InputsSideBySide(*every)
+    pick = np.eye(count)
+    rows = [plant.input_matrix @ pick[list(at)] for plant, at in zip(parts, places, strict=True)]
+    return block_diagonal([plant.matrix for plant in parts]), library(*rows).concatenate(rows)
+
+
+@readable
+class Structural(Module):
+    """A time series as the sum of its components and a noise.
+
+    Args:
+        plant: the components' plants side by side.
+        sensor: what measures their sum.
+        components: weights of the states (n,) for each component, by its name; as `components` takes them.
+    """
+
+    plant: LinearPlant
+    sensor: LinearSensor
+    components: dict[str, Array]
+
+
+def structural(components: "Sequence[Component]", noise: NoiseLike = 0.0, output: str | Names = "y") -> Structural:
+    """Return the model of a series y = sum of components + v.
+
+    `hg.kalman_filter(model.plant, model.sensor)` filters it, `hg.models.components(result, model.components)` takes its
+    estimates apart.
+
+    Args:
+        components: of `level`, `trend`, `seasonal`, `cycle`, `arma` or own ones, each of another name.
+        noise: variance of v, or its law; 0 by default.
+        output: name of y, or a mapping of it to its unit; "y" by default.
+
+    Raises:
+        ValueError: no components, two of one name or with a state of one name, a noise that is none.
+
+    Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989).
+    """
+    parts = [
+        instance("component", part, Component, "one such as hg.models.level(1.0)")
+        for part in items("components", components, "components")
+    ]
+    plant = join([part.plant for part in parts])
+    assert isinstance(plant, LinearPlant)  # as all of them are
+    named = [part.name for part in parts]
+    if len(set(named)) < len(named):
+        raise fail("components", "each name once", named)
+    ends = np.cumsum([len(part.plant.states) for part in parts])
+    weights: dict[str, Array] = {}
+    for part, end in zip(parts, ends, strict=True):
+        weights[part.name] = np.zeros(ends[-1])
+        weights[part.name][end - len(part.loading) : end] = part.loading
+    sensor = LinearSensor(
+        np.sum(list(weights.values()), axis=0)[None], noise, [output] if isinstance(output, str) else output
+    )
+    return Structural(plant, sensor, weights)

@@ -1,0 +1,228 @@
+"""Linear models of motion: constant velocity and acceleration, Singer's, Gauss-Markov, and a turn of known rate."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from heliograph.model.plant import LinearPlant
+from heliograph.models.continuous_time import continuous_plant
+from heliograph.numerics.check import fail, name_list, scalar
+from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.types import ArrayLike, Float, Names, rename
+from heliograph.random_affine.noise import NoiseLike
+
+WIDE = 1e8  # variance of what nobody knows before the first measurement, unless one says it
+LARGEST = 1e100  # deviation, of which the square is a number
+
+
+def constant_velocity(
+    intensity: "Float[ArrayLike, '']",
+    dt: "Float[ArrayLike, ''] | None" = None,
+    axes: Names = ("position",),
+    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_covariance: NoiseLike | None = None,
+) -> LinearPlant:
+    """Return the plant of a nearly constant velocity on each axis: dv = dW.
+
+    States of each axis: its position and "AXIS_velocity" ("velocity" of the axis "position"). Over a step Q is
+    q [[dt^3/3, dt^2/2], [dt^2/2, dt]].
+
+    Args:
+        intensity: q, the variance that a velocity gains in a unit of time.
+        dt: length of every step; by default the input "dt" says it.
+        axes: names of the positions, or a mapping of them to units; "position" by default.
+        initial_mean: mean before the first step (n,); zero by default.
+        initial_covariance: its covariance; by default a variance of 1e8 of each state: nothing is known.
+
+    Raises:
+        ValueError: a negative intensity, a step that goes backwards, an initial law of another size.
+
+    Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 6.2.2.
+    """
+    return _on_axes([[0, 1], [0, 0]], _intensity(2, intensity), axes, dt, initial_mean, initial_covariance)
+
+
+def constant_acceleration(
+    intensity: "Float[ArrayLike, '']",
+    dt: "Float[ArrayLike, ''] | None" = None,
+    axes: Names = ("position",),
+    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_covariance: NoiseLike | None = None,
+) -> LinearPlant:
+    """Return the plant of a nearly constant acceleration on each axis: da = dW.
+
+    States of each axis: its position, "AXIS_velocity" and "AXIS_acceleration".
+
+    Args:
+        intensity: variance that an acceleration gains in a unit of time.
+        dt: length of every step; by default the input "dt" says it.
+        axes: names of the positions, or a mapping of them to units; "position" by default.
+        initial_mean: mean before the first step (n,); zero by default.
+        initial_covariance: its covariance; by default a variance of 1e8 of each state: nothing is known.
+
+    Raises:
+        ValueError: a negative intensity, a step that goes backwards, an initial law of another size.
+
+    Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 6.2.3.
+    """
+    motion = [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
+    return _on_axes(motion, _intensity(3, intensity), axes, dt, initial_mean, initial_covariance)
+
+
+def singer(
+    deviation: "Float[ArrayLike, '']",
+    time: "Float[ArrayLike, '']",
+    dt: "Float[ArrayLike, ''] | None" = None,
+    axes: Names = ("position",),
+    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_covariance: NoiseLike | None = None,
+) -> LinearPlant:
+    """Return Singer's plant of a vehicle that manoeuvres: the acceleration of each axis is a Gauss-Markov process.
+
+    da = -a / T dt + dW, of the same deviation at all times. States as of `constant_acceleration`.
+
+    Args:
+        deviation: standard deviation of an acceleration.
+        time: T, in which an acceleration is forgotten to 1/e.
+        dt: length of every step; by default the input "dt" says it.
+        axes: names of the positions, or a mapping of them to units; "position" by default.
+        initial_mean: mean before the first step (n,); zero by default.
+        initial_covariance: its covariance; by default a variance of 1e8 of positions and velocities, and that of the
+            process of accelerations.
+
+    Raises:
+        ValueError: a negative deviation, a time that is not positive, an initial law of another size.
+
+    Source: Singer, Estimating optimal tracking filter performance for manned maneuvering targets (1970).
+    """
+    size, rate = _deviation_and_rate(deviation, time)
+    motion = library(rate).asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -rate]])
+    start = library(size).asarray([WIDE, WIDE, size**2])
+    return _on_axes(motion, _intensity(3, 2 * size**2 * rate), axes, dt, initial_mean, initial_covariance, start)
+
+
+def gauss_markov(
+    deviation: "Float[ArrayLike, '']",
+    time: "Float[ArrayLike, '']",
+    dt: "Float[ArrayLike, ''] | None" = None,
+    states: Names = ("x",),
+) -> LinearPlant:
+    """Return first-order Gauss-Markov processes dx = -x / T dt + dW, independent, stationary from the start.
+
+    The autocovariance over a time t is deviation^2 exp(-|t| / T).
+
+    Args:
+        deviation: standard deviation of each, at all times.
+        time: T, in which each is forgotten to 1/e.
+        dt: length of every step; by default the input "dt" says it.
+        states: names of the processes, or a mapping of them to units; "x" by default.
+
+    Raises:
+        ValueError: a negative deviation, a time that is not positive, a step that goes backwards.
+
+    Source: Gelb, Applied optimal estimation (1974), 3.8.
+    """
+    size, rate = _deviation_and_rate(deviation, time)
+    named = name_list("states", states)
+    eye = np.eye(len(named))
+    return continuous_plant(
+        -rate * eye, 2 * size**2 * rate * eye, np.zeros(len(named)), size**2 * eye, dt=dt, states=_with_units(named)
+    )
+
+
+def known_turn(
+    intensity: "Float[ArrayLike, '']",
+    turn_rate: "Float[ArrayLike, '']",
+    dt: "Float[ArrayLike, ''] | None" = None,
+    axes: Names = ("x", "y"),
+    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_covariance: NoiseLike | None = None,
+) -> LinearPlant:
+    """Return the plant of a coordinated turn of known rate: velocities turn by it, and gain white noise.
+
+    States: "x", "x_velocity", "y", "y_velocity". It is linear; of an unknown rate take `coordinated_turn`.
+
+    Args:
+        intensity: variance that each velocity gains in a unit of time.
+        turn_rate: radians in a unit of time, positive from the first axis to the second.
+        dt: length of every step; by default the input "dt" says it.
+        axes: names of both positions, or a mapping of them to units; "x" and "y" by default.
+        initial_mean: mean before the first step (4,); zero by default.
+        initial_covariance: its covariance; by default a variance of 1e8 of each state.
+
+    Raises:
+        ValueError: other than two axes, a negative intensity, a step that goes backwards.
+
+    Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 11.7.1.
+    """
+    rate, q = scalar("turn rate", turn_rate), scalar("noise intensity", intensity, 0.0)
+    motion = library(rate).asarray([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, -rate], [0.0, 0.0, 0.0, 1.0],
+                                    [0.0, rate, 0.0, 0.0]])  # fmt: skip
+    named = two_axes(axes)
+    mean = np.zeros(4) if initial_mean is None else initial_mean
+    start = WIDE * np.eye(4) if initial_covariance is None else initial_covariance
+    states = _with_units(_states_of(named, 2))
+    return continuous_plant(motion, q * np.diag([0.0, 1.0, 0.0, 1.0]), mean, start, dt=dt, states=states)
+
+
+def two_axes(axes: Names) -> list[str]:
+    """Return the names of two axes.
+
+    Raises:
+        ValueError: another number of them.
+    """
+    named = name_list("axes", axes)
+    if len(named) != 2:
+        raise fail("axes", "two, such as ['x', 'y']", named)
+    return named
+
+
+def _deviation_and_rate(deviation: ArrayLike, time: ArrayLike) -> tuple[Any, Any]:
+    return scalar("deviation", deviation, 0.0, LARGEST), 1 / scalar("time", time, 1 / LARGEST)
+
+
+def _intensity(order: int, value: ArrayLike) -> Any:
+    """Return the intensity of noise that enters the last of so many states."""
+    q = scalar("noise intensity", value, 0.0)
+    return q * np.diag([0.0] * (order - 1) + [1.0])
+
+
+def _states_of(axes: Sequence[str], order: int) -> list[str]:
+    """Return the names of positions, velocities and accelerations, axis by axis."""
+    named = []
+    for axis in axes:
+        prefix = "" if axis == "position" else f"{axis}_"
+        named += [axis, *(f"{prefix}{derivative}" for derivative in ("velocity", "acceleration")[: order - 1])]
+    return named
+
+
+def _with_units(states: Sequence[str]) -> Sequence[str]:
+    """Return names whose units, where they have some, stay with them."""
+    return [rename(name, str(name)) for name in states]
+
+
+def _on_axes(
+    motion: Any,
+    intensity: Any,
+    axes: Names,
+    dt: ArrayLike | None,
+    initial_mean: ArrayLike | None,
+    initial_covariance: NoiseLike | None,
+    start: Any = None,
+) -> LinearPlant:
+    """Return the same motion on each axis, independently."""
+    named = name_list("axes", axes)
+    if not named:
+        raise fail("axes", "at least one name", "none")
+    order, count = len(intensity), len(named)
+    variances = np.full(order, WIDE) if start is None else start
+    xp = library(variances)
+    return continuous_plant(
+        block_diagonal([library(motion).asarray(motion)] * count),
+        block_diagonal([intensity] * count),
+        np.zeros(order * count) if initial_mean is None else initial_mean,
+        block_diagonal([xp.diag(variances)] * count) if initial_covariance is None else initial_covariance,
+        dt=dt,
+        states=_states_of(named, order),
+    )

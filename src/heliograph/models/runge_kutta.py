@@ -1,0 +1,114 @@
+"""Nonlinear plants from continuous time: dx = f(x, u) dt + dW by a Runge-Kutta step."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.plant import Plant, check_shape
+from heliograph.models.continuous_time import Continuous, Drift, Number, Square, Start, with_time_step
+from heliograph.numerics.check import array, check_count, covariance, function, name_list, scalar
+from heliograph.numerics.module import Module
+from heliograph.numerics.traced import as_real
+from heliograph.numerics.types import Array, Names
+from heliograph.random_affine.noise import NoiseLike
+
+
+class Motion(Module):
+    """dx/dt = f(x, u), and the length of a step: a number, or the last input."""
+
+    drift: Drift
+    dt: Any
+    substeps: int = eqx.field(static=True)
+
+    def split(self, u: jax.Array) -> tuple[jax.Array, Any]:
+        """Return the inputs of f, and the length of the step."""
+        return (u, self.dt) if self.dt is not None else (u[:-1], u[-1])
+
+
+class RungeKuttaStep(Motion):
+    """The classical step of Runge and Kutta: local error of order dt^5."""
+
+    def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """Return the state after a step."""
+        own, dt = self.split(u)
+        h = dt / self.substeps
+
+        def turn(_: object, x: jax.Array) -> jax.Array:
+            first = as_real(self.drift(x, own))
+            second = as_real(self.drift(x + h / 2 * first, own))
+            third = as_real(self.drift(x + h / 2 * second, own))
+            fourth = as_real(self.drift(x + h * third, own))
+            moved: jax.Array = x + h / 6 * (first + 2 * second + 2 * third + fourth)
+            return moved
+
+        moved: jax.Array = turn(0, x) if self.substeps == 1 else jax.lax.fori_loop(0, self.substeps, turn, x)
+        return moved
+
+
+class LinearizedNoise(Motion):
+    """Q of a step: the intensity spread by the Jacobian of f at one state."""
+
+    intensity: Array
+    state: Array
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return Q (n, n)."""
+        own, dt = self.split(u)
+        jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, own)))(jnp.asarray(self.state))
+        return jnp.asarray(Continuous(jacobian, np.zeros((len(self.state), 0)), self.intensity).over(dt).noise)
+
+
+def runge_kutta_plant(
+    drift: Drift,
+    intensity: Square,
+    initial_mean: Start,
+    initial_covariance: NoiseLike,
+    dt: Number | None = None,
+    states: Names | None = None,
+    inputs: Names = (),
+    circular: Names = (),
+    substeps: int = 1,
+    linearized_at: Start | None = None,
+) -> Plant:
+    """Return the plant of dx = f(x, u) dt + dW by the classical Runge-Kutta step, of order 4: local error dt^5.
+
+    Inputs are held over a step. The noise is the integral of exp(J s) S exp(J s)' over the step, with the Jacobian J of
+    f at one state: exact where f is linear in x, and off by order dt^2 where J changes from there. Steps that are long
+    for either are cut by the data: rows without measurements are steps.
+
+    Args:
+        drift: f(x, u), written with jax.numpy, from (n,) and (inputs,) to (n,); without dt.
+        intensity: S, the covariance that W gains in a unit of time (n, n); a number for that in each state.
+        initial_mean: mean of the state before the first step (n,).
+        initial_covariance: its covariance, a variance for all of it, or the law of its deviation.
+        dt: length of every step; by default the input "dt" behind the others says it.
+        states: names of the states, or a mapping of names to units; x0, x1, ... by default.
+        inputs: names of the inputs of f; none by default.
+        circular: states that are angles, in radians; none by default.
+        substeps: Runge-Kutta steps to a step (default 1).
+        linearized_at: state at which J is taken (n,); `initial_mean` by default.
+
+    Raises:
+        ValueError: a drift that returns no state, an intensity that is no covariance, what `hg.Plant` refuses.
+
+    Source: Kutta, Beitrag zur näherungsweisen Integration totaler Differentialgleichungen (1901).
+    """
+    function("drift", drift, "(x, u)")
+    mean = array("initial mean", initial_mean, (None,))
+    n, own = len(mean), name_list("input names", inputs)
+    check_shape("drift(x, u)", drift, (mean, np.zeros(len(own))), (n,))
+    step = None if dt is None else scalar("length of a step", dt, 0.0)
+    at = mean if linearized_at is None else array("state of linearization", linearized_at, (n,))
+    count = check_count("substeps", substeps)
+    return Plant(
+        RungeKuttaStep(drift, step, count),
+        LinearizedNoise(drift, step, count, covariance("noise intensity", intensity, n), at),
+        mean,
+        initial_covariance,
+        states,
+        own if step is not None else with_time_step(own),
+        [str(name) for name in name_list("circular states", circular)],
+    )

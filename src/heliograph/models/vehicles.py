@@ -1,0 +1,211 @@
+"""Nonlinear models of motion in the plane: a turn of unknown rate, a unicycle and a bicycle, exact over a step."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.model.plant import Plant
+from heliograph.models.continuous_time import with_time_step
+from heliograph.models.motion import two_axes
+from heliograph.numerics.check import TINY, covariance, scalar
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, ArrayLike, Float, Names
+from heliograph.random_affine.noise import NoiseLike
+
+NEAR = 1e-4  # radians: below this, series take the place of quotients, right to the last digit
+
+
+class Step(Module):
+    """The length of a step: a number, or the last input."""
+
+    dt: Any
+
+    def length(self, u: jax.Array) -> Any:
+        """Return the length of the step under the input u."""
+        return u[-1] if self.dt is None else self.dt
+
+
+class Turn(Step):
+    """The motion of (x, vx, y, vy, w) over a step: the velocity turns by the angle w dt."""
+
+    def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """Return the state after a step."""
+        dt = self.length(u)
+        angle = x[4] * dt
+        along, across = dt * sine_ratio(angle), dt * cosine_ratio(angle)
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        px, vx, py, vy, rate = x
+        return jnp.stack(
+            [px + along * vx - across * vy, c * vx - s * vy, py + across * vx + along * vy, s * vx + c * vy, rate]
+        )
+
+
+class TurnNoise(Step):
+    """Q of a turn: white accelerations on both axes, and a rate that wanders."""
+
+    intensity: Any
+    turn_intensity: Any
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return Q (5, 5)."""
+        dt = jnp.asarray(self.length(u))
+        axis = self.intensity * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        rate = jnp.reshape(self.turn_intensity * dt, (1, 1))
+        return jnp.asarray(jax.scipy.linalg.block_diag(axis, axis, rate))
+
+
+class Arc(Step):
+    """The motion of (x, y, heading) at the speed and turn rate of the inputs, over an arc of a circle.
+
+    `wheelbase`: of a bicycle, whose second input is the angle of its front wheel; None of a unicycle.
+    """
+
+    wheelbase: Any
+
+    def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """Return the state after a step."""
+        dt, speed = self.length(u), u[0]
+        rate = u[1] if self.wheelbase is None else speed * jnp.tan(u[1]) / self.wheelbase
+        half = rate * dt / 2
+        chord = speed * dt * sine_ratio(half)
+        direction = x[2] + half
+        moved = jnp.stack([chord * jnp.cos(direction), chord * jnp.sin(direction), rate * dt])
+        return jnp.asarray(x + moved)
+
+
+class ScaledNoise(Step):
+    """Q = S dt."""
+
+    intensity: Array
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return Q (n, n)."""
+        return jnp.asarray(jnp.asarray(self.intensity) * self.length(u))
+
+
+def sine_ratio(angle: jax.Array) -> jax.Array:
+    """Return sin(a) / a, 1 at 0."""
+    small = jnp.abs(angle) < NEAR
+    safe = jnp.where(small, 1.0, angle)
+    return jnp.where(small, 1 - angle**2 / 6, jnp.sin(safe) / safe)
+
+
+def cosine_ratio(angle: jax.Array) -> jax.Array:
+    """Return (1 - cos(a)) / a, 0 at 0: of half angles, so that no digits cancel."""
+    return jnp.sin(angle / 2) * sine_ratio(angle / 2)
+
+
+def coordinated_turn(
+    intensity: "Float[ArrayLike, '']",
+    turn_intensity: "Float[ArrayLike, '']",
+    initial_mean: "Float[ArrayLike, '5']",
+    initial_covariance: NoiseLike,
+    dt: "Float[ArrayLike, ''] | None" = None,
+    axes: Names = ("x", "y"),
+) -> Plant:
+    """Return the plant of a coordinated turn of unknown rate, which is a state: "turn_rate", radians in a unit of time.
+
+    States: "x", "x_velocity", "y", "y_velocity", "turn_rate"; the turn over a step is exact, also at a rate of zero.
+    Of a known rate take `known_turn`, which is linear.
+
+    Args:
+        intensity: variance that each velocity gains in a unit of time; Q as of `constant_velocity`.
+        turn_intensity: variance that the turn rate gains in a unit of time.
+        initial_mean: mean before the first step (5,).
+        initial_covariance: its covariance, or the law of its deviation.
+        dt: length of every step; by default the input "dt" says it.
+        axes: names of both positions; "x" and "y" by default.
+
+    Raises:
+        ValueError: other than two axes, a negative intensity, what `hg.Plant` refuses.
+
+    Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 11.7.2.
+    """
+    q, wander = scalar("noise intensity", intensity, 0.0), scalar("intensity of the turn rate", turn_intensity, 0.0)
+    first, second = two_axes(axes)
+    step = None if dt is None else scalar("length of a step", dt, 0.0)
+    states = [first, f"{first}_velocity", second, f"{second}_velocity", "turn_rate"]
+    inputs = [] if dt is not None else with_time_step(())
+    return Plant(Turn(step), TurnNoise(step, q, wander), initial_mean, initial_covariance, states, inputs)
+
+
+def unicycle(
+    intensity: "Float[ArrayLike, '3 3']",
+    initial_mean: "Float[ArrayLike, '3']",
+    initial_covariance: NoiseLike,
+    dt: "Float[ArrayLike, ''] | None" = None,
+    axes: Names = ("x", "y"),
+) -> Plant:
+    """Return the plant of a vehicle that drives at a given "speed" and "turn_rate": an arc of a circle each step.
+
+    States: "x", "y" and the angle "heading" (circular), 0 along the first axis. Inputs: "speed", "turn_rate" in radians
+    in a unit of time, and "dt" unless given; both are held over the step.
+
+    Args:
+        intensity: S of Q = S dt, the covariance that (x, y, heading) gain in a unit of time, (3, 3).
+        initial_mean: mean before the first step (3,).
+        initial_covariance: its covariance, or the law of its deviation.
+        dt: length of every step; by default the input "dt" says it.
+        axes: names of both positions; "x" and "y" by default.
+
+    Raises:
+        ValueError: other than two axes, an intensity that is no covariance, what `hg.Plant` refuses.
+
+    Source: Thrun, Burgard and Fox, Probabilistic robotics (2005), 5.3.
+    """
+    return _vehicle(None, "turn_rate", intensity, initial_mean, initial_covariance, dt, axes)
+
+
+def bicycle(
+    wheelbase: "Float[ArrayLike, '']",
+    intensity: "Float[ArrayLike, '3 3']",
+    initial_mean: "Float[ArrayLike, '3']",
+    initial_covariance: NoiseLike,
+    dt: "Float[ArrayLike, ''] | None" = None,
+    axes: Names = ("x", "y"),
+) -> Plant:
+    """Return the plant of a vehicle steered by its front wheels: turn rate = speed tan(steering) / wheelbase.
+
+    States: position "x", "y" of the middle of the rear axle, and the angle "heading" (circular). Inputs: "speed",
+    "steering" (angle of the front wheel, radians), and "dt" unless given; both are held over the step.
+
+    Args:
+        wheelbase: distance of the axles.
+        intensity: S of Q = S dt, the covariance that (x, y, heading) gain in a unit of time, (3, 3).
+        initial_mean: mean before the first step (3,).
+        initial_covariance: its covariance, or the law of its deviation.
+        dt: length of every step; by default the input "dt" says it.
+        axes: names of both positions; "x" and "y" by default.
+
+    Raises:
+        ValueError: a wheelbase that is not positive, other than two axes, an intensity that is no covariance.
+
+    Source: Rajamani, Vehicle dynamics and control (2012), 2.2, without slip.
+    """
+    length = scalar("wheelbase", wheelbase, TINY)
+    return _vehicle(length, "steering", intensity, initial_mean, initial_covariance, dt, axes)
+
+
+def _vehicle(
+    wheelbase: Any,
+    steered_by: str,
+    intensity: ArrayLike,
+    initial_mean: ArrayLike,
+    initial_covariance: NoiseLike,
+    dt: ArrayLike | None,
+    axes: Names,
+) -> Plant:
+    """Return a vehicle that drives over arcs."""
+    step = None if dt is None else scalar("length of a step", dt, 0.0)
+    spread = covariance("noise intensity", intensity, 3)
+    inputs = ["speed", steered_by]
+    return Plant(
+        Arc(step, wheelbase),
+        ScaledNoise(step, spread) if step is None else spread * step,
+        initial_mean,
+        initial_covariance,
+        [*two_axes(axes), "heading"],
+        with_time_step(inputs) if step is None else inputs,
+        ["heading"],
+    )
