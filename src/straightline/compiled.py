@@ -43,13 +43,16 @@ class Compiled:
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
         self._why: str | None = None
         self._first: list[np.ndarray] = []
+        self._spread = self.differs.index(True) if True in self.differs else None  # an argument that each run has
+        self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
         self._addresses, self._tables = list[int](), addresses(self.code.tables)
 
     def with_first(self, *arguments: PyTree) -> "Compiled":
         """Return the same code whose first arguments are these, which calls leave out."""
         new = copy(self)
         new._first = [memory_of(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
-        new._addresses = addresses(new._first)
+        new._check_shapes(new._first, 0, new._runs(new._first))
+        new._addresses, new._shared = addresses(new._first), None
         return new
 
     def prepare(self, arrays: Sequence[Any] = ()) -> str:
@@ -66,7 +69,7 @@ class Compiled:
         return self._why
 
     def _runs(self, arrays: Sequence[Any]) -> int:
-        return next((len(x) for x, d in zip(arrays, self.differs, strict=False) if d), 1)
+        return 1 if self._spread is None or self._spread >= len(arrays) else len(arrays[self._spread])
 
     def _convert_arguments(self, arguments: PyTree) -> list[np.ndarray]:
         """Return the arguments of a call, of the types and shapes that the code has."""
@@ -74,12 +77,16 @@ class Compiled:
         if len(leaves) != len(self.types) - given:
             raise ValueError(f"arguments: expected {len(self.types) - given} arrays, got {len(leaves)}")
         arrays = [*self._first, *(memory_of(x, t) for x, t in zip(leaves, self.types[given:], strict=True))]
-        runs = self._runs(arrays)
-        for number, (x, shape, differs) in enumerate(zip(arrays, self.shapes, self.differs, strict=True)):
-            if x.shape != ((runs, *shape) if differs else shape):
-                expected = f"(run, {', '.join(map(str, shape))})" if differs else shape
-                raise ValueError(f"array {number} of the arguments: expected shape {expected}, got {x.shape}")
+        self._check_shapes(arrays[given:], given, self._runs(arrays))
         return arrays
+
+    def _check_shapes(self, arrays: Sequence[np.ndarray], first: int, runs: int) -> None:
+        """Check arrays that are arguments from number `first` on; what calls leave out is checked once."""
+        expected = zip(arrays, self.shapes[first:], self.differs[first:], strict=False)
+        for number, (x, shape, differs) in enumerate(expected, first):
+            if x.shape != ((runs, *shape) if differs else shape):
+                wanted = f"(run, {', '.join(map(str, shape))})" if differs else shape
+                raise ValueError(f"array {number} of the arguments: expected shape {wanted}, got {x.shape}")
 
     def __call__(self, *arguments: PyTree, cores: int | None = None) -> PyTree:
         """Return the results of all runs, with a leading axis of runs.
@@ -92,12 +99,14 @@ class Compiled:
         runs = self._runs(arrays)
         code = self.code
         outputs = [in_lines((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
-        shared = aligned(code.shared)
+        shared = aligned(code.shared) if self._shared is None else self._shared
         ends = addresses([*outputs, shared])
         pointers = np.array([*self._addresses, *addresses(arrays[given:]), *self._tables, *ends], dtype=np.uint64)
         if self.once is not None:
-            once = self.once.machine(1)
-            once.run(pointers.ctypes.data, 0, 0, 1, 1)
+            if self._shared is None:
+                once = self.once.machine(1)
+                once.run(pointers.ctypes.data, 0, 0, 1, 1)
+                self._shared = shared if all(self.differs[given:]) else None
             self._copy_common(outputs, shared)
         if not all(code.common):
             memory = arrays, code.tables, outputs, shared

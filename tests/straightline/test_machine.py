@@ -180,3 +180,20 @@ class Interrupted:
         futures = [self.pool.submit(function, item) for item in arguments]
         self.interrupt()
         return [future.result() for future in futures]
+
+
+def test_calls_go_on_with_first_arguments_that_are_held():
+    """What all runs share of them is computed once; where a shared argument is left for calls, at each."""
+
+    def function(matrix, offset, x):
+        return jnp.linalg.inv(matrix) @ x + jnp.exp(offset)
+
+    code = compile(function, np.eye(2), 0.0, np.zeros(2), shared=[0, 1])
+    matrix, x = np.array([[2.0, 1.0], [0.0, 4.0]]), np.arange(6.0).reshape(3, 2)
+    held, all_held = code.with_first(matrix), code.with_first(matrix, 0.5)
+    for offset in (0.5, -1.0):
+        assert np.array_equal(held(offset, x), code(matrix, offset, x))
+        assert np.array_equal(all_held(x + offset), code(matrix, 0.5, x + offset))
+    assert np.array_equal(code.with_first(np.eye(2), 0.5)(x), code(np.eye(2), 0.5, x))
+    with pytest.raises(ValueError, match="array 0 of the arguments: expected shape"):
+        code.with_first(np.eye(3))
