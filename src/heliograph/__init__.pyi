@@ -24,6 +24,9 @@ from .numerics.check import (
 from .random_affine.fading_law import (
     Rayleigh as Rayleigh,
 )
+from .random_affine.flips import (
+    decode_and_forward as decode_and_forward,
+)
 from .random_affine.law import (
     Discrete as Discrete,
 )
@@ -64,6 +67,9 @@ from .model.trigger import (
     SendOnDelta as SendOnDelta,
     SendOnPredictionError as SendOnPredictionError,
     StochasticTrigger as StochasticTrigger,
+)
+from .model.words import (
+    Words as Words,
 )
 from .filters.event.factory import (
     event_filter as event_filter,

@@ -10,6 +10,7 @@ from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.outliers import has_bounded_noise
+from heliograph.random_affine.rounded import find_rounded
 
 Claim = Literal["exact", "upper", "nominal", "none"]
 STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
@@ -100,9 +101,17 @@ def weakest(claims: list[Claim]) -> Claim:
     return min(claims, key=STRENGTH.__getitem__)
 
 
-def lower_to_upper(claim: Claim, *models: PyTree) -> Claim:
-    """Lower a claim to "upper" where some noise of these models is known by a bound of its covariance alone."""
-    return weakest([claim, "upper"]) if has_bounded_noise(*models) else claim
+def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
+    """Lower a claim to what the noises of these models support.
+
+    "upper" where one is known by a bound of its covariance alone, "nominal" where a measurement is rounded to steps of
+    which its noise is no dither.
+    """
+    rounded = find_rounded(*models)
+    if not all(noise.is_exact or noise.is_bounded for noise in rounded):
+        return weakest([claim, "nominal"])
+    bounded = has_bounded_noise(*models) or any(noise.is_bounded for noise in rounded)
+    return weakest([claim, "upper"]) if bounded else claim
 
 
 def is_sound(estimate: Estimate) -> np.ndarray:

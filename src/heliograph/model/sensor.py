@@ -14,11 +14,22 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_at, angles_named
 from heliograph.numerics.caching import cache_by_object
-from heliograph.numerics.check import array, fail, function, instance, name_list, names, show_error
+from heliograph.numerics.check import (
+    array,
+    fail,
+    function,
+    instance,
+    name_list,
+    names,
+    rank,
+    show_error,
+    show_value,
+)
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
+from heliograph.random_affine.rounded import round_without_dither
 
 T = TypeVar("T")
 LONG, SHORT = (97, 64), range(1, 13)  # lengths of a state at which a function is tried
@@ -69,6 +80,8 @@ class Sensor(AbstractSensor):
         outputs: names of the outputs, or a mapping of names to units.
         circular: names of outputs that are angles in radians; a channel must leave them unchanged (gain 1), but for
             noise and erasures.
+        resolution: step to whose multiples y is rounded, of all outputs or for each; None, unless given, of a sensor
+            that does not round.
 
     Raises:
         ValueError: names and noise that disagree about the number of outputs, a variance alone of a function that
@@ -86,6 +99,7 @@ class Sensor(AbstractSensor):
         noise: NoiseLike,
         outputs: Names | None = None,
         circular: Sequence[str] = (),
+        resolution: ArrayLike | None = None,
     ):
         self.function = _take_state_alone(measure)
         _refuse_function("sensor noise", noise)
@@ -98,6 +112,7 @@ class Sensor(AbstractSensor):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
         self.circular = _circular(self.outputs, circular)
+        self.noise = _round_to(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """Return h(x)."""
@@ -105,7 +120,7 @@ class Sensor(AbstractSensor):
 
 
 class LinearSensor(AbstractSensor):
-    """A linear sensor y = C x + v; circular outputs as for `Sensor`.
+    """A linear sensor y = C x + v; circular outputs and resolution as for `Sensor`.
 
     Shapes: matrix (m, n).
 
@@ -124,6 +139,7 @@ class LinearSensor(AbstractSensor):
         noise: NoiseLike,
         outputs: Names | None = None,
         circular: Sequence[str] = (),
+        resolution: ArrayLike | None = None,
     ):
         _refuse_function("sensor matrix", matrix)
         _refuse_function("sensor noise", noise)
@@ -131,6 +147,7 @@ class LinearSensor(AbstractSensor):
         self.noise = as_noise("sensor noise", noise, self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = _circular(self.outputs, circular)
+        self.noise = _round_to(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """Return C x."""
@@ -140,6 +157,19 @@ class LinearSensor(AbstractSensor):
         """The same of the matrix, without a trace, of which each of many nodes would need its own."""
         if self.matrix.shape[-1] != states:
             raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
+
+
+def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequence[str]) -> AbstractNoise:
+    """Return the noise of a sensor that rounds to multiples of its resolution; the noise itself without one."""
+    if resolution is None:
+        return noise
+    if circular:
+        raise fail("resolution of a sensor", "outputs that are no angles", list(circular))
+    m = noise.dimension
+    step = array("resolution of a sensor", resolution, (m,) if rank("resolution of a sensor", resolution) else ())
+    if not np.all(np.asarray(step) > 0):
+        raise fail("resolution of a sensor", "a positive step", show_value(np.asarray(step).tolist()))
+    return round_without_dither(noise, np.array(np.broadcast_to(step, (m,))))
 
 
 def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:

@@ -20,6 +20,7 @@ from heliograph.random_affine.moments.components import (
     Branches,
     NoiseAtom,
     NoiseWithoutOutliers,
+    SignalNoise,
     combine,
     stack_branches,
 )
@@ -76,6 +77,14 @@ class AbstractNoise(Module):
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the mean, relative to that of the whole, and covariance of the noise without its outliers."""
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.covariance)
+
+    def report(self, y: jax.Array) -> jax.Array:
+        """Return what is reported of a measurement with this noise: by default the measurement itself."""
+        return y
+
+    def given_signal(self, mean: Vector, variances: Vector) -> SignalNoise:
+        """Return the noise beside a signal of this mean and these variances without it; by default the same by any."""
+        return SignalNoise(self.columns, self.covariance)
 
     def list_atoms(self) -> list[NoiseAtom]:
         """List all combinations of the atoms of the noise, where these are finitely many; by default a refusal."""
@@ -283,6 +292,12 @@ class Independent(AbstractNoise):
         """Draw each part."""
         keys = jax.random.split(key, len(self.parts))
         return jnp.concatenate([component.sample(k) for component, k in zip(self.parts, keys, strict=True)])
+
+    def report(self, y: jax.Array) -> jax.Array:
+        """Return what each part reports of its components."""
+        ends = np.cumsum([component.dimension for component in self.parts])[:-1]
+        pieces = zip(self.parts, jnp.split(y, ends), strict=True)
+        return jnp.concatenate([component.report(piece) for component, piece in pieces])
 
     def moment(self, powers: Exponents) -> Number:
         """Return prod_parts E[n_part^a_part]."""

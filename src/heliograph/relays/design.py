@@ -11,7 +11,7 @@ from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
-from heliograph.model.estimate import lower_to_upper
+from heliograph.model.estimate import lower_by_noise
 from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, fail, instance, table
@@ -160,7 +160,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
         moved = transition, gain, offset
         arrays = Gains(*moved, *moved, expected, constant, *believed)
-        schedules[name] = Schedule(arrays, network.initial()[0], lower_to_upper("exact", network))
+        schedules[name] = Schedule(arrays, network.initial()[0], lower_by_noise("exact", network))
     relayed = {name: schedules[name].gains.gain for name in network.relays}
     premise = Premise(network.plant, relays=network, gains=relayed)
     return {name: believing(schedule, premise) for name, schedule in schedules.items()}
@@ -221,7 +221,7 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     Raises:
         ValueError: gains of the wrong shape, a relay without gains.
     """
-    return lmmse(receiver_system(network, gains), lower_to_upper("exact", network))
+    return lmmse(receiver_system(network, gains), lower_by_noise("exact", network))
 
 
 def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:

@@ -131,7 +131,7 @@ def premise_at(network: HasNodes, name: str) -> Premise:
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
         range = node.limits if node.limits is not None and node.limits.bounded else None
-        return Premise(plant, node.sensor, node.channel, node.trigger, range=range)
+        return Premise(plant, node.sensor, node.channel, node.trigger, range=range, encoder=node.encoder)
     if network.common is not None:
         return part_of(Premise(plant, network.common.sensor, network.common.channel), network.rows[name])
     if network.relays is None:  # a node without a sensor

@@ -20,6 +20,7 @@ from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
+from heliograph.model.word_route import find_places
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.frozen import FrozenMapping
@@ -393,5 +394,7 @@ Network._repr_html_ = table_of  # type: ignore[attr-defined]
 def _world(node: Node | ReceivingNode) -> object:
     """Return the parts of a node that determine its measurements."""
     if isinstance(node, Node):
-        return node.sensor, drop_names(node.channel), node.informed_by, node.trigger, node.predictor
+        places = None if node.encoder is None else find_places(node.channel)
+        link = drop_names(node.channel)
+        return node.sensor, link, node.informed_by, node.trigger, node.encoder, places, node.predictor
     return node.received, node.complete

@@ -21,13 +21,16 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.told import name_received
-from heliograph.model.trigger import AbstractTrigger
+from heliograph.model.trigger import AbstractTrigger, Periodic
+from heliograph.model.word_route import FLAG, find_places
+from heliograph.model.words import Words
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
+from heliograph.random_affine.flips import Flips
 from heliograph.random_affine.modes import ModeOutput, OneStepLate
 
 FUSED = "fused"  # the name under which results of several nodes stand
@@ -88,11 +91,14 @@ class Node(Module):
         invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
         trigger: when the sender transmits, such as `SendOnDelta(0.5)`; at each step by default. The filter for it is
             `event_filter`; all others take what was not sent for missing.
+        encoder: `Words` as which the sender sends what it measures; the channel is then one of words, and behind what
+            it delivers stand the dithers that are to be taken off, if any. Numbers of unlimited length by default.
 
     Raises:
         ValueError: a sensor and a channel that do not fit; a filter with another number of values than arrive,
             or flags of another step than those that do; another filter of the measurement next to one that is fed back;
-            limits that are none; a trigger that does not fit, or next to feedback or a channel that is late.
+            limits that are none; a trigger that does not fit, or next to feedback or a channel that is late; words
+            that are amplified, or compared by a trigger with what a flipped bit or a dither lets the ends not share.
     """
 
     sensor: AnySensor
@@ -100,6 +106,7 @@ class Node(Module):
     filters: dict[str, AbstractFilter]
     limits: Limits | None
     trigger: AbstractTrigger | None
+    encoder: Words | None
     received: int = eqx.field(static=True, init=False, repr=False)  # length of the measurement that reaches the filters
     complete: bool = eqx.field(static=True, init=False, repr=False)  # whether everything arrives, always
 
@@ -111,8 +118,9 @@ class Node(Module):
         limits: LimitsLike = None,
         invalid: ArrayLike = (),
         trigger: "AbstractTrigger | None" = None,
+        encoder: "Words | None" = None,
     ):
-        self.trigger = trigger
+        self.trigger, self.encoder = trigger, encoder
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         # Sensor, channel and filters fit.
         check_type("sensor", first(sensor), AbstractSensor)
@@ -121,6 +129,8 @@ class Node(Module):
         if trigger is not None:
             check_trigger(trigger, first(sensor), first(channel), self.filters)
         known = 0 if trigger is None else trigger.side_information(len(self.outputs))
+        if encoder is not None:
+            known += check_encoder(encoder, first(sensor), channel, trigger, self.filters)
         self.received = int(first(channel).outputs) + known
         self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
@@ -162,7 +172,14 @@ class Node(Module):
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
         channel = first(self.channel)
-        return name_received(self.outputs, channel, self.received - channel.outputs)
+        if self.encoder is None or not self.encoder.subtracts:
+            return name_received(self.outputs, channel, self.received - channel.outputs)
+        dithers = [f"dither_{self.outputs[place]}" for place in find_places(channel) if place != FLAG]
+        values = name_received(self.outputs, channel, self.received - channel.outputs - len(dithers))
+        several = {name for name in dithers if dithers.count(name) > 1}
+        return values + tuple(
+            f"{name}_{dithers[: i + 1].count(name)}" if name in several else name for i, name in enumerate(dithers)
+        )
 
 
 @readable
@@ -279,6 +296,41 @@ def check_trigger(
         isinstance(filter, AbstractFilter) and _predicts(filter, trigger) for filter in filters.values()
     ):
         raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
+
+
+def check_encoder(
+    encoder: Words,
+    sensor: AbstractSensor,
+    channel: Channel,
+    trigger: AbstractTrigger | None,
+    filters: Mapping[str, object],
+) -> int:
+    """Check that an encoder fits the sensor, channel, trigger and filters of a node; count the dithers to take off.
+
+    Raises:
+        ValueError: a range for another count of components, angles, words that are amplified, a trigger whose ends do
+            not share what it compares with, a filter that is fed back.
+    """
+    check_type("encoder", encoder, Words)
+    encoder.check_outputs(len(sensor.outputs))
+    if sensor.circular:
+        raise fail("encoder", "a sensor without angles", list(sensor.circular))
+    if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
+        raise fail("encoder", "no filter that is fed back", "one")
+    places = find_places(channel)
+    if trigger is not None and not isinstance(trigger, Periodic):
+        if encoder.subtracts:
+            raise fail("trigger of a node with an encoder", "a dither that is not taken off, or Periodic", "subtracted")
+        if flips_words(first(channel)):
+            expected = "a link without flipped bits (erasure for a checksum), as both ends share the word; or Periodic"
+            raise fail("trigger of a node with an encoder", expected, type(trigger).__name__)
+    return sum(place != FLAG for place in places) if encoder.subtracts else 0
+
+
+def flips_words(channel: AbstractRandomAffine) -> bool:
+    """Test whether a channel of words may flip bits."""
+    links = [link for link in [channel, *all_inner_maps(channel)] if isinstance(link, Flips)]
+    return any(float(link.error.moment(1)) > 0 for link in links)
 
 
 def name_values(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:

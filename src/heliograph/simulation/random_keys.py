@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 # What a key is for: folded in last, so that uses have separate streams.
-INITIAL, PROCESS, SENSOR, CHANNEL, CHANNEL_START, MEMORY, MEMORY_START, TRIGGER = range(8)
+INITIAL, PROCESS, SENSOR, CHANNEL, CHANNEL_START, MEMORY, MEMORY_START, TRIGGER, DITHER = range(9)
 WORLD = 0  # the plant's place among the checksums of names
 
 Number = int | jax.Array | np.ndarray

@@ -19,13 +19,15 @@ from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor, without_output_names
 from heliograph.model.trigger import AbstractTrigger, Sender
+from heliograph.model.word_route import in_bits, reader_of
+from heliograph.model.words import Reader, Words
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_names
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.random_keys import SENSOR, TRIGGER, checksum, draw_key
+from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.side_by_side import map_all
 from heliograph.simulation.shared_fading import deliver, memory_places, start
 
@@ -61,6 +63,8 @@ class NodeGroup(Module):
 
     `trigger`: when they send; its prediction is that of a filter too, the `reference_filter`.
 
+    `encoder`: of the words that they send; the `channel` then carries their bits, which the `reader` puts together.
+
     Shapes: checksums (node,), memories (node, memories of a channel): checksums of the channels' memories.
     """
 
@@ -70,7 +74,9 @@ class NodeGroup(Module):
     memories: jax.Array | np.ndarray
     reference_filter: FedBackFilter | EventFilter | StochasticEventFilter | None
     trigger: AbstractTrigger | None
+    encoder: Words | None
     informed_at: tuple[int, int] | None = eqx.field(static=True)
+    reader: Reader | None = eqx.field(static=True)
 
 
 class Silent(Module):
@@ -117,7 +123,7 @@ class SeparateChannels(AbstractMedium):
             y = measure(sensor, x, draw_key(key, k, group.checksums, SENSOR))
             if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
                 y = y - group.reference_filter.reference(reach.feed_back, u, k)
-            memory, z = deliver(group.channel, reach.memory, y, key, k, group.checksums, group.memories)
+            y, z, memory = _send(group, reach.memory, y, key, k)
             if group.trigger is None or reach.sender is None:
                 return LinkState(memory, reach.feed_back), z
             # The sender decides, by its own reference.
@@ -155,13 +161,26 @@ class SeparateChannels(AbstractMedium):
         return {str(g): reach.sender.last for g, reach in links if reach.sender is not None}
 
 
+def _send(
+    group: NodeGroup, memory: PyTree, y: jax.Array, key: jax.Array, k: jax.Array
+) -> tuple[jax.Array, jax.Array, PyTree]:
+    """Send y, or its words, through the channel: return what was sent, what is received, and the channel's memory."""
+    if group.encoder is None or group.reader is None:
+        memory, z = deliver(group.channel, memory, y, key, k, group.checksums, group.memories)
+        return y, z, memory
+    outputs = len(y)
+    words, numbers = group.encoder.send(y, draw_key(key, k, group.checksums, DITHER))
+    memory, received = deliver(group.channel, memory, numbers, key, k, group.checksums, group.memories)
+    return words, group.reader.read(group.encoder, outputs, received), memory
+
+
 def _first_mean(filter: AbstractFilter) -> jax.Array:
     return jnp.asarray(filter.estimate(filter.init()).mean)
 
 
 def measure(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
-    """Return y = h(x) + v, angles between -pi and pi."""
-    return wrap_angles(sensor.measure(x) + sensor.noise.sample(key), sensor.angles)
+    """Return what the sensor reports of y = h(x) + v, angles between -pi and pi."""
+    return wrap_angles(sensor.noise.report(sensor.measure(x) + sensor.noise.sample(key)), sensor.angles)
 
 
 class CommonChannel(AbstractMedium):
@@ -220,7 +239,7 @@ class Slots(AbstractMedium):
         """Sum the hops of this step's slot, at each listener."""
         # Signals: of the sensor, and C s of each relay.
         sensor = at(self.relays.sensor, k)
-        y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR))
+        y = sensor.noise.report(sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR)))
         signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
         sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
         # Hops without memory by a branch for the slot, then those with memory.
@@ -322,7 +341,7 @@ def make_reception(network: Network) -> AbstractMedium:
             continue
         # Sensor, channel, and where their draws and memories stand.
         sensors = [without_output_names(nodes[name].sensor) for name in names]
-        channels = [_drop_names(nodes[name].channel, memories[name]) for name in names]
+        channels = [_drop_names(_carrying_channel(nodes[name]), memories[name]) for name in names]
         stacked = stack(list(zip(sensors, channels, strict=True)))
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         memory_rows = np.stack([memories[name] for name in names])
@@ -336,8 +355,17 @@ def make_reception(network: Network) -> AbstractMedium:
         informed_at = None if informed_by is None else places[names[0], informed_by][:2]
         triggers: PyTree = [nodes[name].trigger for name in names]
         trigger = None if triggers[0] is None else stack(triggers)
-        groups.append(NodeGroup(*stacked, checksums, memory_rows, reference_filter, trigger, informed_at))
+        encoders: PyTree = [nodes[name].encoder for name in names]
+        encoder, reader = (None, None) if encoders[0] is None else (stack(encoders), reader_of(nodes[names[0]].channel))
+        groups.append(
+            NodeGroup(*stacked, checksums, memory_rows, reference_filter, trigger, encoder, informed_at, reader)
+        )
     return SeparateChannels(tuple(groups))
+
+
+def _carrying_channel(node: Node) -> Channel:
+    """Return the channel of the numbers by which a node's signal is carried: its words' bits where it sends words."""
+    return node.channel if node.encoder is None else in_bits(node.encoder, node.channel)
 
 
 def _drop_names(channel: Channel, places: np.ndarray) -> Channel:

@@ -12,7 +12,7 @@ from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.patterns import SideInformation, describe_by_pattern
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, lower_to_upper
+from heliograph.model.estimate import Claim, lower_by_noise
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, first, restack, unstack
 from heliograph.model.plant import AnyPlant, check_plant
@@ -118,7 +118,7 @@ def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger:
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_has_known_gain(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):
-        return lower_to_upper("exact", plant, sensor, channel)
+        return lower_by_noise("exact", plant, sensor, channel)
     hidden = trigger.losses == "unknown" and any(_may_lose(step) for step in steps)
     return (
         "exact"

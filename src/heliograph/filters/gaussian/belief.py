@@ -20,7 +20,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.model.premises.premise import believes
@@ -175,7 +175,7 @@ def open_loop_filter(
     start = check_plant(plant)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
-    claim = lower_to_upper("exact" if linear else "nominal", plant)
+    claim = lower_by_noise("exact" if linear else "nominal", plant)
     return OpenLoop(
         plant=plant,
         transform=Cubature(),

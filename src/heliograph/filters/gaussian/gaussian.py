@@ -25,7 +25,7 @@ from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain, perfect
-from heliograph.model.estimate import Innovation, lower_to_upper
+from heliograph.model.estimate import Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
@@ -169,7 +169,7 @@ def _make_gaussian_filter(
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     claim = update.claim(uncertain=False) if linear and trusted and not prior_given else "nominal"
-    claim = lower_to_upper(claim, plant, sensor, channel)
+    claim = lower_by_noise(claim, plant, sensor, channel)
     filter = GaussianFilter(
         plant=plant,
         sensor=sensor,

@@ -19,15 +19,17 @@ from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
 from heliograph.filters.modes.uncertain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.filters.words.linear import build_behind_words
 from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.model.words import Words
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetric
@@ -35,6 +37,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outliers import has_bounded_noise
+from heliograph.random_affine.rounded import find_rounded
 
 
 class LinearFilter(AbstractSizedFilter):
@@ -113,10 +116,11 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     with respect to the estimate do not involve them.
     """
     matrix, law = jnp.asarray(sensor.matrix), sensor.noise
-    mean = matrix @ state.state_mean + law.mean
-    second = matrix @ state.state_covariance @ matrix.T + law.covariance + jnp.outer(mean, mean)
+    mean, explained = matrix @ state.state_mean + law.mean, matrix @ state.state_covariance @ matrix.T
+    noise = law.given_signal(mean, jnp.diagonal(explained))
+    second = explained + noise.covariance + jnp.outer(mean, mean)
     slopes = matrix @ state.gaussian.root
-    return Signal(state.gaussian, mean, slopes, law.columns, symmetric(second), signal_size_at_start(sensor, start))
+    return Signal(state.gaussian, mean, slopes, noise.columns, symmetric(second), signal_size_at_start(sensor, start))
 
 
 def correct_linear(
@@ -132,7 +136,11 @@ def correct_linear(
 @believes
 @takes_told
 def linear_filter(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    update: Polytope | None = None,
+    encoder: Words | None = None,
 ) -> AbstractFilter:
     """Return the best linear filter for a linear plant and sensor behind any channel.
 
@@ -150,14 +158,20 @@ def linear_filter(
         sensor: a linear sensor, m outputs, with white noise.
         channel: from the sensor to the filter.
         update: how uncertain probabilities are bounded; `Polytope()` by default, none behind links with memory.
+        encoder: `Words` as which the sensor's measurement is sent, where the channel is one of words; none by default.
 
-    Claim: "exact"; "upper" where probabilities are uncertain, "nominal" there by `ZeroMean`.
+    Claim: "exact"; "upper" where probabilities are uncertain, "nominal" there by `ZeroMean`. Behind words:
+    "exact" with a triangular dither, with one that is taken off behind a known gain, and with any but "none" of a
+    Gaussian y; "upper" else with these; without dither "exact" if the sensor's noise is Gaussian with a deviation of a
+    step or more, "nominal" if not; and "nominal" where overload may change the rms error by more than 1 %.
 
     Raises:
         ValueError: a plant or sensor that is not linear, or parts that do not fit.
 
     Source: De Koning (1984), for multiplicative noise; Costa (1994), for modes.
     """
+    if encoder is not None:
+        return build_behind_words(plant, sensor, channel, encoder, partial(linear_filter, update=update))
     # Delays: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(channel)])[0].past:
         return build_behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
@@ -169,14 +183,8 @@ def linear_filter(
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
-        if first(channel).erases:
-            return side_information_filter(plant, sensor, channel)
-        if uncertain_chain(channel):
-            return uncertain_modal_filter(plant, sensor, channel)
-        terms = independent_terms(channel)
-        if len(terms) > 1:
-            return additive_modal_filter(plant, sensor, terms)
-        return modal_filter(plant, sensor, channel)
+        filter = _make_behind_memory(plant, sensor, channel)
+        return replace(filter, claim=lower_by_noise(filter.claim, sensor)) if find_rounded(sensor) else filter
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
@@ -189,11 +197,21 @@ def linear_filter(
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
         **make_sizes(
-            lower_to_upper(rule.claim(whole.uncertain), plant, sensor, channel),
+            lower_by_noise(rule.claim(whole.uncertain), plant, sensor, channel),
             start,
             first(channel).outputs,
         ),
     )
+
+
+def _make_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
+    """Return the filter that estimates the modes of links jointly with the state."""
+    if first(channel).erases:
+        return side_information_filter(plant, sensor, channel)
+    if uncertain_chain(channel):
+        return uncertain_modal_filter(plant, sensor, channel)
+    terms = independent_terms(channel)
+    return additive_modal_filter(plant, sensor, terms) if len(terms) > 1 else modal_filter(plant, sensor, channel)
 
 
 @believes

@@ -17,7 +17,7 @@ from heliograph.linear.polynomial import quadratic_system_with_linear_estimate
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
@@ -383,4 +383,4 @@ def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degre
         claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
     else:
         claim = "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"
-    return lower_to_upper(claim, plant, sensor, channel)
+    return lower_by_noise(claim, plant, sensor, channel)

@@ -19,7 +19,7 @@ from heliograph.filters.linear.linear import correct_linear
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.patterns import append_flag
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
+from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
@@ -214,7 +214,7 @@ def _make_mode_observed_filter(plant: AnyPlant, sensor: AnySensor, channel: Chan
         channel=channel,
         late=late,
         **make_sizes(
-            lower_to_upper(
+            lower_by_noise(
                 "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel), plant, sensor, channel
             ),
             start,

@@ -36,7 +36,7 @@ from heliograph.filters.modes.modal import (
 )
 from heliograph.filters.modes.patterns import SideInformation, append_flag, describe_by_pattern, pattern_of
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation, lower_to_upper
+from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, restack, unstack
 from heliograph.model.plant import AnyPlant
@@ -344,7 +344,7 @@ def side_information_filter(
         for i, row in enumerate(chances):
             probabilities(f"flags in mode {i}", row)
         steps = [replace(step, flags=chances) for step in steps]
-    claim = lower_to_upper("exact" if is_known else "nominal", plant, sensor, channel)
+    claim = lower_by_noise("exact" if is_known else "nominal", plant, sensor, channel)
     filter = SideInformationFilter(
         plant=plant,
         sensor=sensor,

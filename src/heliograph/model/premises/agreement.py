@@ -31,6 +31,7 @@ from heliograph.random_affine.outliers import has_bounded_noise
 
 PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"
 RANGE = "range of values"
+ENCODER = "encoder"
 
 
 def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
@@ -53,6 +54,8 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         parts.append(TRIGGER)
     if own.range is not None:  # what is refused for its value tells of the state
         parts.append(RANGE)
+    if not same(believed.encoder, own.encoder):
+        parts.append(ENCODER)
     sensors = _test_all_steps(_same_sensor, believed.sensor, own.sensor, order)
     channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
     if sensors and channels:

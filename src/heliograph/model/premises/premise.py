@@ -15,6 +15,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
+from heliograph.model.words import Words
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
 
@@ -37,6 +38,7 @@ class Premise:
         relays: relays whose sums of hops are received, in place of sensor and channel; None by default.
         gains: gains of these relays by name, (steps, n, received).
         range: limits of what a node uses, which refuses other numbers; None where all are used, as filters believe.
+        encoder: of the words that the sender sends; None of one that sends numbers.
     """
 
     def __init__(
@@ -49,9 +51,11 @@ class Premise:
         relays: RelayNetwork | None = None,
         gains: Mapping[str, np.ndarray] | None = None,
         range: Limits | None = None,
+        encoder: Words | None = None,
     ):
         self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
         self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range
+        self.encoder = encoder
 
     def replaced(self, **parts: Any) -> "Premise":
         """Return the premise with other parts, by name."""
@@ -99,7 +103,7 @@ def believing(made: B, premise: Premise | None) -> B:
 
 
 def believes(make: Callable[P, B]) -> Callable[P, B]:
-    """Let the filter that a function makes say what it believes: the arguments called plant, sensor, channel, trigger.
+    """Let the filter that a function makes say what it believes: its plant, sensor, channel, trigger, encoder.
 
     In a network a claim holds where these are the node's own. Without a channel, the sensor is received as it is.
 
@@ -109,7 +113,7 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
     Raises:
         ValueError: no function, or one whose parameters nobody can know.
     """
-    parts = ("plant", "sensor", "channel", "trigger")
+    parts = ("plant", "sensor", "channel", "trigger", "encoder")
     try:
         parameters = inspect.signature(make)
     except (TypeError, ValueError) as error:

@@ -7,6 +7,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import jax
 import numpy as np
 
+from heliograph.factors.columns import Columns
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import block_diagonal, library
 from heliograph.numerics.types import Array, Float
@@ -84,6 +85,13 @@ class Branches(NamedTuple):
     log_share: Float[Array, "n branches"]
     mean: Float[Array, "n branches"]
     variance: Float[Array, "n branches"]
+
+
+class SignalNoise(NamedTuple):
+    """A noise beside a signal y: factors of what it adds to the error of y, and what to E y y' (n, n)."""
+
+    columns: Columns
+    covariance: Float[Array, "n n"]
 
 
 def stack_branches(parts: Sequence[Branches]) -> Branches:

@@ -36,7 +36,7 @@ from heliograph.fusion.informed import AbstractInformedFusion, CentreStep
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_to_upper, weakest
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise, weakest
 from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles, without_output_names
@@ -252,7 +252,7 @@ def claim_of_informed(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) ->
         return "nominal"
     _check_linear(rule, plant, nodes)
     known: Claim = "nominal" if any(_has_uncertain_law(channel) for _, channel, _ in nodes.values()) else "exact"
-    return lower_to_upper(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
+    return lower_by_noise(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
 def along_estimates(nodes: Parts) -> bool:

@@ -11,6 +11,7 @@ from heliograph.disk.quoting import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.words.linear import SEEN, LinearWordsFilter
 from heliograph.filters.wrappers.told import ToldFilter
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import first
@@ -68,7 +69,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
-    lines += _find_declared_noise(network)
+    lines += [*_find_declared_noise(network), *_find_overloads(network)]
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
@@ -76,6 +77,19 @@ def doubts_before_data(network: Network) -> list[Doubt]:
             Doubt(False, f"{words}; a plant of each, a fleet, is estimated as well, starts sooner, costs less")
         )
     return sorted(lines, key=lambda doubt: not doubt.serious)
+
+
+def _find_overloads(network: Network) -> Iterator[Doubt]:
+    """Yield how often the words of a node are overloaded before any data, and what that may do to a claim."""
+    for name, node in network.nodes.items():
+        for label, filter in node.filters.items():
+            if not isinstance(filter, LinearWordsFilter):
+                continue
+            share, bound = float(np.max(filter.overload.probability)), float(filter.overload.bound)
+            often = f"words of node {name!r} are overloaded in at most {share:.2g} of the steps"
+            known = f"the rms error of filter {label!r} differs from its claim by at most {100 * bound:.2g}% for it"
+            unknown = f"what that does to the claim of filter {label!r} is not bounded"
+            yield Doubt(not bound <= SEEN, f"{often}, {known if np.isfinite(bound) else unknown}")
 
 
 def _list_sensors(network: Network) -> list[AbstractSensor]:

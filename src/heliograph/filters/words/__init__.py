@@ -1,0 +1,1 @@
+"""Filters of words of finite length."""

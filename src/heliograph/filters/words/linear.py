@@ -1,0 +1,169 @@
+"""Linear filters behind words: the same filter of numbers about the centres of the words' range."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    Step,
+    corrects,
+    estimates,
+    make_sizes,
+    predicts,
+)
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
+from heliograph.model.channel import Channel, check_sent
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise, weakest
+from heliograph.model.over_time import at_each_step, first, unstack
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.model.word_route import FLAG, about_centres, find_places
+from heliograph.model.words import Words
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, PyTree
+from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
+from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.rounded import Rounded, find_rounded
+
+SEEN = 0.01  # share of the rms error that overload may change a claim by
+MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
+
+
+class LinearWordsFilter(AbstractSizedFilter):
+    """A linear filter of the numbers z = q' - c - E[g] d, with q' the received words and d the dithers to take off.
+
+    Of a number that is no word nothing is taken.
+
+    Args:
+        base: the filter of z.
+        centres: c of each output of the channel, 0 of a flag.
+        gains: E[g] of each word whose dither is taken off; none without.
+        words: outputs that are words.
+        overload: of the words, before any data.
+    """
+
+    base: AbstractFilter
+    centres: Array
+    gains: Array
+    words: tuple[int, ...] = eqx.field(static=True)
+    overload: Overload
+
+    @in_float64
+    def init(self) -> PyTree:
+        """Return the state before any message."""
+        return self.base.init()
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Predict as without words."""
+        return self.base.predict(state, u, k)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Correct with the words that arrived, as numbers."""
+        after, innovation = self.base.correct(state, self._as_numbers(jnp.asarray(z)), k)
+        lacking = self.received - len(self.centres)
+        value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(lacking, jnp.nan)])
+        covariance = jnp.pad(innovation.covariance, ((0, lacking), (0, lacking)), constant_values=jnp.nan)
+        return after, Innovation(value, covariance, innovation.log_likelihood)
+
+    @estimates
+    def estimate(self, state: PyTree) -> Estimate:
+        """Return the mean and covariance of the estimate."""
+        return self._claim(self.base.estimate(state))
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """Return the mean and covariance after step k."""
+        return self._claim(self.base.after_step(state, k))
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the smoother step of the filter of the numbers."""
+        return self.base.smoother_step(step._replace(z=self._as_numbers(jnp.asarray(step.z))))
+
+    def _as_numbers(self, z: jax.Array) -> jax.Array:
+        """Return z = q' - c - E[g] d."""
+        values = z[: len(self.centres)] - jnp.asarray(self.centres)
+        if self.received == len(self.centres):
+            return values
+        return values.at[np.array(self.words)].add(-jnp.asarray(self.gains) * z[len(self.centres) :])
+
+    def _claim(self, estimate: Estimate) -> Estimate:
+        return Estimate(estimate.mean, estimate.covariance, self.claim)
+
+
+def build_behind_words(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, encoder: Words, make: MakeFilter
+) -> LinearWordsFilter:
+    """Build a linear filter of words from `make`, which builds one of numbers for a sensor and a channel.
+
+    Raises:
+        ValueError: words that do not fit, a dither that is not known behind a link that remembers, a range that is
+            overloaded more often than once in a thousand steps.
+    """
+    start = check_plant(plant)
+    check_linear("linear filter", plant, sensor)
+    outputs = len(first(sensor).outputs)
+    instance("encoder", encoder, Words, "Words").check_outputs(outputs)
+    check_sent(first(sensor), first(channel))
+    places, numbers = find_places(channel), about_centres(encoder, channel)
+    remembers = first(channel).remembers
+    if remembers and encoder.dither in ("stochastic", "subtracted"):
+        raise fail("encoder behind a channel that remembers", 'dither="triangular" (or "none")', repr(encoder.dither))
+    if find_rounded(sensor):
+        raise fail(
+            "sensor of a node with an encoder", "one without resolution, as words have their own", "a resolution"
+        )
+    # The sensor of y - c with rounding, and the filter of numbers behind it.
+    gaussian = _is_gaussian(plant, sensor) and not first(channel).past
+    rounded = at_each_step(lambda one: _round_sensor(one, encoder, gaussian, remembers or _fades(numbers)), sensor)
+    base = make(plant, rounded, numbers)
+    overload = bound_overload(plant, rounded, numbers, encoder, places)
+    refuse_overload(overload)
+    words = tuple(i for i, place in enumerate(places) if place != FLAG)
+    centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in places])
+    gains = _mean_gains(numbers)[list(words)] if encoder.subtracts else np.zeros(0)
+    late: Claim = "upper" if first(channel).past else "exact"  # before the first word its noise is none, and claimed
+    claim = weakest([lower_by_noise(base.claim, rounded), late, _claim_of(overload)])
+    received = len(places) + len(gains)
+    return LinearWordsFilter(
+        base=base, centres=centres, gains=gains, words=words, overload=overload, **make_sizes(claim, start, received)
+    )
+
+
+def _claim_of(overload: Overload) -> Claim:
+    return "exact" if float(np.max(overload.bound, initial=0.0)) <= SEEN else "nominal"
+
+
+def _round_sensor(sensor: LinearSensor, encoder: Words, gaussian: bool, matters: bool) -> LinearSensor:
+    """Return the sensor of y - c whose noise has the error of rounding."""
+    m = len(sensor.outputs)
+    step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))
+    noise = Rounded(sensor.noise, step, high - centre, centre, encoder.dither, gaussian, matters)
+    return LinearSensor(sensor.matrix, noise, sensor.outputs)
+
+
+def _fades(numbers: Channel) -> bool:
+    """Test whether the gain of words is random."""
+    return any(has_random_gain(link, second_order(link)) for link in unstack(numbers))
+
+
+def _mean_gains(numbers: Channel) -> np.ndarray:
+    """Return E[g] of each output of a channel of numbers: its row sums, as each output carries one word."""
+    steps = [np.asarray(second_order(link).mean_gain).sum(axis=1) for link in unstack(numbers)]
+    if any(not np.array_equal(step, steps[0]) for step in steps):
+        raise fail("channel of words whose dither is taken off", "the same mean gains at every step", "others")
+    return np.asarray(steps[0])
+
+
+def _is_gaussian(plant: AnyPlant, sensor: AnySensor) -> bool:
+    """Test whether what the sensor measures is Gaussian before any data."""
+    laws: list[object] = [first(plant).deviation]
+    laws += [one.noise for one in unstack(plant)] + [one.noise for one in unstack(sensor)]
+    return all(isinstance(law, Gaussian) for law in laws if isinstance(law, AbstractNoise))

@@ -1,0 +1,186 @@
+"""How often words are overloaded before any data, and by how much a claim may be off for it."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import ndtr
+
+from heliograph.linear.recursion import lmmse
+from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import at, steps_covered, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.model.words import Words
+from heliograph.numerics.caching import cache_by_object
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Float
+from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.rounded import Rounded
+
+STEPS = 500  # that are looked at, if the models do not end before
+MOST = 1e-3  # probability of an overload at a step that is not refused
+BEYOND = 40  # steps of words beyond the range that are counted
+Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
+Sensing = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+@readable
+class Overload(NamedTuple):
+    """Overload of a sender's words before any data.
+
+    probability: of each component at the step at which it is largest (outputs,). bound: by how much the rms error may
+    differ from that claimed, relative to it, the largest of the states; nan where it is not known.
+    """
+
+    probability: Float[np.ndarray, " outputs"]
+    bound: Float[np.ndarray, ""]
+
+
+def bound_overload(
+    plant: AnyPlant, sensor: AnySensor, numbers: Channel, encoder: Words, places: tuple[int, ...]
+) -> Overload:
+    """Bound what overload does to a linear filter: the difference of the rms errors is at most
+
+        sum_j |((I - K H) A)^j K| sqrt(E g^2) D sqrt(sum_{m >= 1} (2m - 1) P(|y + d - c| > a + (m - 1/2) D))
+
+    (Minkowski's inequality), with y Gaussian of the moments before any data and inputs zero, d averaged over.
+
+    Args:
+        plant: linear.
+        sensor: of y - c, with the noise of rounding.
+        numbers: the channel of words as numbers about c.
+        encoder: of the words.
+        places: component of each output of the channel.
+    """
+    link = at(numbers, 0)
+    late = link.past or link.remembers or any(place < 0 for place in places)
+    horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
+    outputs = len(at(sensor, 0).outputs)
+    step, half = encoder.each(encoder.step, outputs), encoder.each(encoder.high - encoder.low, outputs) / 2
+    links = None if late else _links(numbers, horizon)
+    system, signals = _describe_system(plant, sensor, links, horizon)
+    tails = np.array([_count_beyond(mean, variance, half, step, encoder.dither) for mean, variance in signals])
+    probability = tails[:, 0].max(axis=0)
+    excess = step * np.sqrt(np.sum((2 * np.arange(1, BEYOND + 1)[:, None] - 1) * tails, axis=1))
+    if links is None or system is None:
+        return Overload(probability, np.asarray(0.0 if probability.max() < RARE else np.nan))
+    return Overload(probability, np.asarray(_bound_error(system, excess, links, places)))
+
+
+RARE = 1e-9  # probability below which an overload is left out, behind links of which the bound is not known
+
+
+def _describe_system(
+    plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, horizon: int
+) -> tuple[LinearSystem | None, list[tuple[np.ndarray, np.ndarray]]]:
+    """Return plant, sensor and links, where given, as a linear system, and mean and variance of y - c at each step."""
+    start = at(plant, 0)
+    mean, covariance = np.asarray(start.initial_mean), np.asarray(start.initial_covariance)
+    x, spread = mean, covariance
+    parts, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
+    for k in range(horizon):
+        (a, b, q), (c, shift, source, rounding), link = _at_step(plant, sensor, links, k)
+        x, spread = a @ x + b, a @ spread @ a.T + q
+        y, explained = c @ x + shift, c @ spread @ c.T
+        signals.append((y, np.diag(explained + source)))
+        if link is not None:
+            second = explained + source + rounding + np.outer(y, y)
+            parts.append(_describe_step((a, b, q), (c, shift, source + rounding), link, (y, second)))
+    stacked = Steps(*(np.array(field) for field in zip(*parts, strict=True))) if parts else None
+    system = None if stacked is None else LinearSystem(stacked, mean, covariance, np.eye(len(mean)))
+    return system, signals
+
+
+def _links(numbers: Channel, horizon: int) -> list[SecondOrder]:
+    """Return the second moments of the channel at each step."""
+    links = [second_order(link) for link in unstack(numbers)]
+    return links if len(links) > 1 else links * horizon
+
+
+def _at_step(
+    plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
+) -> tuple[Motion, Sensing, SecondOrder | None]:
+    """Return motion, sensor and link at a step; those of step 0 where nothing varies."""
+    moves, senses = at(plant, k), at(sensor, k)
+    return _motion(moves), _sensing(senses), None if links is None else links[k]
+
+
+@cache_by_object
+@in_float64
+def _motion(plant: LinearPlant) -> Motion:
+    """Return A, b and Cov w with inputs zero."""
+    u = jnp.zeros(len(plant.inputs))
+    parts = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
+    return np.asarray(parts[0]), np.asarray(parts[1]), np.asarray(parts[2])
+
+
+@cache_by_object
+def _sensing(sensor: LinearSensor) -> Sensing:
+    """Return C, the mean of y - c - C x, Cov v and the covariance of the rounding error."""
+    law = sensor.noise
+    assert isinstance(law, Rounded)
+    source = np.asarray(law.source.covariance)
+    return np.asarray(sensor.matrix), np.asarray(law.mean), source, np.asarray(law.covariance) - source
+
+
+def _describe_step(motion: Motion, senses: Motion, link: SecondOrder, signal: tuple[np.ndarray, np.ndarray]) -> Steps:
+    """Return one step with the random gain's part of the noise from the second moments of y."""
+    (a, b, q), (c, shift, covariance), (y, second) = motion, senses, signal
+    gain, moments = np.asarray(link.mean_gain), np.block([[second, y[:, None]], [y[None], np.ones((1, 1))]])
+    spread = np.einsum("ijkl,kl->ij", np.asarray(link.gain_spread), moments)
+    columns = np.asarray(link.noise.matrix)
+    noise = gain @ covariance @ gain.T + (columns * np.asarray(link.noise.weights)) @ columns.T
+    return Steps(a, b, q, gain @ c, gain @ shift + np.asarray(link.offset), noise + spread)
+
+
+def _count_beyond(
+    mean: np.ndarray, variance: np.ndarray, half: np.ndarray, step: np.ndarray, dither: str
+) -> Float[np.ndarray, "beyond outputs"]:
+    """P(|y + d - c| > a + (m - 1/2) D), m = 1, 2, ..., of a Gaussian y, averaged over the dither."""
+    ends = half + (np.arange(1, BEYOND + 1)[:, None] - 0.5) * step
+    deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+    if dither == "none":
+        shifts, shares = np.zeros(1), np.ones(1)
+    elif dither == "triangular":  # density (1 - |v|) / D of d = D v
+        shifts = np.concatenate([(NODES - 1) / 2, (NODES + 1) / 2])
+        shares = np.concatenate([WEIGHTS, WEIGHTS]) / 2 * (1 - np.abs(shifts))
+    else:
+        shifts, shares = NODES / 2, WEIGHTS / 2
+    total: np.ndarray = np.zeros_like(ends)
+    for shift, share in zip(shifts, shares, strict=True):
+        centre = mean + shift * step
+        total += share * (ndtr((centre - ends) / deviation) + ndtr((-centre - ends) / deviation))
+    return total
+
+
+def _bound_error(
+    system: LinearSystem, excess: Float[np.ndarray, "steps outputs"], links: list[SecondOrder], places: tuple[int, ...]
+) -> float:
+    """Return the bound of the error relative to the rms, the largest over states and steps."""
+    gains = lmmse(system).gains
+    worst, n = 0.0, system.mean.size
+    terms = np.zeros((0, n, len(places)))  # ((I - K H) A)^j K e of each output
+    for k in range(system.horizon):
+        power = np.asarray(links[k].power.center)
+        size = np.sqrt(np.maximum(np.einsum("iikk->i", power[..., :-1, :-1]), 0.0))
+        fresh = gains.gain[k] * (size * excess[k][list(places)])
+        terms = gains.transition[k] @ terms[np.abs(terms).max(axis=(1, 2), initial=0.0) > 1e-12 * np.abs(fresh).max()]
+        terms = np.concatenate([terms, fresh[None]])
+        rms, most = np.sqrt(np.diag(gains.covariance[k])), np.abs(terms).sum(axis=(0, 2))
+        worst = max(worst, float(np.max(np.divide(most, rms, out=np.zeros(n), where=rms > 0))))
+    return worst
+
+
+def refuse_overload(overload: Overload) -> None:
+    """Raise ValueError where words are overloaded more often than once in a thousand steps."""
+    worst = float(np.max(overload.probability))
+    if worst > MOST:
+        bound = float(overload.bound)
+        off = f"; the claim may be off by {100 * bound:.3g}%" if np.isfinite(bound) else ""
+        expected = "an overload in at most 1 of 1000 steps: widen low and high, or centre them (hg.model.centred)"
+        raise fail("range of the words", expected, f"{worst:.2g} a step{off}")

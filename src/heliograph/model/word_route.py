@@ -1,0 +1,156 @@
+"""Channels of words: the same channel of the words' bits, and of the words as numbers about the centres of their range.
+
+Words are not amplified. They go through `decode_and_forward`, losses, constant and drawn delays, choices and modes of
+such links, and are selected and copied on the way.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import at_each_step, first
+from heliograph.model.words import Reader, Words
+from heliograph.numerics.check import fail
+from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.composite import AbstractUniform
+from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
+from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.flips import Flips
+from heliograph.random_affine.hop import GainAndNoise, known
+from heliograph.random_affine.modes import ModeOutput
+
+FLAG = -1  # in the place of a component: a number that is no word
+Places = tuple[int, ...]  # of words: the component that each carries
+
+
+class Routed(NamedTuple):
+    """A map of words in another form, and the components that stand at its outputs."""
+
+    map: AbstractRandomAffine
+    places: Places
+
+
+class Form(NamedTuple):
+    """How a link of words and a selection of words are written in another form."""
+
+    flips: Callable[[Flips, Places], AbstractRandomAffine]
+    selection: Callable[[np.ndarray], AbstractRandomAffine]
+    size: int  # numbers that a word is written as
+
+
+def in_bits(encoder: Words, channel: Channel) -> Channel:
+    """Return the channel of the numbers by which the words are carried: their bits, and dithers that pass.
+
+    Args:
+        encoder: of the words.
+        channel: of words.
+    """
+    beside = encoder.carried - encoder.bits
+    eye = np.eye(encoder.carried)
+    form = Form(
+        lambda link, places: link.on_bits(encoder.bits, beside),
+        lambda matrix: known(np.kron(matrix, eye)),
+        encoder.carried,
+    )
+    carried: Channel = at_each_step(lambda link: route(link, form).map, channel)
+    return carried
+
+
+def about_centres(encoder: Words, channel: Channel) -> Channel:
+    """Return the channel of the words as numbers about the centres of their range.
+
+    Args:
+        encoder: of the words.
+        channel: of words.
+    """
+
+    def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
+        power = encoder.each(encoder.power, signal_size(link))
+        return route(link, Form(lambda flips, places: flips.about_centre(power[list(places)]), known, 1)).map
+
+    numbers: Channel = at_each_step(convert, channel)
+    return numbers
+
+
+def find_places(channel: Channel) -> Places:
+    """Return the component of y that each output of a channel of words carries, FLAG of a number that is no word."""
+    form = Form(lambda flips, places: known(np.eye(flips.dimension)), known, 1)
+    return route(first(channel), form).places
+
+
+def reader_of(channel: Channel) -> Reader:
+    """Return how the receiver behind a channel of words reads their bits."""
+    return Reader(find_places(channel))
+
+
+def route(channel: AbstractRandomAffine, form: Form) -> Routed:
+    """Write a channel of words in another form.
+
+    Raises:
+        ValueError: a channel that does more with words than select, copy, flip, delay and lose them.
+    """
+    sent = tuple(range(signal_size(channel)))
+    return _route(channel, sent * (1 + channel.past), form)
+
+
+def _route(link: AbstractRandomAffine, places: Places, form: Form) -> Routed:
+    """Write a map of words, of which these components come in, in another form."""
+    match link:
+        case Flips():
+            return Routed(form.flips(link, places), places)
+        case GainAndNoise():
+            return _route_selection(link, places, form)
+        case ModeOutput():
+            return Routed(ModeOutput(link.memory, link.sent * form.size), (FLAG,) * link.outputs)
+        case Series():
+            return _route_series(link, places, form)
+        case Stack():
+            parts = [_route(part, places, form) for part in link.maps]
+            together = tuple(p for part in parts for p in part.places)
+            return Routed(Stack([part.map for part in parts]), together)
+        case AbstractUniform():
+            return _route_choice(link, places, form)
+        case Erasure() | DelayLine():
+            (inner,) = inner_maps(link)
+            routed = _route(inner, places, form)
+            return Routed(replace_inner_maps(link, [routed.map]), routed.places)
+        case Delayed() if not link.timestamped:
+            chosen = _route(link.delay, places, form)
+            routed = _route(link.link, chosen.places, form)
+            maps = [chosen.map if inner is link.delay else routed.map for inner in inner_maps(link)]
+            return Routed(replace_inner_maps(link, maps), routed.places)
+    raise refuse_link(type(link).__name__)
+
+
+def _route_selection(link: GainAndNoise, places: Places, form: Form) -> Routed:
+    matrix, gain = np.asarray(link.matrix), link.law.constant
+    still = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
+    one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
+    if gain is None or float(gain) != 1.0 or not still or not one_each:
+        raise refuse_link(link.in_words() or "a gain")
+    return Routed(form.selection(matrix), tuple(places[int(np.argmax(row))] for row in matrix))
+
+
+def _route_series(link: Series, places: Places, form: Form) -> Routed:
+    maps = []
+    for part in link.maps:
+        routed = _route(part, places, form)
+        places = routed.places
+        maps.append(routed.map)
+    return Routed(Series(maps), places)
+
+
+def _route_choice(link: AbstractUniform, places: Places, form: Form) -> Routed:
+    parts = [_route(part, places, form) for part in link.maps]
+    if len({part.places for part in parts}) > 1:
+        raise fail("channel of words", "choices and modes that deliver the same components", "others")
+    return Routed(replace_inner_maps(link, [part.map for part in parts]), parts[0].places)
+
+
+def refuse_link(got: str) -> Exception:
+    """Build the error of a link that words do not pass."""
+    expected = "one that words pass, which are not amplified: hg.decode_and_forward([p]), perfect(), erasure, delays"
+    return fail("channel of a node with an encoder", expected, got)
