@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
+    from heliograph.serving.brokers.state_topics import StateTopics
     from heliograph.serving.settings import ServiceSettings
 
 
@@ -54,6 +55,12 @@ class ServeOptions:
     forecast: Annotated[
         str, Parameter(help="How far ahead forecasts are published beside estimates: 5s,1min, or steps.")
     ] = ""
+    states: Annotated[
+        str | None, Parameter(help="mqtt://host:port/topic: a retained topic for each state, of the newest estimates.")
+    ] = None
+    discovery: Annotated[
+        str, Parameter(help="Of --states: topic under which Home Assistant looks for devices, as homeassistant.")
+    ] = ""
     ignore_unknown: Annotated[
         bool, Parameter(help="Of a table: leave out columns that the network does not know.", negative="")
     ] = False
@@ -88,8 +95,30 @@ class ServeOptions:
             accept_changes=self.accept_changes,
             every=self.every,
             forecast=horizons_in(self.forecast) if self.forecast else None,
+            states=self._read_states(),
         )
         return settings if self.node is None else settings_of_node(settings, self.node)
+
+    def _read_states(self) -> "StateTopics | None":
+        """Return where single states go.
+
+        Raises:
+            ValueError: an address that is none of MQTT; discovery without one, or a topic that is none.
+        """
+        from heliograph.numerics.check import fail
+        from heliograph.serving.brokers.state_topics import StateTopics
+        from heliograph.serving.brokers.url import parse_address
+
+        if self.states is None:
+            if self.discovery:
+                raise fail("--discovery", "a broker for the states (--states mqtt://host/topic)", "none")
+            return None
+        address = parse_address(self.states)
+        if address.kind != "mqtt":
+            raise fail("--states", "mqtt:// or mqtts://host:port/topic", str(address))
+        if any(sign in self.discovery for sign in "+# ") or self.discovery != self.discovery.strip("/"):
+            raise fail("--discovery", "words between slashes, as homeassistant", repr(self.discovery))
+        return StateTopics(address, self.discovery)
 
 
 def serve(network: str | None = None, /, *, options: ServeOptions | None = None) -> None:

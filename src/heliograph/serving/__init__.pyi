@@ -46,6 +46,10 @@ from .brokers.line_reader import (
 from .brokers.pipe import (
     Pipe as Pipe,
 )
+from .brokers.state_topics import (
+    StatePublishing as StatePublishing,
+    StateTopics as StateTopics,
+)
 from .brokers.url import (
     Address as Address,
     parse_address as parse_address,

@@ -205,6 +205,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look:
             service.resume()
             broker = settings.broker
             transport = _open_pipe(settings, reads) if broker is None else make_transport(broker, translator=reads)
+            transport = _add_states(settings, transport)
             patience = None if step is None else max(step, SHORTEST)
             looked = look(service) if reads is None else LastWordsService(look(service), reads.sources.words, store)
             await serve_until(stop, WaitingService(looked, stop), transport, patience)
@@ -216,6 +217,15 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look:
     if resumed and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
         _say(f"{service.known} messages were known already or came after what was final; {anew}")
+
+
+def _add_states(settings: ServiceSettings, transport: Transport) -> Transport:
+    """Return the transport with single states published beside it, where that is asked for."""
+    if settings.states is None:
+        return transport
+    from heliograph.serving.brokers.state_topics import StatePublishing
+
+    return StatePublishing(transport, settings.states, settings.network.states)
 
 
 def _open_pipe(settings: ServiceSettings, reads: Translator | None) -> Pipe:

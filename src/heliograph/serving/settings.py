@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from heliograph.files.json_field import Source
 from heliograph.live.event import INPUTS
@@ -13,6 +14,9 @@ from heliograph.serving.brokers.transport import encode_name
 from heliograph.serving.brokers.url import Address
 from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
+
+if TYPE_CHECKING:
+    from heliograph.serving.brokers.state_topics import StateTopics
 
 NOTHING = "none"  # the store that keeps nothing
 SHORTEST = 1.0  # seconds without messages after which their silence is used
@@ -40,6 +44,7 @@ class ServiceSettings:
         accept_changes: whether the plants of a store whose network has changed go on with what fits.
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
             hardly changed; None for never.
+        states: where single states are published beside the outputs; None for nowhere.
         forecast: how far ahead forecasts are published beside provisional estimates; None for not at all.
 
     Raises:
@@ -63,6 +68,7 @@ class ServiceSettings:
     accept_changes: bool = False
     every: float | None = None
     forecast: Spans | None = None
+    states: "StateTopics | None" = None
 
     def __post_init__(self) -> None:
         """Raise one line if options contradict each other, or need one that is not given."""
@@ -79,6 +85,8 @@ class ServiceSettings:
             raise fail("--anew", "a store that has the plants (--store FILE)", "none")
         if self.parts is not None:
             check_count("--parts", self.parts)
+            if self.states is not None:
+                raise fail("--states", "one process, whose end says offline (no --parts)", "--parts")
             if self.store is None or self.broker is None:
                 raise fail("--parts", "a store and a broker that all processes share", "not both")
             if self.sources is not None:
@@ -106,6 +114,9 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
     if settings.broker is None or settings.parts is not None:
         raise fail("--node", "a broker between the nodes (--broker URL), and no --parts",
                    "none" if settings.broker is None else "--parts")  # fmt: skip
+    states = settings.states
+    if states is not None:
+        states = states._replace(address=_below(states.address, node))
     # Messages of its own sensor, where they are of topics of others; the seconds of a step are those of all nodes.
     table, step = settings.sources, settings.options.step
     if isinstance(table, Mapping):
@@ -120,11 +131,17 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
         settings,
         network=node_network(settings.network, node),
         options=settings.options._replace(step=step),
-        broker=replace(settings.broker, topic=f"{settings.broker.topic}/{encode_name(node)}"),
+        broker=_below(settings.broker, node),
+        states=states,
         sources=table,
         others=tuple(name for name in settings.network.names if name != node),
         name=f"{settings.name} {node}",
     )
+
+
+def _below(address: Address, node: str) -> Address:
+    """Return the address of a node's service, at the topic of its name below that of all."""
+    return replace(address, topic=f"{address.topic}/{encode_name(node)}")
 
 
 def name_of(network: str) -> str:

@@ -48,7 +48,7 @@ class Mqtt:
         await asyncio.gather(asyncio.to_thread(self._reader.close), asyncio.to_thread(self._writer.close))
 
 
-class _Connection:
+class Connection:
     """A connection that is opened anew whenever it ends, after a wait that doubles; callbacks run in its thread."""
 
     def __init__(self, address: Address, identity: str):
@@ -69,16 +69,19 @@ class _Connection:
         self.client = client
 
     def start(self) -> None:
+        """Begin to connect; return at once."""
         self.client.connect_async(self.address.host, self.address.port)
         self.client.loop_start()
 
     def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
+        """Log where the broker refuses."""
         if code.is_failure:
             LOG.warning("%s: refused, %s; trying again", self.address, code)
 
     def disconnected(
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
     ) -> None:
+        """Log that the connection ended, unless it was closed here."""
         if self.open:
             LOG.warning("%s: the connection ended, %s; trying again", self.address, code)
 
@@ -90,6 +93,7 @@ class _Connection:
             )  # called where it was caught
 
     def close(self) -> None:
+        """End the connection, and its thread."""
         with self.room:
             self.open = False
             self.room.notify_all()
@@ -97,7 +101,7 @@ class _Connection:
         self.client.loop_stop()
 
 
-class _Reader(_Connection):
+class _Reader(Connection):
     """Connection that receives messages and holds them until `receive` takes them."""
 
     def __init__(self, address: Address, part: Part, translator: Translator | None):
@@ -164,7 +168,7 @@ class _Reader(_Connection):
         self._connection += 1
 
 
-class _Writer(_Connection):
+class _Writer(Connection):
     """Connection that publishes outputs."""
 
     def __init__(self, address: Address):

@@ -1,0 +1,120 @@
+"""Messages of single states: one flat JSON object a state, as Home Assistant and telegraf read them."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from pydantic_core import from_json
+
+from heliograph.numerics.times.dates import instant
+from heliograph.numerics.types import unit_of
+from heliograph.serving.brokers.transport import encode_name
+
+ONLINE, OFFLINE = b"online", b"offline"
+
+
+class StateMessage(NamedTuple):
+    """A message that the broker keeps for whoever comes later: its topic, and its body."""
+
+    topic: str
+    body: bytes
+
+
+class _State(NamedTuple):
+    """One state of one filter of a plant, and the topic of its messages."""
+
+    plant: str
+    node: str
+    filter: str
+    state: str
+    topic: str
+
+    @property
+    def identity(self) -> str:
+        """Return an identity of letters, digits, hyphens and underscores."""
+        return self.topic.replace("%", "_").replace("/", "-")
+
+    @property
+    def label(self) -> str:
+        """Return what it is called below its device."""
+        return f"{self.state} ({self.node}, {self.filter})"
+
+
+def availability_topic(topic: str) -> str:
+    """Return the topic on which a service at `topic` says online and offline."""
+    return f"{topic}/availability"
+
+
+def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Iterator[StateMessage]:
+    """Yield a message for each state of each filter of an estimate: value, deviation, dead, and time.
+
+    The topic is TOPIC/state/PLANT/NODE/FILTER/STATE. `value` and `deviation` are numbers, or null; `dead` is 1 where
+    the sender of the node is dead, else 0; `time` is of the estimate, in seconds since 1970 where it is a date.
+
+    Args:
+        topic: the service's.
+        states: names of the states.
+        body: an estimate that a service published, as JSON.
+    """
+    estimate = from_json(body)
+    moment = estimate["time"]
+    time = instant(moment).timestamp() if isinstance(moment, str) else moment
+    dead = _read_dead(estimate)
+    for place, i, message in _iterate_states(topic, states, estimate):
+        covariance = message["covariance"]
+        variance = None if covariance is None else covariance[i][i]
+        deviation = None if variance is None or variance < 0 else math.sqrt(variance)
+        content = {"value": message["mean"][i], "deviation": deviation, "dead": dead.get(place.node, 0), "time": time}
+        yield StateMessage(place.topic, json.dumps(content).encode())
+
+
+def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, prefix: str) -> Iterator[StateMessage]:
+    """Yield what tells Home Assistant of the states of a plant: a sensor each of value and deviation, and of dead ones.
+
+    Args:
+        topic: the service's.
+        states: names of the states; a unit goes with the sensor.
+        body: an estimate that a service published, as JSON.
+        prefix: the topic under which Home Assistant looks, "homeassistant" unless it is set otherwise.
+    """
+    estimate = from_json(body)
+    plant = str(estimate["plant"])
+    device = {"identifiers": [f"{topic.replace('/', '-')}-{encode_name(plant).replace('%', '_')}"],
+              "name": plant or topic, "manufacturer": "heliograph"}  # fmt: skip
+    for place, i, _ in _iterate_states(topic, states, estimate):
+        common: dict[str, Any] = {
+            "state_topic": place.topic,
+            "availability_topic": availability_topic(topic),
+            "device": device,
+        }
+        number = {"state_class": "measurement", **({"unit_of_measurement": u} if (u := unit_of(states[i])) else {})}
+        parts = [
+            ("sensor", "value", place.label, number),
+            ("sensor", "deviation", f"{place.label} deviation", number | {"entity_category": "diagnostic"}),
+        ]
+        if place.node in _read_dead(estimate):
+            dead = {"payload_on": "1", "payload_off": "0", "device_class": "problem"}
+            parts.append(("binary_sensor", "dead", f"{place.label} sender dead", dead))
+        for kind, key, name, more in parts:
+            identity = f"{place.identity}-{key}"
+            said = {"name": name, "unique_id": identity, "value_template": f"{{{{ value_json.{key} }}}}"}
+            yield StateMessage(f"{prefix}/{kind}/{identity}/config", json.dumps(said | common | more).encode())
+
+
+def _read_dead(estimate: Mapping[str, Any]) -> dict[str, int]:
+    """Return 1 for each node whose sender is dead, 0 for each that lives, by node with such a sender."""
+    return {node: int(sender["dead"]) for node, sender in estimate.get("senders", {}).items()}
+
+
+def _iterate_states(
+    topic: str, states: Sequence[str], estimate: Mapping[str, Any]
+) -> Iterator[tuple[_State, int, Mapping[str, Any]]]:
+    """Yield each state of each filter, with its number and the filter's estimate."""
+    plant = str(estimate["plant"])
+    for node, filters in estimate["estimates"].items():
+        for name, message in filters.items():
+            words = [encode_name(word) for word in (plant, node, name)]
+            for i, state in enumerate(states):
+                path = "/".join([topic, "state", *words, encode_name(str(state))])
+                yield _State(plant, node, name, str(state), path), i, message
