@@ -127,8 +127,8 @@ TABLES = {
     "unknown column": ("time,push,poss\n0,0,1\n", ["only the columns time, push, dt, pos", "'poss'", "'pos'"]),
     "missing column": ("time,pos\n0,0\n", ["one column 'push'", "only time, pos"]),
     "doubled column": ("time,push,pos,pos\n0,0,0,0\n", ["distinct columns", "'pos'"]),
-    "time goes backwards": (
-        "time,push,pos\n0,0,1\n2,0,1\n1,0,1\n", ["row 3, column 'time'", "does not go backwards", "1 after 2"]),
+    "time goes backwards beside dt": (
+        "time,dt,push,pos\n0,0,0,1\n2,2,0,1\n1,1,0,1\n", ["row 3, column 'time'", "not go backwards", "1 after 2"]),
     "text in all cells": ("time,push,pos\n0,0,far\n1,0,far\n", ["row 1, column 'pos'", "a number", "'far'"]),
     "infinite": ("time,push,pos\n0,0,inf\n", ["row 1, column 'pos'", "a finite number", "inf"]),
     "missing input": ("time,push,pos\n0,,1\n", ["row 1, column 'push'", "a finite number", "an empty cell"]),

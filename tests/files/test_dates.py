@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.files.table import read_table, write_table
-from heliograph.numerics.times.dates import dates, format_dates
+from heliograph.numerics.times.dates import dates, format_dates, instant, moment_of
 from heliograph.serving import Message
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
@@ -175,11 +175,35 @@ def test_an_instant_is_the_date_that_python_says(moment, zone, space):
 
 @pytest.mark.parametrize(
     "text", ["0.1", "1e9", "", "2026-11-21T10:00:00", "2026-11-21", "0001-01-01T00:00+10:00", "9999-12-31T23:59-10:00",
-             "2026-13-01T00:00Z", "2026-11-21T25:00Z", "2026-11-21T10:00:00+99:00", "20261121T100000Z", "nan"]
+             "2026-13-01T00:00Z", "2026-11-21T25:00Z", "2026-11-21T10:00:00+99:00", "20261121T1000",
+             "2026-11-21T10:00:60Z", "nan"]
 )  # fmt: skip
 def test_no_other_text_is_an_instant(text):
     with pytest.raises(ValueError):
         Message(node="a", sequence=0, time=text)
+
+
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        ("20261121T100000Z", "2026-11-21T10:00:00Z"),
+        ("20261121t100000.123456789+0100", "2026-11-21T09:00:00.123456789Z"),
+        ("20261121T1000", "2026-11-21T10:00"),
+        ("2016-12-31T23:59:60Z", "2017-01-01T00:00:00Z"),  # leap seconds are the second after them
+        ("2016-12-31T23:59:60.25Z", "2017-01-01T00:00:00.25Z"),
+        ("2017-01-01T00:59:60+01:00", "2017-01-01T00:00:00Z"),
+    ],
+)
+def test_basic_dates_and_leap_seconds_are_read(text, same):
+    assert moment_of(text, "time") == moment_of(same, "time")
+    if moment_of(text, "time")[1]:
+        assert instant(text) == instant(same)
+
+
+@pytest.mark.parametrize("text", ["2016-12-31T22:59:60Z", "2016-12-30T23:59:60Z", "2016-12-31T23:59:60.1234567891Z"])
+def test_other_sixtieth_seconds_and_finer_than_nanoseconds_are_refused(text):
+    with pytest.raises(ValueError, match=r"^time: expected a date as .*, from 1678 to 2261, to the nanosecond"):
+        moment_of(text, "time")
 
 
 def test_text_among_numbers_is_no_number():

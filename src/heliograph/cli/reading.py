@@ -160,9 +160,9 @@ def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOpt
 
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
-        recording, refused = read_recording_rows(path, network, options.strict, options.ignore_unknown)
+        recording, refused, notes = read_recording_rows(path, network, options.strict, options.ignore_unknown)
     lines = [describe_refused(path, "rows", len(refused), refused[:SAID])] if refused else []
-    return Measured("", recording, warnings=[*lines, *(str(doubt.message) for doubt in doubts)])
+    return Measured("", recording, warnings=[*lines, *notes, *(str(doubt.message) for doubt in doubts)])
 
 
 def _convert_events(events: "EventTable", plant: str, options: ReadingOptions) -> Measured:

@@ -90,14 +90,26 @@ def _read_events(
     table = read_events(path, reference, network, module, options, lambda *_: None)
     if table is None:
         rows = read_rows(path, network, options)
-        for line in rows.warnings:
+        for line in [*rows.warnings, *_describe_finer(path, rows.recording.time)]:
             print(f"heliograph: {visible(line)}", file=sys.stderr)
         yield ("", *events_of_recording(rows.recording, network))
         return
+    import numpy as np
+
     from heliograph.cli.reading import describe_unread
 
-    for line in [*describe_unread(path, table), *table.notes]:
+    times = [table.of(name).columns[node].time for name in table.plants for node in table.of(name).columns]
+    finer = _describe_finer(path, np.concatenate(times).astype("datetime64[ns]")) if table.dated else []
+    for line in [*describe_unread(path, table), *table.notes, *finer]:
         print(f"heliograph: {visible(line)}", file=sys.stderr)
     for name in table.plants:
         events = table.of(name)
         yield name, list(events.sort_events()), None if events.steps or events.numbers else events.date
+
+
+def _describe_finer(path: Path, time: "np.ndarray") -> list[str]:
+    """Say how many dates are finer than the microseconds that messages have; nothing if none is."""
+    if time.dtype.kind != "M":
+        return []
+    finer = int((time != time.astype("datetime64[us]")).sum())
+    return [f"{path}: times that messages have to the microsecond only: {finer}"] if finer else []

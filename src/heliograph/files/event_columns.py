@@ -11,13 +11,10 @@ from heliograph.files.sources import Reading
 from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.plant import GAP
 from heliograph.numerics.check import fail
+from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-
-SECOND = 10**9  # nanoseconds
-YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
-CENTURY = 946_684_800 * SECOND  # 2000-01-01
 
 USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
 
@@ -85,47 +82,31 @@ class Columns:
 
         A stamp that is more than a year before its arrival was not set; where most are, they are of another clock, and
         each event arrives when it was measured. Where arrivals are not known, neither was one that is more than a year
-        away from the messages before and after it, which go on from one to the other.
+        away from the messages before and after it, which go on from one to the other. Numbers are seconds.
         """
         time, arrival, sequence = self.arrays()
-        late = arrival - time
+        late, year = arrival - time, YEAR / SECOND if self.numbers else YEAR
         if not len(time):
             return "", "", 0
-        if np.median(late) > YEAR:
-            self.arrival = array("q", self.time)
+        if np.median(late) > year:
+            self.arrival = array(self.time.typecode, self.time)
             return f"{name}: stamps and arrivals are of two clocks: each event arrives when it was measured", "", 0
-        near, unset = ("that of arrival", late > YEAR) if late.any() else ("the others in order", _find_astray(time))
+        known = bool(late.any())
+        near = "that of arrival" if known else "the others in order"
+        unset = late > year if known else find_astray(time, year)
         count = int(np.count_nonzero(unset))
         if not count:
             return "", "", 0
-        got = f"{np.datetime64(int(time[np.argmax(unset)]), 'ns')} in {count} of {len(time)} messages"
+        first = time[np.argmax(unset)]
+        moment = f"{first:.10g}" if self.numbers else str(np.datetime64(int(first), "ns"))
+        got = f"{moment} in {count} of {len(time)} messages"
         # They came when those did that were set just before them, or first.
         set_before = np.maximum.accumulate(np.where(unset, -1, np.arange(len(time))))
         near_them = time[np.where(set_before < 0, np.argmin(unset), set_before)]
-        moments = (arrival if late.any() else near_them)[unset]
+        moments = (arrival if known else near_them)[unset]
         self.unread += zip(moments.tolist(), sequence[unset].tolist(), strict=True)
         self.keep(~unset)
         return "", str(fail(name, f"a time that was set, near {near}", got)), count
-
-
-def _find_astray(time: np.ndarray) -> Bool[np.ndarray, " events"]:
-    """Return the mask of the stamps, in the order of their messages, of a clock that was not set.
-
-    They are more than a year outside of all others, and a stretch of fewer messages than those before and after it,
-    between which is less than a year; or, at the start, of the first year since 1970, where clocks begin to count, and
-    all others are of this century.
-    """
-    stretches = np.split(np.arange(len(time)), np.flatnonzero(np.abs(np.diff(time)) > YEAR) + 1)
-    astray = np.zeros(len(time), dtype=bool)
-    for before, one, after in zip(stretches, stretches[1:], stretches[2:], strict=False):
-        returns = abs(int(time[after[0]]) - int(time[before[-1]])) <= YEAR
-        astray[one] = returns and len(one) < len(before) + len(after)
-    first, later = stretches[0], time[len(stretches[0]) :][~astray[len(stretches[0]) :]]
-    astray[first] = len(later) and later.min() >= CENTURY and np.all((time[first] >= 0) & (time[first] < YEAR))
-    if not astray.any():
-        return astray
-    others = time[~astray]
-    return np.asarray(astray & ((time < others.min() - YEAR) | (time > others.max() + YEAR)))
 
 
 class Events(NamedTuple):

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from heliograph.files.event_columns import (
-    SECOND,
     USED,
     Columns,
     Events,
@@ -22,6 +21,7 @@ from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.module import readable
+from heliograph.numerics.times.row_order import SECOND
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
 
@@ -155,12 +155,12 @@ class EventTable:
         """End the reading of a source: leave out stamps that were not set; say what was left out.
 
         A stamp that is more than a year before its arrival, or zero where the others are of our days, was not set;
-        where most of a node's are, they are of another clock, and arrivals say nothing.
+        where most of a node's are, they are of another clock, and arrivals say nothing. Numbers of steps are no stamps.
 
         Raises:
             ValueError: no event, and a message that could not be read.
         """
-        for plant in self._plants.values() if self.dated else ():
+        for plant in self._plants.values() if self.dated or not self.steps else ():
             for name, columns in plant.items():
                 note, reason, count = columns.drop_unset(f"{source}, {name}")
                 self.notes += [note] if note else []

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from heliograph.files.table import TIME, Rows, columns_of, read_back_name, read_rows, write_table
+from heliograph.files.table_rows import Cells, KeptRows, keep_rows, order_rows
 from heliograph.model.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
@@ -70,13 +71,14 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
 
 def read_recording_rows(
     source: "Path | StoreTable", network: Network, strict: bool, ignore_unknown: bool
-) -> tuple[Recording, list[str]]:
+) -> tuple[Recording, list[str], list[str]]:
     """Read a recording as `read_recording` does, of which a row that cannot be read is refused alone unless `strict`.
 
-    Where the network counts steps such a row is a step in which nothing arrived and inputs stayed as they were.
+    Where the network counts steps such a row is a step in which nothing arrived and inputs stayed as they were. Unless
+    `strict`, rows of continuous time are put in the order of their times.
 
     Returns:
-        The recording, and why rows were refused.
+        The recording, why rows were refused, and lines on what was put in order.
 
     Raises:
         ValueError: what `read_recording` refuses of a table as a whole; no row that can be read.
@@ -86,7 +88,7 @@ def read_recording_rows(
     recording = reader.read(rows)
     if not len(recording.time):
         raise reader.refused[0] if reader.refused else fail(str(source), "at least one row", "none")
-    return recording, [str(error) for error in reader.refused]
+    return recording, [str(error) for error in reader.refused], reader.notes
 
 
 def write_recording(recording: Recording, network: Network, path: str | Path) -> None:
@@ -149,13 +151,14 @@ class RowReader:
     Attributes:
         only: the columns that are read; None for all.
         refused: why rows were refused, in the order of the table.
+        notes: lines on what was put in order.
     """
 
     def __init__(self, network: Network, source: str, strict: bool, ignore_unknown: bool):
         self.network, self.source, self._strict = network, source, strict
         self._headers = _map_headers(network)
         self.only: Mapping[str, str] | None = self._headers if ignore_unknown else None
-        self.refused = list[InputError]()
+        self.refused, self.notes = list[InputError](), list[str]()
 
     @property
     def names(self) -> set[str]:
@@ -169,8 +172,19 @@ class RowReader:
             ValueError: unknown, missing or doubled columns; times that go backwards; a row that cannot be read, where
                 reading is strict. One line that names the row, from 1, and the column.
         """
-        cells = self.read_cells(rows)
-        kept = _keep_rows(cells.numbers, self.network)
+        return self.arrange(self.read_cells(rows))
+
+    def arrange(self, cells: Cells) -> Recording:
+        """Return rows as a recording; unless reading is strict, in the order of their times.
+
+        Raises:
+            ValueError: times that go backwards, where reading is strict or each row is a step in most cases.
+        """
+        if not self._strict:
+            cells, refused, note = order_rows(cells, self.network, self.source)
+            self.refused += refused
+            self.notes += [note] if note else []
+        kept = keep_rows(cells.numbers, self.network)
         time = kept.fill_times(cells.time)
         u = _make_inputs(self.network, cells.inputs, time, kept, self.source)
         measurements = {node: kept.fill(values) for node, values in cells.measurements.items()}
@@ -180,7 +194,7 @@ class RowReader:
         truth = [kept.fill(cells.truth.get(state, unknown)) for state in self.network.states]
         return Recording(measurements, u, time, np.stack(truth, axis=1))
 
-    def read_cells(self, rows: Rows) -> "Cells":
+    def read_cells(self, rows: Rows) -> Cells:
         """Return what stands in the rows that can be read, each by itself.
 
         Raises:
@@ -191,21 +205,6 @@ class RowReader:
         cells = _read_cells(columns, self.network, checks)
         self.refused += [*rows.refused, *checks.refused]
         return cells.of(checks.good)
-
-
-class Cells(NamedTuple):
-    """Rows of time: their numbers from 1, times, measurements by node, inputs and true states by name."""
-
-    numbers: np.ndarray
-    time: np.ndarray
-    measurements: dict[str, np.ndarray]
-    inputs: dict[str, np.ndarray]
-    truth: dict[str, np.ndarray]
-
-    def of(self, good: np.ndarray) -> "Cells":
-        """Return some of the rows."""
-        parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
-        return Cells(self.numbers[good], self.time[good], *parts)
 
 
 class _RowChecks:
@@ -265,7 +264,7 @@ def _read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: _Ro
 
 
 def _make_inputs(
-    network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: "_KeptRows", source: str
+    network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: "KeptRows", source: str
 ) -> np.ndarray:
     """Return the inputs of rows whose times do not go backwards; a missing dt is the difference of the times."""
     row = backwards(time)
@@ -279,40 +278,6 @@ def _make_inputs(
         if name == TIME_STEP and (fault := find_time_step_fault(u[:, i])):
             raise fail(f"{source}, row {rows.numbers[fault.row]}, column {name!r}", fault.expected, fault.came)
     return u
-
-
-class _KeptRows(NamedTuple):
-    """Rows that a recording has: their numbers in the table, which row each is of, and whether it arrived itself."""
-
-    numbers: np.ndarray
-    of: np.ndarray
-    arrived: np.ndarray
-
-    def fill(self, values: np.ndarray) -> np.ndarray:
-        """Return values of these rows, NaN where one did not arrive."""
-        filled = np.array(values[self.of], dtype=np.float64)
-        filled[~self.arrived] = np.nan
-        return filled
-
-    def fill_times(self, time: np.ndarray) -> np.ndarray:
-        """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
-        between = np.flatnonzero(~self.arrived)
-        filled = np.array(time[self.of])
-        before, after = self.of[between], np.minimum(self.of[between] + 1, len(time) - 1)
-        known = self.numbers[self.arrived]
-        share = np.maximum(self.numbers[between] - known[before], 0) / np.maximum(known[after] - known[before], 1)
-        moved = share * (time[after] - time[before]).astype(np.float64)
-        filled[between] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
-        return filled
-
-
-def _keep_rows(numbers: np.ndarray, network: Network) -> _KeptRows:
-    """Return the rows of these numbers; where each row is a step also those between them, as the ones before."""
-    if TIME_STEP in network.inputs or not len(numbers):
-        return _KeptRows(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
-    steps = np.arange(1, numbers[-1] + 1)
-    before = np.maximum(np.searchsorted(numbers, steps, side="right") - 1, 0)
-    return _KeptRows(steps, before, numbers[before] == steps)
 
 
 def _list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
@@ -367,7 +332,7 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         warnings.warn(
             f"{source}, column {TIME!r}: {shared} of {len(time)} rows share their time with another row, as stamps do "
             f"that lost their digits; {len(counts)} times in all",
-            stacklevel=5,
+            stacklevel=6,
         )
 
 

@@ -149,8 +149,8 @@ def test_lines_without_a_topic_are_of_the_only_one(file):
     (neither,) = several.read([b'{"t": 20.5, "time": 1700000000}'])
     assert "expected a message in our own form, or a topic of the sources, got neither" in neither
     named = LineReader(network, Translator(table, network), Path("here/other.jsonl"))
-    (message,) = named.read([b'{"t": 20.5, "time": 1700000000}'])
-    assert message.values == [20.5]
+    assert named.read([b'{"t": 20.5, "time": 1700000001}', b'{"t": 20.4, "time": 1700000000}']) == []
+    assert [message.values for message in named.end()] == [[20.4], [20.5]]  # of a file, in the order of their times
 
 
 def test_sources_and_parts_exclude_each_other():

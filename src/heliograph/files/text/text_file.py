@@ -6,6 +6,7 @@ import re
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TextIO, TypeVar
 
@@ -23,13 +24,33 @@ class CutOffError(InputError):
 
 
 def kind_of(path: Path) -> str:
-    """Return the extension of a file in small letters, without .gz where it is packed."""
-    return (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
+    """Return the extension of a file in small letters, without .gz where it is packed; of a table in a .txt ".csv"."""
+    kind = (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
+    return ".csv" if kind == ".txt" and path.is_file() and _begins_as_table(path) else kind
+
+
+def _begins_as_table(path: Path) -> bool:
+    """Return whether the first line of a text names columns, and the second has as many cells, one of them a value."""
+    try:
+        with open_text(path) as text:
+            header, *rows = islice((line.strip() for line in text if line.strip()), 2)
+    except (OSError, ValueError):
+        return False
+    names = header.split(",")
+    if header.startswith("#"):  # a comment, of which the reader of tables says what to do
+        return len(names) > 1
+    words = all(re.fullmatch(r"[^\W\d][^{}\[\]:]*", name.strip().strip('"')) for name in names)
+    return len(names) > 1 and words and all(len(row.split(",")) == len(names) for row in rows)
 
 
 def encoding_of(start: bytes) -> str:
-    """Return the encoding of a text by its first bytes: UTF-16 where its mark is there, else UTF-8."""
-    return "utf-16" if start.startswith(WIDE) else "utf-8-sig"
+    """Return the encoding of a text by its first two bytes: UTF-16 by its mark or by a NUL beside a letter."""
+    if start.startswith(WIDE):
+        return "utf-16"
+    low, high = (*start[:2], 1, 1)[:2]
+    if 0 in (low, high) and low != high:
+        return "utf-16-be" if low == 0 else "utf-16-le"
+    return "utf-8-sig"
 
 
 def is_text(line: str) -> bool:
@@ -39,7 +60,7 @@ def is_text(line: str) -> bool:
 
 @contextmanager
 def open_text(path: Path) -> Iterator[TextIO]:
-    """Open a file of text in UTF-8, or in UTF-16 with its mark, packed or not; bytes that are no text are escaped.
+    """Open a file of text in UTF-8 or UTF-16, packed or not; bytes that are no text are escaped.
 
     Raises:
         CutOffError: a packed file that is damaged or cut off, from there on.
@@ -49,7 +70,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
     try:
         with gzip.open(path, "rb") if packed else path.open("rb") as file:
             encoding = encoding_of(file.read(len(WIDE[0])))
-        errors = "replace" if encoding == "utf-16" else "surrogateescape"
+        errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
         if packed:
             with gzip.open(path, "rt", newline="", encoding=encoding, errors=errors) as text:
                 yield text

@@ -61,7 +61,7 @@ class TextStream:
     def _may_be_no_text(start: bytes) -> bool:
         """Return whether more bytes may show that these are no text in UTF-8."""
         marks = (*NO_TEXT, GZIP, *WIDE, codecs.BOM_UTF8)
-        return any(mark.startswith(start) for mark in marks if len(start) < len(mark))
+        return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
     def _begin(self, start: bytes) -> bytes:
         """Choose how the bytes are read; return those that are read so."""
@@ -71,8 +71,8 @@ class TextStream:
                 raise fail(self.source, "text: CSV, lines of JSON, a log", came)
         if start.startswith(GZIP):
             self._packed, self._inside = b"", TextStream(self.source)
-        elif encoding_of(start) == "utf-16":
-            self._decode = codecs.getincrementaldecoder("utf-16")("replace")
+        elif (encoding := encoding_of(start)) != "utf-8-sig":
+            self._decode = codecs.getincrementaldecoder(encoding)("replace")
         return start.removeprefix(codecs.BOM_UTF8)
 
     def _unpacked(self, data: bytes, ended: bool) -> bytes:

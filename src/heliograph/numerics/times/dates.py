@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,8 @@ DATE = re.compile(
     r"(?P<day>\d{4}-\d\d-\d\d)(?:[T ](?P<clock>\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?))?"
     r" ?(?P<zone>Z?[+-]\d\d(?::?\d\d)?|Z|UTC|GMT)?"  # mosquitto_sub writes Z+0100
 )
+BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)[Tt](\d\d)(\d\d)(?:(\d\d)([.,]\d{1,9})?)?(.*)")  # of ISO 8601, without marks
+LEAP_SECOND = re.compile(r"(\d\d:\d\d:)60")
 MONTH = re.compile(r"(?P<year>\d{4})-(?:(?P<month>\d\d)|Q(?P<quarter>[1-4]))|(?P<of>\d{4})Q(?P<quarter_of>[1-4])")
 UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MISSING = np.iinfo(np.int64).min  # NumPy's NaT
@@ -21,7 +23,7 @@ YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
 
 def looks_like_date(text: str) -> bool:
     """Return whether a text begins like a date of ISO 8601, or is a month (2026-11) or a quarter (2026Q4)."""
-    return re.match(r"\d{4}-\d\d-", text) is not None or MONTH.fullmatch(text) is not None
+    return re.match(r"\d{4}-\d\d-|\d{8}[Tt]\d{4}", text) is not None or MONTH.fullmatch(text) is not None
 
 
 def dates(texts: Iterable[object], name: str) -> np.ndarray:
@@ -46,6 +48,8 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
 def moment_of(text: str, name: str) -> tuple[int, bool]:
     """Return a date as nanoseconds since 1970 in UTC, and whether it has a zone; a month or quarter is its first day.
 
+    A leap second (23:59:60 UTC at the end of a month) is the second after it, as clocks of computers have it.
+
     Raises:
         ValueError: no date of ISO 8601, or one beyond what nanoseconds can say.
     """
@@ -53,29 +57,47 @@ def moment_of(text: str, name: str) -> tuple[int, bool]:
     if month := MONTH.fullmatch(text):
         quarter = month["quarter"] or month["quarter_of"]
         text = f"{month['year'] or month['of']}-{month['month'] or f'{3 * int(quarter) - 2:02}'}-01"
-    match = DATE.fullmatch(text.upper())
     try:
-        if match is None:
-            raise ValueError
-        return _convert_to_nanoseconds(match), match["zone"] is not None
+        match, leap = _match_date(text)
+        return _convert_to_nanoseconds(match, leap), match["zone"] is not None
     except ValueError:
-        expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
+        expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261, to the nanosecond"
         raise fail(name, expected, show_value(text)) from None
 
 
-def _convert_to_nanoseconds(match: re.Match[str]) -> int:
+def _match_date(text: str) -> tuple[re.Match[str], bool]:
+    """Return the parts of a date, and whether it is a leap second, which is read as the second before it.
+
+    Raises:
+        ValueError: no date of ISO 8601, or one of a year that nanoseconds cannot say.
+    """
+    text = text.upper()
+    if basic := BASIC.fullmatch(text):
+        year, month, day, hour, minute, second, part, zone = basic.groups(default="")
+        text = f"{year}-{month}-{day}T{hour}:{minute}{second and ':'}{second}{part}{zone}"
+    leap = LEAP_SECOND.search(text) is not None
+    match = DATE.fullmatch(LEAP_SECOND.sub(r"\g<1>59", text) if leap else text)
+    if match is None or int(match["day"][:4]) not in YEARS:
+        raise ValueError
+    return match, leap
+
+
+def _convert_to_nanoseconds(match: re.Match[str], leap: bool) -> int:
     """Return the nanoseconds since 1970 in UTC."""
-    if int(match["day"][:4]) not in YEARS:
-        raise ValueError
-    nanoseconds = int(np.datetime64(_local(match), "ns").astype(np.int64))
-    zone = _offset(match["zone"])
-    if zone == "Z":
+    nanoseconds, zone = int(np.datetime64(_local(match), "ns").astype(np.int64)), _offset(match["zone"])
+    if zone != "Z":
+        hours, minutes = int(zone[1:3]), int(zone[-2:]) if len(zone) > 3 else 0
+        if hours > 23 or minutes > 59:
+            raise ValueError
+        ahead = (60 * hours + minutes) * 60 * 10**9
+        nanoseconds += -ahead if zone[0] == "+" else ahead
+    if not leap:
         return nanoseconds
-    hours, minutes = int(zone[1:3]), int(zone[-2:]) if len(zone) > 3 else 0
-    if hours > 23 or minutes > 59:
+    after = nanoseconds + 10**9
+    second = np.datetime64(after, "ns").astype("datetime64[s]")
+    if second != second.astype("datetime64[M]"):  # leap seconds end a month in UTC
         raise ValueError
-    ahead = (60 * hours + minutes) * 60 * 10**9
-    return nanoseconds - ahead if zone[0] == "+" else nanoseconds + ahead
+    return after
 
 
 def _local(match: re.Match[str]) -> str:
@@ -90,9 +112,12 @@ def _offset(zone: str | None) -> str:
 
 def instant(text: str) -> datetime:
     """Return a date of ISO 8601 with its zone, to the microsecond."""
-    match = DATE.fullmatch(text.upper())
-    if match is None or match["zone"] is None or int(match["day"][:4]) not in YEARS:
+    match, leap = _match_date(text)
+    if match["zone"] is None:
         raise ValueError
+    if leap:
+        nanoseconds = _convert_to_nanoseconds(match, leap)
+        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=nanoseconds // 1000)
     zone = _offset(match["zone"]).replace("Z", "+00:00")
     return datetime.fromisoformat(f"{_local(match)}{zone}")
 

@@ -12,6 +12,7 @@ from heliograph.files.fields import decode_json
 from heliograph.files.message_files import FileMessage, convert_line, convert_object, flatten
 from heliograph.files.own_messages import OwnReader, is_own
 from heliograph.numerics.check import InputError, file_path, flag, instance
+from heliograph.serving.brokers.arrival_order import ArrivalOrder
 from heliograph.serving.brokers.table_lines import TableLines, read_own
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
@@ -22,7 +23,7 @@ CLOSES = re.compile(rb"[\]}]")  # the last one, which is not indented
 
 
 class LineReader:
-    """Lines of a pipe, to messages of a network.
+    """Lines of a pipe, to messages of a network; of a file in the order of their arrivals.
 
     Args:
         network: the network.
@@ -57,6 +58,7 @@ class LineReader:
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
         self._number = 0
+        self._order = None if path is None else ArrivalOrder()
 
     def read(self, lines: Sequence[bytes]) -> list[Payload]:
         """Return the messages of lines, which are not empty.
@@ -73,13 +75,16 @@ class LineReader:
             else:
                 self._number += 1
                 payloads += self._line(line)
-        return payloads + (self._table.read(rows) if rows else [])
+        payloads += self._table.read(rows) if rows else []
+        return payloads if self._order is None else self._order.add(payloads)
 
     def end(self) -> list[Payload]:
         """Return the messages of what is left at the end."""
         if self._is_table:
-            return self._table.end()
-        return [] if self._document is None else self._read_document(self._document)
+            rest = self._table.end()
+        else:
+            rest = [] if self._document is None else self._read_document(self._document)
+        return rest if self._order is None else [*self._order.add(rest), *self._order.end()]
 
     def _line(self, line: bytes) -> list[Payload]:
         """Return the messages of a line that is none of a table."""

@@ -38,7 +38,7 @@ class Reader(Protocol):
 class Pipe:
     """Messages from one file descriptor, outputs to another, one a line. Empty lines are ignored.
 
-    What is packed (gzip) is unpacked, and UTF-16 read where its mark is there. A line longer than LONGEST bytes is cut
+    What is packed (gzip) is unpacked, and UTF-16 read. A line longer than LONGEST bytes is cut
     there, and the rest of it is skipped.
 
     Args:

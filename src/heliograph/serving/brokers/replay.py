@@ -54,7 +54,7 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     """
     path = file_path("recording", path)
     instance("network", network, Network, "a Network")
-    table, _ = read_recording_rows(path, network, strict=True, ignore_unknown=False)
+    table, *_ = read_recording_rows(path, network, strict=True, ignore_unknown=False)
     return events_of_recording(table, network)
 
 
@@ -225,5 +225,6 @@ def _format_time(time: float, origin: np.datetime64 | None) -> float | str:
     """Return a time as messages have it: a date where time 0 has one, else the number."""
     if origin is None:
         return float(time)
-    microseconds = np.timedelta64(round(time * 1e6), "us")  # what a message keeps of a date
-    return f"{np.datetime_as_string(origin.astype('datetime64[us]') + microseconds)}Z"
+    nanoseconds = int(origin.astype("datetime64[ns]").astype(np.int64)) + round(time * 1e9)
+    microseconds = np.datetime64((nanoseconds + 500) // 1000, "us")  # what a message keeps of a date
+    return f"{np.datetime_as_string(microseconds)}Z"

@@ -1,7 +1,8 @@
 """Lines of a table of CSV that come through a pipe, to messages: rows of time, events, and rows that sources map."""
 
 import json
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,14 @@ from heliograph.files.own_messages import NODE, OWN, SEQUENCE, OwnReader
 from heliograph.files.recording import RowReader
 from heliograph.files.sources import Reading, Unread
 from heliograph.files.table import CsvColumns
+from heliograph.files.table_rows import Cells, join_cells
 from heliograph.files.text.csv_text import ANNOTATIONS, CsvRow, CsvText
 from heliograph.files.text.dialects import COMMENTS, names_in
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError
-from heliograph.serving.brokers.replay import check_time_steps, encode_event, row_events
+from heliograph.serving.brokers.replay import check_time_steps, encode_event, events_of_recording, row_events
 from heliograph.serving.brokers.translator import Translator, date_of
+from heliograph.serving.brokers.transport import LOG
 from heliograph.serving.message import Message, Payload, UnreadMessage
 from heliograph.simulation.network import Network
 
@@ -37,7 +40,7 @@ class TableLines:
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvText(self._source, path, marked=translator is not None)
-        self._reader: EventRows | MappedRows | TimeRows | None = None
+        self._reader: MessageRows | TimeRows | None = None
 
     def names_columns(self, line: str) -> bool:
         """Return whether a line is the first of a table: it names a column that the network or its sources know."""
@@ -60,60 +63,42 @@ class TableLines:
 
     def end(self) -> list[Payload]:
         """Return the messages of what is left at the end."""
-        return self._convert(self._text.end())
+        rest = self._convert(self._text.end())
+        return rest + (self._reader.end() if isinstance(self._reader, TimeRows) else [])
 
     def _convert(self, rows: list[CsvRow | InputError]) -> list[Payload]:
         if self._reader is None and self._text.header:
             self._reader = self._choose(self._text.header)
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
-    def _choose(self, header: list[str]) -> "EventRows | MappedRows | TimeRows":
+    def _choose(self, header: list[str]) -> "MessageRows | TimeRows":
         """Return the reader of rows with these columns."""
         if {NODE, SEQUENCE} <= set(header):
-            return EventRows(OwnReader(self._network, self._source, self._ignore, table=True))
-        if self._translator is not None:
-            topic = self._translator.topic_of_rows(self._path, header)
+            own = OwnReader(self._network, self._source, self._ignore, table=True)
+            return MessageRows(lambda row: read_own(own, row.where, typed_cells(row)))
+        translator = self._translator
+        if translator is not None:
+            topic = translator.topic_of_rows(self._path, header)
             if topic is not None or TOPIC in header:
-                return MappedRows(self._translator, topic)
+                return MessageRows(lambda row: translator.decode(convert_row(row.where, typed_cells(row)), topic))
         return TimeRows(self._network, header, self._text, self._ignore)
 
 
-class MappedRows:
-    """Rows of which the sources say what they mean: of a log with a column `topic`, or all of one topic."""
+class MessageRows:
+    """Rows each of which is a message, or several: an event in our own form, or what sources map."""
 
-    def __init__(self, translator: Translator, topic: str | None):
-        self._translator, self._topic = translator, topic
-
-    def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows."""
-        payloads = list[Payload]()
-        for row in rows:
-            if isinstance(row, InputError):
-                payloads.append(str(row))
-            else:
-                payloads += self._translator.decode(convert_row(row.where, typed_cells(row)), self._topic)
-        return payloads
-
-
-class EventRows:
-    """Rows that are events in our own form."""
-
-    def __init__(self, reader: OwnReader):
-        self._reader = reader
+    def __init__(self, decode: Callable[[CsvRow], Sequence[Payload]]):
+        self._decode = decode
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows."""
-        payloads = list[Payload]()
-        for row in rows:
-            if isinstance(row, InputError):
-                payloads.append(str(row))
-            else:
-                payloads += read_own(self._reader, row.where, typed_cells(row))
-        return payloads
+        """Return the messages of rows, and why others cannot be read."""
+        return [
+            payload for row in rows for payload in ([str(row)] if isinstance(row, InputError) else self._decode(row))
+        ]
 
 
 class TimeRows:
-    """Rows of time, as `heliograph.files.read_recording` reads them."""
+    """Rows of time, as `heliograph run` reads them: of a file all of them at its end: the same rows."""
 
     def __init__(self, network: Network, header: list[str], text: CsvText, ignore_unknown: bool):
         self._network, self._steps = network, TIME_STEP not in network.inputs
@@ -123,13 +108,16 @@ class TimeRows:
         self._given = [name for name in network.inputs if name != TIME_STEP]
         self._origin: np.datetime64 | None = None
         self._before: float | None = None  # time of the row before
+        self._whole = text.path is not None
+        self._cells = list[Cells]()  # those of a file, until it ends
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
         """Return the messages of rows, as a replay of them has them, and why others cannot be read."""
         cells = self._rows.read_cells(self._columns.read(rows))
         refused, self._rows.refused = [str(error) for error in self._rows.refused], []
         count = len(cells.numbers)
-        if not count:
+        if not count or self._whole:
+            self._cells += [cells] if count else []
             return [*refused]
         time = self._seconds(cells.time, cells.numbers)
         if TIME_STEP in cells.inputs:
@@ -142,6 +130,19 @@ class TimeRows:
         lines = [json.dumps(encode_event(event, "", self._origin)).encode() for event in events]
         self._before = float(time[-1])
         return [*lines, *refused]
+
+    def end(self) -> list[Payload]:
+        """Return the messages of the rows of a file."""
+        if not self._cells:
+            return []
+        with warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always", UserWarning)
+            recording, self._cells = self._rows.arrange(join_cells(self._cells)), []
+        for line in [*self._rows.notes, *(str(doubt.message) for doubt in doubts)]:
+            LOG.warning("%s", line)
+        events, origin = events_of_recording(recording, self._network)
+        lines = [json.dumps(encode_event(event, "", origin)).encode() for event in events]
+        return [*lines, *(str(error) for error in self._rows.refused)]
 
     def _seconds(self, time: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Return the times in the unit of messages: steps, numbers, or seconds since the first date."""

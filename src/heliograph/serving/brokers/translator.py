@@ -5,11 +5,11 @@ from collections.abc import Collection, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from heliograph.files.event_columns import YEAR
 from heliograph.files.fields import decode_json, parse_arrival
 from heliograph.files.message_files import FileMessage, message_name
 from heliograph.files.sources import Reading, Sources, Unread
 from heliograph.numerics.check import InputError, fail, instance, show_value
+from heliograph.numerics.times.row_order import YEAR
 from heliograph.serving.brokers.transport import LOG
 from heliograph.serving.message import LONGEST, Message, UnreadMessage
 from heliograph.simulation.network import Network

@@ -1,0 +1,106 @@
+"""Rows of a table that were read: what stands in them, in which order they are, and which steps they are of."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.files.table import TIME
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray, find_out_of_order
+from heliograph.numerics.times.row_times import backwards
+from heliograph.simulation.network import Network
+
+MOST_OUT = 0.5  # share of the rows that may be out of order where each row is a step
+
+
+class Cells(NamedTuple):
+    """Rows of time: their numbers from 1, times, measurements by node, inputs and true states by name."""
+
+    numbers: np.ndarray
+    time: np.ndarray
+    measurements: dict[str, np.ndarray]
+    inputs: dict[str, np.ndarray]
+    truth: dict[str, np.ndarray]
+
+    def of(self, good: np.ndarray) -> "Cells":
+        """Return some of the rows."""
+        parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
+        return Cells(self.numbers[good], self.time[good], *parts)
+
+
+def join_cells(parts: Sequence[Cells]) -> Cells:
+    """Return the rows of several parts of a table, one after the other."""
+    named = (
+        {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
+        for i in range(2, len(Cells._fields))
+    )
+    return Cells(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
+
+
+def order_rows(cells: Cells, network: Network, source: str) -> tuple[Cells, list[InputError], str]:
+    """Return rows whose times do not go backwards, why others are refused, and a line on what was put in order.
+
+    A time that is more than a year outside of all others was not set, and its row is refused alone. Where time is
+    continuous the others are put in the order of their times. Where each row is a step the fewest without which times
+    do not go backwards are refused. Beside a column `dt`, which is of the order of the rows, and where half of the
+    steps or more would be refused, rows stay as they are.
+
+    Args:
+        cells: the rows.
+        network: the network that they belong to.
+        source: name of the table, for errors.
+    """
+    if backwards(cells.time) is None:
+        return cells, [], ""
+    dated = cells.time.dtype.kind == "M"
+    stamps = cells.time.astype(np.int64) if dated else cells.time
+    if TIME_STEP not in network.inputs:
+        out, expected = find_out_of_order(stamps), "a time that does not go backwards"
+    else:
+        out, expected = find_astray(stamps, YEAR if dated else YEAR / SECOND), "a time that was set, near the others"
+    if TIME_STEP in cells.inputs or np.mean(out) >= MOST_OUT:
+        return cells, [], ""
+    refused = [
+        fail(f"{source}, row {number}, column {TIME!r}", expected, str(time) if dated else f"{time:.10g}")
+        for number, time in zip(cells.numbers[out].tolist(), cells.time[out], strict=True)
+    ]
+    cells = cells.of(~out)
+    behind = int(np.count_nonzero(cells.time < np.maximum.accumulate(cells.time)))
+    note = f"{source}: rows that came after later ones, used in the order of their times: {behind}" if behind else ""
+    return cells.of(np.argsort(cells.time, kind="stable")), refused, note
+
+
+class KeptRows(NamedTuple):
+    """Rows that a recording has: their numbers in the table, which row each is of, and whether it arrived itself."""
+
+    numbers: np.ndarray
+    of: np.ndarray
+    arrived: np.ndarray
+
+    def fill(self, values: np.ndarray) -> np.ndarray:
+        """Return values of these rows, NaN where one did not arrive."""
+        filled = np.array(values[self.of], dtype=np.float64)
+        filled[~self.arrived] = np.nan
+        return filled
+
+    def fill_times(self, time: np.ndarray) -> np.ndarray:
+        """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
+        between = np.flatnonzero(~self.arrived)
+        filled = np.array(time[self.of])
+        before, after = self.of[between], np.minimum(self.of[between] + 1, len(time) - 1)
+        known = self.numbers[self.arrived]
+        share = np.maximum(self.numbers[between] - known[before], 0) / np.maximum(known[after] - known[before], 1)
+        moved = share * (time[after] - time[before]).astype(np.float64)
+        filled[between] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
+        return filled
+
+
+def keep_rows(numbers: np.ndarray, network: Network) -> KeptRows:
+    """Return the rows of these numbers; where each row is a step also those between them, as the ones before."""
+    if TIME_STEP in network.inputs or not len(numbers):
+        return KeptRows(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
+    steps = np.arange(1, numbers[-1] + 1)
+    before = np.maximum(np.searchsorted(numbers, steps, side="right") - 1, 0)
+    return KeptRows(steps, before, numbers[before] == steps)

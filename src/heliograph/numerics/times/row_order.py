@@ -1,0 +1,59 @@
+"""Order of times: those that fall out of it, and those of a clock that was not set."""
+
+from bisect import bisect_right
+
+import numpy as np
+
+from heliograph.numerics.types import Bool
+
+SECOND = 10**9  # nanoseconds
+YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
+CENTURY = 946_684_800 * SECOND  # 2000-01-01
+
+
+def find_out_of_order(time: np.ndarray) -> Bool[np.ndarray, " rows"]:
+    """Return the mask of the fewest rows without which times do not go backwards; of equally few, the later ones.
+
+    The others are a longest subsequence that does not fall (patience sorting, from the end).
+    """
+    if np.all(time[1:] >= time[:-1]):
+        return np.zeros(len(time), dtype=bool)
+    falling = (-time.astype(np.int64) if time.dtype.kind in "Mi" else -time)[::-1].tolist()
+    tails, last = list[float](), list[int]()  # of each length, the least end of a subsequence, and its row
+    before = list[int]()
+    for row, value in enumerate(falling):
+        length = bisect_right(tails, value)
+        before.append(last[length - 1] if length else -1)
+        tails[length : length + 1], last[length : length + 1] = [value], [row]
+    out = np.ones(len(time), dtype=bool)
+    row = last[-1]
+    while row >= 0:
+        out[len(time) - 1 - row] = False
+        row = before[row]
+    return out
+
+
+def find_astray(time: np.ndarray, year: float = YEAR) -> Bool[np.ndarray, " events"]:
+    """Return the mask of the stamps, in the order of their messages, of a clock that was not set.
+
+    They are more than a year outside of all others, and a stretch of fewer messages than those before and after it,
+    between which is less than a year; or, at the start, of the first year since 1970, where clocks begin to count, and
+    all others are of this century.
+
+    Args:
+        time: the stamps.
+        year: a year in their unit (default nanoseconds).
+    """
+    stretches = np.split(np.arange(len(time)), np.flatnonzero(np.abs(np.diff(time)) > year) + 1)
+    astray = np.zeros(len(time), dtype=bool)
+    for before, one, after in zip(stretches, stretches[1:], stretches[2:], strict=False):
+        returns = abs(int(time[after[0]]) - int(time[before[-1]])) <= year
+        astray[one] = returns and len(one) < len(before) + len(after)
+    first, later = stretches[0], time[len(stretches[0]) :][~astray[len(stretches[0]) :]]
+    astray[first] = (
+        len(later) and later.min() >= CENTURY / YEAR * year and np.all((time[first] >= 0) & (time[first] < year))
+    )
+    if not astray.any():
+        return astray
+    others = time[~astray]
+    return np.asarray(astray & ((time < others.min() - year) | (time > others.max() + year)))
