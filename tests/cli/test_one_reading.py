@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from datetime import datetime
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -299,6 +300,22 @@ def test_where_steps_are_counted_the_fewest_rows_that_go_backwards_did_not_arriv
     assert "log.csv, row 2, column 'time': expected a time that does not go backwards, got 0 after 1" in (
         capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_fewer_steps_than_refused_are_out_of_order(folder, capsys, seed):
+    """Against all subsets of eight rows; what is left does not go backwards."""
+    time = np.random.default_rng(seed).integers(0, 8, 8)
+    (folder / "net.py").write_text(STEPS)
+    (folder / "log.csv").write_text("time,push,y\n" + "".join(f"{t},0,{t}\n" for t in time))
+    subsets = (rows for size in range(9) for rows in combinations(time.tolist(), size))
+    longest = max(len(rows) for rows in subsets if sorted(rows) == list(rows))
+    known = cli.main(["replay", "log.csv", "--network", "net.py"]) == 0
+    assert known == (longest > 4)  # half of them are refused as a whole
+    if known:
+        messages = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        values = [message["values"][0] for message in messages if message["node"] == "a"]
+        assert len(values) == longest and sorted(values) == values
 
 
 REFUSED = {
