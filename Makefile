@@ -55,7 +55,7 @@ clean:  ## Remove the environment and everything made by the other targets
 	rm -rf .venv out docs/_made build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find src studies tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
-# An interpreter of some years comes with a pip that takes half as long again.
+# An interpreter of some years comes with a pip that takes half as long again, and knows no groups (before 25.1).
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 	  { echo "heliograph needs Python 3.11 or newer, and '$(PYTHON)' is older or does not start: try make PYTHON=python3.12" >&2; exit 1; }
@@ -73,12 +73,12 @@ $(CREATED):
 
 .venv/.test: $(CREATED) pyproject.toml constraints.txt
 	@echo "Installing heliograph and its tools into .venv (the first time: a minute or two) ..."
-	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all]'
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[all]' --group dev
 	@touch .venv/.demo $@
 
 .venv/.docs: .venv/.test
 	@echo "Installing what builds the documentation into .venv ..."
-	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all,docs]'
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[all]' --group dev --group docs
 	@touch $@
 
 # The newest of everything on the oldest and on a newer Python. jax, numpy, scipy and zarr have left 3.11 behind,
@@ -87,12 +87,12 @@ constraints:  ## Pin the newest versions in constraints.txt (needs Python 3.11 a
 	@set -e; work=$$(mktemp -d); trap 'rm -rf "$$work"' EXIT; export LC_ALL=C; \
 	for python in $(PYTHONS); do \
 	  "$$python" -m venv "$$work/venv" --clear; \
-	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all,docs]'; \
+	  "$$work/venv/bin/python" $(INSTALL) -e '.[all]' --group dev --group docs; \
 	  "$$work/venv/bin/python" -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==[^ ]+$$' \
 	    | sort > "$$work/$$(echo "$$python" | tr / _).txt"; \
 	done; \
 	set -- $(subst /,_,$(PYTHONS)); old="$$work/$$1.txt"; new="$$work/$$2.txt"; \
-	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all,docs] resolves to.'; \
+	{ echo '# Written by "make constraints": what a fresh install of heliograph[all] and the groups dev and docs resolves to.'; \
 	  { comm -12 "$$old" "$$new"; \
 	    comm -23 "$$old" "$$new" | sed 's/$$/; python_version < "3.12"/'; \
 	    comm -13 "$$old" "$$new" | sed 's/$$/; python_version >= "3.12"/'; } | sort -f; } > constraints.txt

@@ -17,6 +17,8 @@ from heliograph.files.text.dialects import NO_VALUE, check_distinct
 from heliograph.files.text.text_file import kind_of, until_cut_off
 from heliograph.numerics.check import InputError, fail, file_path, show_value, table
 from heliograph.numerics.masked import fill_masked, is_absent
+from heliograph.numerics.process.plugins import FORMATS as FORMATS_OF_OTHERS
+from heliograph.numerics.process.plugins import find_plugin
 from heliograph.numerics.times.dates import MISSING as NAT
 from heliograph.numerics.times.dates import dates, format_dates, looks_like_date, moment_of
 from heliograph.numerics.types import Shaped
@@ -124,7 +126,8 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
     UTC. Dates without a time zone are not converted.
 
     Args:
-        path: the file, ending in .csv or .parquet.
+        path: the file, ending in .csv or .parquet, or in the name of an entry point of the group `heliograph.formats`,
+            which is called with the path and returns columns.
 
     Returns:
         Columns by name, each of shape (rows,).
@@ -143,12 +146,17 @@ def read_rows(path: Path, only: Container[str] | None, strict: bool) -> Rows:
     Raises:
         ValueError: what `read_table` refuses; where reading is not strict, a row alone is none of that.
     """
-    kind = kind_of(path) if kind_of(path) in FORMATS else format_of(path)
+    plugin = None if kind_of(path) in FORMATS else find_plugin(FORMATS_OF_OTHERS, path.suffix.lower().removeprefix("."))
+    kind = kind_of(path) if plugin is not None or kind_of(path) in FORMATS else format_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if path.stat().st_size == 0:
         raise fail(str(path), "a table with a header and rows", "an empty file")
-    rows = _read_csv(path, only, strict) if kind == ".csv" else _read_parquet(path, only)
+    if plugin is not None:
+        columns = columns_of(plugin(path), str(path), only)
+        rows = Rows(columns, np.arange(1, len(next(iter(columns.values()), ())) + 1), [])
+    else:
+        rows = _read_csv(path, only, strict) if kind == ".csv" else _read_parquet(path, only)
     if not len(rows.numbers):
         raise rows.refused[0] if rows.refused else fail(str(path), "at least one row", "none")
     return rows

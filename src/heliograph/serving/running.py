@@ -12,6 +12,7 @@ from typing import Protocol
 from heliograph.live.fleet import Fleet
 from heliograph.live.network_program import NetworkProgram
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.process.plugins import BROKERS, find_plugin
 from heliograph.serving.brokers.line_reader import LineReader, redirected_file
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
@@ -33,12 +34,13 @@ def make_transport(address: Address, part: Part = WHOLE, translator: Translator 
     """Return the transport for one part of the plants through the broker at this address.
 
     Args:
-        address: the broker; its `kind`, mqtt, nats or opc.tcp, selects the protocol.
+        address: the broker; its `kind`, mqtt, nats or opc.tcp, selects the protocol; of any other the entry point of
+            that name in the group `heliograph.brokers`, called with these arguments, makes the transport.
         part: the part of the plants whose messages are read; by default all.
         translator: what reads the topics of others; None reads those of the service alone.
 
     Raises:
-        ValueError: no address, part or translator; an OPC UA server without sources.
+        ValueError: no address, part or translator; an OPC UA server without sources; a broker that no package offers.
     """
     instance("address", address, Address, "an Address")
     instance("part", part, Part, "a Part")
@@ -54,6 +56,12 @@ def make_transport(address: Address, part: Part = WHOLE, translator: Translator 
         from heliograph.serving.brokers.mqtt import Mqtt
 
         return Mqtt(address, part, translator)
+    if address.kind != "nats":
+        make = find_plugin(BROKERS, address.kind)
+        if make is None:
+            raise fail(f"{address}", "mqtt, nats, opc.tcp, or a package that offers the broker", address.kind)
+        transport: Transport = make(address, part, translator)
+        return transport
     from heliograph.serving.brokers.nats import Nats
 
     return Nats(address, part, translator)

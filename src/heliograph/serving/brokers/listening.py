@@ -29,6 +29,8 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
         asyncio.run(Listener(topics).listen(address, seconds))
     elif address.kind == "mqtt":
         _listen_mqtt(address, seconds, topics)
+    elif address.kind != "nats":
+        raise fail(f"broker {address}", "mqtt, nats or opc.tcp, of which topics can be listed", address.kind)
     else:
         asyncio.run(_listen_nats(address, seconds, topics))
     return topics

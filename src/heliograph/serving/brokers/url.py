@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from urllib.parse import unquote, urlsplit
 
 from heliograph.numerics.check import fail, table, text
+from heliograph.numerics.process.plugins import BROKERS, find_plugin
 
 PORTS = {"mqtt": 1883, "mqtts": 8883, "nats": 4222, "nats+tls": 4222, "opc.tcp": 4840}
 SECURE = ("mqtts", "nats+tls")
@@ -20,9 +21,9 @@ class Address:
     """Address of a broker; printed it is the URL without user and password.
 
     Args:
-        kind: "mqtt", "nats" or "opc.tcp".
+        kind: "mqtt", "nats" or "opc.tcp"; of a broker of another package the scheme of its URL.
         host: name or address of the machine.
-        port: port number.
+        port: port number; 0 where the URL has none, of a broker of another package.
         topic: topic under which a service's messages are.
         secure: whether the connection uses TLS.
         user: user name, or token of a NATS server without passwords; None if the broker asks for none.
@@ -61,7 +62,8 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
 
     Args:
         url: SCHEME://user:password@host:port/topic, where SCHEME is `mqtt`, `mqtts`, `nats`, `nats+tls` or `opc.tcp`;
-            only scheme and host are required.
+            only scheme and host are required. A package that offers an entry point of the group
+            `heliograph.brokers` under another scheme makes its transport.
         environment: environment variables; by default those of the process.
 
     Raises:
@@ -76,7 +78,8 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
         host, port = parts.hostname, parts.port
     except ValueError:
         raise fail("broker", shape, "an address that cannot be read") from None
-    if parts.scheme not in PORTS or not host or parts.query or parts.fragment:
+    own = parts.scheme not in PORTS and bool(parts.scheme) and find_plugin(BROKERS, parts.scheme) is not None
+    if (parts.scheme not in PORTS and not own) or not host or parts.query or parts.fragment:
         raise fail("broker", shape, f"{parts.scheme}://{host or ''}")
     user = environment.get(USER) or (unquote(parts.username) if parts.username else None)
     password = environment.get(PASSWORD) or (unquote(parts.password) if parts.password else None)
@@ -87,5 +90,7 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
     topic = unquote(parts.path).strip("/") or TOPIC
     if any(sign in topic for sign in "*>+#.$ ") or not topic.isprintable():
         raise fail("broker, topic", "words between slashes, without . * > + # $ and spaces", topic)
+    if own:
+        return Address(parts.scheme, host, port or 0, topic, False, user, password)
     kind = "mqtt" if parts.scheme.startswith("mqtt") else "nats"
     return Address(kind, host, port or PORTS[parts.scheme], topic, parts.scheme in SECURE, user, password)
