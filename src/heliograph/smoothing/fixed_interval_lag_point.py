@@ -14,6 +14,7 @@ from heliograph.filters.smoother_step import SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
 from heliograph.smoothing.backward_pass import carry_ahead, sweep_back, sweep_means, sweep_over_lag
 
@@ -27,11 +28,17 @@ def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
     """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
-    time = len(steps.mean)
+    return sum_blocks(steps.nis, steps.received)
+
+
+def sum_blocks(nis: Float[Array, " time"], received: Float[Array, " time"]) -> Float[Array, "5"]:
+    """Return `nis_sums` of the squares e' S^-1 e of each step, and of the number of components that arrived."""
+    xp, time = library(nis), len(nis)
     count = min(BLOCKS, time)
     edges = [-(-time * i // count) for i in range(count + 1)]
-    s, h = (jnp.stack([jnp.sum(values[a:b]) for a, b in pairwise(edges)]) for values in (steps.nis, steps.received))
-    return jnp.stack([jnp.sum(values) for values in (s, h, s * s, s * h, h * h)])
+    s, h = (xp.stack([xp.sum(values[a:b]) for a, b in pairwise(edges)]) for values in (nis, received))
+    sums: Array = xp.stack([xp.sum(values) for values in (s, h, s * s, s * h, h * h)])
+    return sums
 
 
 def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:

@@ -14,7 +14,8 @@ from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.smoothing.backward_pass import data_free_smoother_steps, plan_with_past, step_rows
-from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, FixedInterval
+from heliograph.smoothing.chunks import smooth_in_chunks
+from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, FixedInterval, warn_if_inconsistent
 
 
 @readable
@@ -40,8 +41,9 @@ def rts_smoother(
 ) -> Smoothed:
     """Rauch-Tung-Striebel smoother: estimates of every state given all rows, by a pass back over those of a filter.
 
-    The estimates of `filter.run(z, u)` given the later rows too. It warns where the innovations say that the filter is
-    not consistent. Of a whole network: `hg.run(..., smooth=hg.smoothing.FixedInterval())`.
+    The estimates of `filter.run(z, u)` given the later rows too, of many rows in chunks side by side as there. It warns
+    where the innovations say that the filter is not consistent. Of a whole network:
+    `hg.run(..., smooth=hg.smoothing.FixedInterval())`.
 
     Args:
         filter: a filter that can be smoothed; any that keeps a covariance.
@@ -57,8 +59,13 @@ def rts_smoother(
     rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
-    _, steps = step_rows(filter, rows, inputs, filter.init(), np.asarray(0))
-    estimate = FixedInterval().estimates(steps)
+    in_chunks = smooth_in_chunks(filter, rows, inputs)
+    if in_chunks is not None:
+        warn_if_inconsistent("smoothing", in_chunks.sums)
+        estimate = in_chunks.estimate
+    else:
+        _, steps = step_rows(filter, rows, inputs, filter.init(), np.asarray(0))
+        estimate = FixedInterval().estimates(steps)
     return Smoothed(np.asarray(estimate.mean), np.asarray(estimate.covariance), estimate.claim)
 
 

@@ -1,0 +1,139 @@
+"""A long recording smoothed in chunks of rows side by side, where a filter forgets how it began and how it will end.
+
+A chunk is filtered from the state with which it begins (`heliograph.filters.chunks`) over its own rows and as many
+behind them as are forgotten, and passed through backwards from the filtered state there. Of the state between two
+chunks, that by which one of them was entered backwards and the one with which the later one was left have to agree;
+else the earlier one is smoothed again from the latter. What a step leaves for the way back stays in the lanes.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import choose_code
+from heliograph.factors.gaussian import Gaussian
+from heliograph.filters.chunks import (
+    Begun,
+    Recursion,
+    agree,
+    begin_chunks,
+    linear_start,
+    mend_chunks,
+    replace_chunk,
+    scan_chunk,
+    select_state,
+    take,
+    take_windows,
+)
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis, gaussian_of
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.smoothing.fixed_interval_lag_point import sum_blocks
+
+
+class SmoothedRows(NamedTuple):
+    """Smoothed estimates of all rows, and sums over blocks of their squared innovations, as `nis_sums` returns them."""
+
+    estimate: Estimate
+    sums: Float[np.ndarray, "5"]
+
+
+class SmootherRows(Recursion):
+    """A filter over rows (z, u), of each of which its smoother step is kept; `own`: rows of a chunk."""
+
+    filter: Any
+    own: int = eqx.field(static=True)
+
+    def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, SmootherStep]:
+        """Predict and correct."""
+        z, u = row
+        prior = self.filter.predict(state, u, k)
+        after, innovation = self.filter.correct(prior, z, k)
+        trace = StepTrace(state, prior, after, innovation, z, u, jnp.asarray(k))
+        return after, add_nis(self.filter.smoother_step(trace), innovation)
+
+    def predict(self, state: PyTree, row: tuple[Array, Array], k: Array) -> PyTree:
+        """Predict alone."""
+        return self.filter.predict(state, row[1], k)
+
+
+class SmoothedChunk(NamedTuple):
+    """Results of a chunk: the filter's state behind it, the smoothed laws behind it and ahead of it, and its rows."""
+
+    end: PyTree
+    behind: Gaussian
+    ahead: Gaussian
+    estimate: Estimate
+    nis: jax.Array
+    received: jax.Array
+
+
+def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
+    """Smooth rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
+
+    Args:
+        filter: the filter, which can be smoothed.
+        z: measurements (rows, received), NaN for what did not arrive.
+        u: inputs (rows, inputs).
+    """
+    start, rows = linear_start(filter), (np.asarray(z), np.asarray(u))
+    if start is None:
+        return None
+    with jax.enable_x64(True):
+        begun = begin_chunks(SmootherRows(filter, 0), start, rows)
+        return None if begun is None else _smooth_all(SmootherRows(filter, begun.lengths.chunk), begun, rows)
+
+
+def smooth_chunk(
+    recursion: SmootherRows, state: PyTree, rows: PyTree, first: Array, end: Array, later: Gaussian, is_given: Array
+) -> SmoothedChunk:
+    """Smooth a chunk by its rows and those behind it, up to row `end`; backwards from `later` there, if it is given."""
+    own = recursion.own
+    after, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
+    last, behind = scan_chunk(recursion, after, take(rows, slice(own, None)), first + own, end)
+
+    def pass_back(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, None]:
+        step, k = item
+        return select_state(k < end, step.back(law), law), None
+
+    def smooth(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
+        return pass_back(law, item)[0], item[0].estimate_from(law)
+
+    k = first + jnp.arange(len(rows[0]))
+    law = select_state(is_given, later, gaussian_of(last))
+    entered, _ = jax.lax.scan(pass_back, law, (behind, k[own:]), reverse=True)
+    left, estimate = jax.lax.scan(smooth, entered, (steps, k[:own]), reverse=True)
+    return SmoothedChunk(after, entered, left, estimate, steps.nis, steps.received)
+
+
+def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> SmoothedRows | None:
+    """Smooth all chunks, and again those that the one before them, or the one behind them, contradicts."""
+    total, (own, ahead) = len(rows[0]), begun.lengths
+    windows = take_windows(rows, begun.first, own + ahead)
+    ends = np.minimum(begun.first + own + ahead, total)
+
+    def smooth(states: PyTree, which: slice, later: Gaussian | None = None) -> SmoothedChunk | None:
+        first = begun.first[which]
+        end = ends[which] if later is None else first + own
+        laws = gaussian_of(states) if later is None else later
+        arguments = recursion, states, take(windows, which), first, end, laws, np.full(len(first), later is not None)
+        choice = choose_code(smooth_chunk, arguments, [False, *[True] * 6])
+        return None if choice.code is None else choice.results()
+
+    results = smooth(begun.states, slice(None))
+    if results is None:
+        return None
+    mend_chunks(smooth, begun.states, lambda results: results.end, results)
+    # The states with which chunks begin are those in which the ones before them end.
+    wrong = ~agree(take(results.behind, slice(None, -1)), take(results.ahead, slice(1, None)))
+    for c in range(len(wrong) - 1, -1, -1):
+        if wrong[c]:
+            here, law = slice(c, c + 1), take(results.ahead, slice(c + 1, c + 2))
+            state = take(results.end, slice(c - 1, c)) if c else take(begun.states, here)
+            replace_chunk(results, here, smooth(state, here, law))
+            wrong[c - 1] = c and not agree(take(results.behind, slice(c - 1, c)), take(results.ahead, here))[0]
+    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], results[3:])
+    return SmoothedRows(estimate, np.asarray(sum_blocks(nis, received)))
