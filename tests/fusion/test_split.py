@@ -62,6 +62,27 @@ def test_with_all_known_it_is_matrix_weights_and_with_nothing_known_intersection
     assert np.trace(nothing.covariance) == pytest.approx(np.trace(intersected.covariance), rel=1e-3)
 
 
+def test_an_unknown_part_that_is_rounding_of_a_known_one_leaves_a_bound():
+    """Known parts of 10^21 and unknown ones of 10^5, their rounding, which small shares divide: no claim below 0.
+
+    W (P^a + P^b) W' of independent unknown parts is below what is claimed, to 1e-9 of it.
+    """
+    draw, shared = np.random.default_rng(0), np.array([[1e21, 3e20], [3e20, 2e21]])
+    for _ in range(20):
+        known = np.tile(shared[None, :, None, :], (3, 1, 3, 1)) + 0.0
+        known = known + 1e16 * np.eye(6).reshape(3, 2, 3, 2)
+        root = draw.normal(size=(3, 2, 2)) * np.exp(draw.uniform(2, 8, size=(3, 1, 1)))
+        unknown = root @ np.swapaxes(root, 1, 2)
+        given = estimates(known, unknown)
+        fused = hg.fusion.fuse(hg.fusion.SplitIntersection(known), given)
+        weights = gain(hg.fusion.SplitIntersection(known), given)
+        joint = known + np.einsum("ij,iab->iajb", np.eye(3), unknown)
+        true = np.einsum("aib,ibjc,djc->ad", weights, joint, weights)
+        claimed = np.asarray(fused.covariance)
+        unit = np.sqrt(np.diagonal(claimed))
+        assert np.linalg.eigvalsh((claimed - true) / np.outer(unit, unit))[0] > -1e-9
+
+
 def test_what_is_no_split_is_refused():
     known, unknown = parts(3)
     rule = hg.fusion.SplitIntersection(known)

@@ -13,7 +13,6 @@ import numpy as np
 from jax import lax
 
 from heliograph.factors.columns import (
-    UNITS,
     Columns,
     below_diagonal,
     decorrelate,
@@ -27,8 +26,13 @@ from heliograph.factors.columns import (
     unit_of,
     zero_covariance,
 )
-from heliograph.factors.repeated import noise_beside_rounding, rounding_of_slopes, triangularise_noise
-from heliograph.factors.scalar_update import measure_parts, measure_product, revise_columns
+from heliograph.factors.repeated import (
+    noise_beside_rounding,
+    rounding_of_products,
+    rounding_of_slopes,
+    triangularise_noise,
+)
+from heliograph.factors.scalar_update import carry_rounding, measure_parts, measure_product, revise_columns
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Float
@@ -217,6 +221,7 @@ def condition_on_observation(
         values.append(-news[n + i])
         totals.append(total)
         news = news + gain * values[i]
+        least = carry_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
     after = Gaussian(news[:n], below_diagonal(root[:n]), d)
     return after, Innovations(_stack_numbers(values), _stack_numbers(totals), whole)
 
@@ -231,10 +236,12 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: Columns) -> jax.Array:
     weights = jnp.asarray(noise.weights)
     least = rounding_of_slopes(n, noise.matrix, slopes**2 @ x.variances + noise.matrix**2 @ weights)
 
-    def measure_part(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return _measure_row(root, d, root[n + i], weights[i], least[i])[:3]
+    def measure_part(
+        i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        return _measure_row(root, d, root[n + i], weights[i], rounding)[:3]
 
-    *_, gains = measure_parts(measure_part, len(rows), jnp.concatenate([x.root, rows]), x.variances)
+    *_, gains = measure_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
     entering = unit_lower(below_diagonal(gains[n:]))
     return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
 
@@ -317,27 +324,29 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
 
     (x, x+) has the factors [[L_x, 0], [slopes, N]] and (d, r). Each part of x+, without a noise but omega, is measured:
     its innovation, given those before it, is a part of e, its gain a column of K and, of the parts to come, of L. Where
-    those before it determine a part, its slopes are the rounding of n^3 products, UNITS eps each, and count as zero.
+    those before it determine a part, its slopes are rounding, that of all that was taken from them, and count as zero.
 
     Shapes: slopes (n, n); noise N (n, n), unit lower, as `triangularise` makes it, and r (n,).
     """
     n, root = len(x.mean), jnp.concatenate([x.root, slopes])
     whole = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
-    rounding = (UNITS * n**3 * unit_of(slopes)) ** 2 * whole
+    least = rounding_of_products(n, whole)
     beside, weights = jnp.concatenate([jnp.zeros((n, n), slopes.dtype), noise.matrix]), jnp.asarray(noise.weights)
 
-    def measure_part(i: int | jax.Array, root: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def measure_part(
+        i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         # Of omega, part i has its own component left, and determines it: those before it are determined.
         f, own, r = root[n + i], beside[:, i], weights[i]
         product = d * f
         power = f * product
-        says = jnp.sum(power) > rounding[i]
+        says = jnp.sum(power) > rounding
         products = jnp.append(jnp.where(says, product, 0.0), r), jnp.append(jnp.where(says, power, 0.0), r)
         rows = jnp.concatenate([root, own[:, None]], axis=1)
         rows, d, gain, _ = measure_product(rows, jnp.append(d, r), jnp.append(f, 1.0), products, jnp.zeros_like(r))
         return rows[:, :n], d[:n], gain
 
-    root, d, gains = measure_parts(measure_part, n, root, x.variances)
+    root, d, gains = measure_parts(measure_part, root, x.variances, least)
     left = Gaussian(x.mean, below_diagonal(root[:n]), d)
     return BackwardGain(left, gains[:n], ahead, below_diagonal(gains[n:]))
 

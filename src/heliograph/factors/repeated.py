@@ -37,16 +37,20 @@ def triangularise_noise(noise: Columns) -> Columns:
     return (_triangularise_in_loop if len(matrix) > WRITTEN else _triangularise_row_by_row)(matrix, weights)
 
 
+def rounding_of_products(n: int, variance: jax.Array) -> jax.Array:
+    """Return the variance by the rounding of n slopes, each a sum of n products, of rows of these variances."""
+    rounding: jax.Array = (UNITS * n * unit_of(variance)) ** 2 * variance
+    return rounding
+
+
 def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     """Variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding, of rows of variances `whole`.
 
     UNITS n eps of each s_i, from which measuring takes what was known, and RANK of what is subtracted: a correlation of
     noises is not known to more.
     """
-    own = UNITS * n * unit_of(whole)
-    below = jnp.tril(lower, -1)
-    least: jax.Array = own**2 * whole + max(own, RANK) ** 2 * (below**2 @ whole)
-    return least
+    share, below = max(UNITS * n * unit_of(whole), RANK), jnp.tril(lower, -1)
+    return rounding_of_products(n, whole) + share**2 * (below**2 @ whole)
 
 
 def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:

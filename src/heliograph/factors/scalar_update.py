@@ -57,20 +57,41 @@ def revise_columns(
 
 
 def measure_parts(
-    measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]], n: int, root: jax.Array, d: jax.Array
+    measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]],
+    root: jax.Array,
+    d: jax.Array,
+    least: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Measure n parts one by one, many of them in a loop: rows, variances d and gains (rows, n) after them."""
-    gains = list[jax.Array]()
+    """Measure n parts one by one, many of them in a loop: rows, variances d and gains (rows, n) after them.
+
+    Args:
+        measure_part: from the part's number, rows, variances and its entry of `least` to rows, variances and its gain.
+        root: rows of x, and below them those of the n parts.
+        d: variances of the columns.
+        least: variance (n,) up to which a part's slopes are rounding (`carry_rounding`).
+    """
+    n, gains = len(least), list[jax.Array]()
+    first = len(root) - n
     if n > WRITTEN:
 
         def body(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            root, d, gain = measure_part(i, *carry[:2])
-            return root, d, jnp.where(np.arange(n) == i, gain[:, None], carry[2])
+            root, d, least, gains = carry
+            root, d, gain = measure_part(i, root, d, least[i])
+            gains = jnp.where(np.arange(n) == i, gain[:, None], gains)
+            return root, d, carry_rounding(least, gain[first:], least[i]), gains
 
-        start = root, d, jnp.zeros((len(root), n), root.dtype)
-        looped: tuple[jax.Array, jax.Array, jax.Array] = lax.fori_loop(0, n, body, start)
-        return looped
+        root, d, _, looped = lax.fori_loop(0, n, body, (root, d, least, jnp.zeros((len(root), n), root.dtype)))
+        return root, d, looped
     for i in range(n):
-        root, d, gain = measure_part(i, root, d)
+        root, d, gain = measure_part(i, root, d, least[i])
+        least = carry_rounding(least, gain[first:], least[i])
         gains.append(lax.expand_dims(gain, (1,)))
     return root, d, lax.concatenate(gains, 1)
+
+
+def carry_rounding(least: jax.Array, gain: jax.Array, measured: jax.Array) -> jax.Array:
+    """Return the rounding (m,) of the slopes of parts from which a measured one is taken, times its gain (m,).
+
+    Slopes become f_j - gain_j f_i: what rounding left of f_i, of a variance `measured`, is in those of all others.
+    """
+    return least + gain**2 * measured

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import UNITS, unit_of
 from heliograph.fusion.joint_covariance_weights import matrix_weights, weigh_covariance
 from heliograph.fusion.rules import AbstractIntersection, Covariances, Fused, Means
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank
@@ -65,7 +66,7 @@ class SplitIntersection(AbstractIntersection):
         known = jnp.asarray(self.known)
         count = len(means)
         items = jnp.arange(count)
-        unknown = covariances - known[items, :, items, :]
+        unknown = _add_rounding(covariances - known[items, :, items, :], covariances)
 
         # P(w), and shares in proportion to root(tr W_i P^b_i W_i').
         def above(shares: jax.Array) -> jax.Array:
@@ -85,3 +86,14 @@ class SplitIntersection(AbstractIntersection):
         sound = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))
         mean, covariance = jnp.einsum("aib,ib->a", weights, means), weigh_covariance(weights, joint)
         return mean, jnp.where(sound, covariance, jnp.nan)
+
+
+def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:
+    """Return parts P^b_i = P_i - P^a_ii with the rounding of P_i, of which they are known; one that is 0 stays so.
+
+    A share may be small: divided by it, an eps of P_i that is missing would be much of the bound.
+    """
+    n = unknown.shape[-1]
+    rounding = UNITS * n * unit_of(covariances) * jnp.einsum("aii->ai", covariances)
+    there = jnp.any(unknown != 0, axis=(-1, -2), keepdims=True)
+    return unknown + jnp.where(there, rounding[..., None] * jnp.eye(n, dtype=unknown.dtype), 0.0)

@@ -79,7 +79,7 @@ def test_errors_and_innovations_across_a_full_turn_are_judged_by_the_shorter_way
     mean = truth + rng.normal(size=truth.shape) * [0.1, 1.0]
     truth[:, 0], mean[:, 0] = (np.angle(np.exp(1j * heading)) for heading in (truth[:, 0], mean[:, 0]))
     claimed = np.diag([0.01, 1.0])
-    plant = hg.Plant(lambda x: x, np.eye(2), [0.0, 0.0], np.eye(2), states=["heading", "x"], circular=["heading"])
+    plant = hg.Plant(lambda x, u: x, np.eye(2), [0.0, 0.0], np.eye(2), states=["heading", "x"], circular=["heading"])
     sensor = hg.Sensor(lambda x: x, np.eye(2), outputs=["heading", "x"], circular=["heading"])
     assert not hg.consistency(hg.nees(truth, mean, claimed), 2).consistent
     for values in (
