@@ -123,7 +123,7 @@ def run(
 
 
 def change_settings(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
-    """A study's settings with other values; an option that it has no setting for is called by its name.
+    """Return a study's settings with other values; an option that it has no setting for is called by its name.
 
     Raises:
         ValueError: no such setting, or a value that is none.

@@ -259,7 +259,7 @@ def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
 
 
 def unit_of(numbers: Array) -> float:
-    """Eps of the precision in which these numbers are computed."""
+    """Return eps of the precision in which these numbers are computed."""
     return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(_precision.get()).eps))
 
 

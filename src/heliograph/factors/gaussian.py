@@ -149,7 +149,7 @@ def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Columns)
 
 
 def take_leading(x: Gaussian, n: int) -> Gaussian:
-    """Marginal Gaussian of the first n components: the first rows of L."""
+    """Return the marginal Gaussian of the first n components: the first rows of L."""
     return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
 
 

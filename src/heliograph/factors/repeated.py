@@ -62,7 +62,7 @@ def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
 
 
 def _clear(numbers: jax.Array, least: jax.Array) -> jax.Array:
-    """Numbers, and zero where they are no larger than `least`; NaN stays."""
+    """Return numbers, and zero where they are no larger than `least`; NaN stays."""
     return jnp.where(jnp.abs(numbers) <= least, 0.0, numbers)
 
 

@@ -135,7 +135,7 @@ def targets_of(origin: Origin) -> list[Target]:
 
 
 def _entry(stacked: PyTree, place: int) -> PyTree:
-    """One of the states of filters that are stacked."""
+    """Return one of the states of filters that are stacked."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[place], stacked)
 
 

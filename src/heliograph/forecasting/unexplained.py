@@ -164,7 +164,7 @@ def _autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
 
 
 def _test_correlation(e: np.ndarray, lags: int) -> float:
-    """P-value of n (n + 2) sum r_l^2 / n_l, n_l pairs of lag l, which is chi-squared."""
+    """Return the P-value of n (n + 2) sum r_l^2 / n_l, n_l pairs of lag l, which is chi-squared."""
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:
         return float("nan")
@@ -173,7 +173,7 @@ def _test_correlation(e: np.ndarray, lags: int) -> float:
 
 
 def _test_normality(e: np.ndarray) -> float:
-    """P-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis."""
+    """Return the P-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis."""
     came = e[~np.isnan(e)]
     if len(came) < LEAST:
         return float("nan")
@@ -182,7 +182,7 @@ def _test_normality(e: np.ndarray) -> float:
 
 
 def _test_same_variance(e: np.ndarray) -> float:
-    """P-value, of both sides, of the ratio of the sums of squares in the last and in the first third."""
+    """Return P-value, of both sides, of the ratio of the sums of squares in the last and in the first third."""
     came = e[~np.isnan(e)]
     h = len(came) // 3
     if h < LEAST // 2:

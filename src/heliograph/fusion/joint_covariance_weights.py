@@ -198,5 +198,5 @@ def weigh_covariance_by_component(
 def solve_regularised_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """One number for each of those that are present, of least trace."""
+    """Return one number for each of those that are present, of least trace."""
     return _weigh_by_trace(partial(solve_regularised_weights, present=present), joint)

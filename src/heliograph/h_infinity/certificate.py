@@ -234,7 +234,7 @@ def _add_growth(
 def _drop_absent(
     phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
 ) -> Float[np.ndarray, "kept kept"]:
-    """Phi without f and f~, or h and h~, where the function is zero throughout."""
+    """Return Phi without f and f~, or h and h~, where the function is zero throughout."""
     stored = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
         if growth.absent:

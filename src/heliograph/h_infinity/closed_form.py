@@ -75,7 +75,7 @@ def _compute_best_gain(
     level: float,
     multipliers: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n n"]] | None:
-    """K* and P2+ = (E S E' - K* U S E')^-1, or None where Q is not positive."""
+    """Return K* and P2+ = (E S E' - K* U S E')^-1, or None where Q is not positive."""
     errors = slice(system.states, 2 * system.states)
     grows = [not growth.absent for growth in (system.growth, system.output_growth)]
     # S^-1 over (e, f~, h~, v, rho): Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I of e, then the multipliers

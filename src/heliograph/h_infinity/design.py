@@ -259,7 +259,7 @@ def _checked_weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 def _inequality_holds(
     step: StepMatrices, unknowns: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float
 ) -> bool:
-    """Feasibility of one step: P1, P2 > 0, and the inequality with Z = K'P2 K itself strictly negative."""
+    """Return whether one step is feasible: P1, P2 > 0, and the inequality with Z = K'P2 K itself strictly negative."""
     gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, spread=gain.T @ unknowns.error @ gain)
     positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0

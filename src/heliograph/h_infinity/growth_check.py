@@ -207,7 +207,7 @@ class _SlopesAndRatios:
         return np.where(finite, np.linalg.norm(safe, 2, axis=(-2, -1)), np.inf)
 
     def steepest(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
-        """Unit direction in which the function changes most."""
+        """Return the unit direction in which the function changes most."""
         return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
 
     def ratio(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:

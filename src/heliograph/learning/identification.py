@@ -106,7 +106,7 @@ def identify_by_recording(surface: Surface, start: Float[np.ndarray, " p"], seed
 
 
 def _choose_points(start: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Three points at which to look: a start, and two drawn near it."""
+    """Return three points at which to look: a start, and two drawn near it."""
     rng = np.random.default_rng([seed, 1])
     return [
         start + rng.uniform(-AROUND, AROUND, len(start)) * np.minimum(1.0, 0.2 + np.abs(start)) for _ in range(POINTS)
@@ -139,7 +139,7 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
 
 
 def _describe_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
-    """One sentence on a group of confounded numbers: which sums or products of them the data do tell."""
+    """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell."""
     names = [parameters.coordinates[i] for i in group.places]
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
     # products or sums that are identified, each with its interval

@@ -205,7 +205,7 @@ class Solution:
         return self._tables[key]
 
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
-        """One row for each entry: at a boundary, not identified, or with an interval by this method."""
+        """Return one row for each entry: at a boundary, not identified, or with an interval by this method."""
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
         values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
         rows = []

@@ -50,7 +50,7 @@ def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.
 
 
 def covariance_step(root: Float[np.ndarray, "N _"], s: Steps, noises: NoiseRoots) -> RecursionStep:
-    """P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
+    """Return P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
 
     O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
     """

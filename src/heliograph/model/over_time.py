@@ -150,7 +150,7 @@ def stacked(model: PyTree) -> PyTree:
 
 
 def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
-    """function(*items), or an `OverTime` of its results where some item varies."""
+    """Return function(*items), or an `OverTime` of its results where some item varies."""
     steps = steps_covered(items)
     return function(*items) if steps is None else over_time([function(*at(items, k)) for k in range(steps)])
 

@@ -45,7 +45,7 @@ class OfInputs(Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """M(u)."""
+        """Return M(u)."""
         return as_real(self.function(u))
 
     def _refuse(self, *_: object, **__: object) -> NoReturn:

@@ -202,7 +202,7 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np
 
 
 def _repeat_over_steps(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
-    """One array of a plant or sensor for each step."""
+    """Return one array of a plant or sensor for each step."""
     value = np.asarray(read(stacked(model)), dtype=np.float64)
     if value.ndim == dimensions + 1:
         return value[:horizon]

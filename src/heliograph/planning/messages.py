@@ -299,7 +299,7 @@ def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
 
 
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights of parts of a line, each cut to lengths of at most 8 units."""
+    """Return Gauss-Legendre nodes and weights of parts of a line, each cut to lengths of at most 8 units."""
     x, w = np.polynomial.legendre.leggauss(NODES)
     parts = []
     for a, b in pairwise(edges):

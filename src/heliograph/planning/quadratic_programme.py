@@ -88,7 +88,7 @@ class Programme:
         return float(now.powers.sum()) / scale, now.power_slope.sum(axis=0) * self.problem.unit / scale
 
     def room(self, z: Vector) -> Float[np.ndarray, "limits"]:
-        """Remainder of each limit, as a part of it; of the target last."""
+        """Return the remainder of each limit, as a part of it; of the target last."""
         rows, most, target, _ = self.limits
         now = self.at(z)
         if now is None:
@@ -114,7 +114,7 @@ class Programme:
         return self.value(z)[0] if self.feasible(z) else np.inf
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
-        """Point where a sequential quadratic programme ends, or the start where that is better."""
+        """Return the point where a sequential quadratic programme ends, or the start where that is better."""
         constraints = [NonlinearConstraint(self.room, 0.0, np.inf, self.room_slope)] if len(self.room(z)) else []
         before = self.merit(z)
         end = self._minimize(self.value, z, constraints, tolerance)
@@ -143,7 +143,7 @@ class Programme:
         return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
 
     def polish(self, z: Vector) -> Vector:
-        """Newton's method on the active limits, as long as the Lagrangian's exact penalty does not rise."""
+        """Take Newton's steps on the active limits, as long as the Lagrangian's exact penalty does not rise."""
         for _ in range(ROUNDS):
             newton = self._solve_newton_step(z)
             if newton is None:
@@ -161,7 +161,7 @@ class Programme:
         return z
 
     def _penalty(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
-        """Value and, weighed by the multipliers, the excess over the active limits."""
+        """Return the value and, weighed by the multipliers, the excess over the active limits."""
         excess = np.maximum(-self.room(z), 0.0)
         return float(self.value(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
 

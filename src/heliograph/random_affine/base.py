@@ -379,7 +379,7 @@ class AbstractModal(AbstractWithMemory, AbstractRandomAffine):
         return "" if self.memory.name is None else f"{self.memory.name!r}: "
 
     def degree_in(self, identity: str) -> int:
-        """One in its own memory."""
+        """Return one in its own memory."""
         return int(self.memory.identity == identity)
 
 

@@ -246,7 +246,7 @@ class Autoregression(AbstractMemory):
         return rho * state + jnp.sqrt(1 - rho**2) * jax.random.normal(key, dtype=float)
 
     def nodes(self, degree: int) -> Nodes:
-        """Gauss-Hermite nodes: the Lagrange polynomials on them take the place of the indicators of modes.
+        """Return Gauss-Hermite nodes: the Lagrange polynomials on them take the place of the indicators of modes.
 
         With N = degree + 1 nodes x and weights w, E[L_j(c+) | c = x_i] = sum_{m < N} rho^m h_m(x_i) h_m(x_j) w_j, h_m
         the normalised Hermite polynomials. Expectations of polynomials of degree 2 N - 1 are exact; for a degree of 1
@@ -307,7 +307,7 @@ def _compute_binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarr
 
 @cache_arrays
 def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
+    """Return Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
     x, w = hermegauss(count)
     scale = np.sqrt([float(factorial(m)) for m in range(count)])
     return x, w / np.sqrt(2 * np.pi), hermevander(x, count - 1) / scale

@@ -253,7 +253,7 @@ class Stack(AbstractCombination):
         return [m for affine in self.maps for m in affine.in_parallel]
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """A stack of maps that are covered one by one."""
+        """Return a stack of maps that are covered one by one."""
         return self.covers_maps(own, same_noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:

@@ -178,7 +178,7 @@ def _list_delays(delay: Delay) -> tuple[int, ...]:
 
 
 def _make_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
-    """S_d, which selects the signal of d steps ago from the line, and below it the number d if time stamped."""
+    """Return S_d, which selects the signal of d steps ago from the line, and below it the number d if time stamped."""
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:
         return known(rows)

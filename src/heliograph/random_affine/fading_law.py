@@ -34,7 +34,7 @@ class Rayleigh(AbstractLaw):
         return np.asarray(np.sqrt(-2 * np.log1p(-probability)) * float(self.scale))
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """log(g) - g^2 / (2 scale^2)."""
+        """Return log(g) - g^2 / (2 scale^2)."""
         return jnp.log(g) - jnp.square(g / self.scale) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
@@ -69,7 +69,7 @@ class Rician(AbstractLaw):
         )
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)), x = g sight / scale^2."""
+        """Return log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)), x = g sight / scale^2."""
         sight, scale = jnp.asarray(self.sight), jnp.asarray(self.scale)
         bessel = jax.scipy.special.i0e(g * sight / scale**2)
         return jnp.log(g) - jnp.square((g - sight) / scale) / 2 + jnp.log(bessel)
@@ -80,7 +80,7 @@ class Rician(AbstractLaw):
 
 
 def _evaluate_laguerre(order: int, x: Scalar) -> Scalar:
-    """L_(order/2)(-x) = 1F1(-order/2; 1; -x) for x >= 0, by (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1).
+    """Return L_(order/2)(-x) = 1F1(-order/2; 1; -x) for x >= 0, by (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1).
 
     Even orders are polynomials, from L_0 = 1; odd ones start from exponentially scaled Bessel functions,
     L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) = e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the

@@ -144,7 +144,7 @@ class GainAndNoise(AbstractHop):
         return sum(low for low, _ in products), sum(high for _, high in products)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """A hop of this matrix whose gain has a law that is believed possible."""
+        """Return a hop of this matrix whose gain has a law that is believed possible."""
         if not isinstance(own, GainAndNoise) or not self.law.covers(own.law):
             return False
         return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)

@@ -160,7 +160,7 @@ class Discrete(AbstractLaw):
         return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
 
     def covers(self, own: AbstractLaw) -> bool:
-        """A law of the same values whose probabilities stay within the radius."""
+        """Return a law of the same values whose probabilities stay within the radius."""
         if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
             return same(self, own)
         return within(own.probabilities, own.radius, self.probabilities, self.radius)

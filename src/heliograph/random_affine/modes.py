@@ -65,7 +65,7 @@ class Modes(AbstractUniform, AbstractModal):
         return present
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Modes of a chain that is believed possible, with maps that are covered one by one."""
+        """Return modes of a chain that is believed possible, with maps that are covered one by one."""
         if not isinstance(own, Modes) or not self.memory.covers(own.memory) or len(own.maps) != len(self.maps):
             return False
         return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
@@ -279,7 +279,7 @@ def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffin
 
 
 def mix_maps(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
-    """One of the modes' maps, by a law (that of the long run unless given)."""
+    """Return one of the modes' maps, by a law (that of the long run unless given)."""
     in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
     return Mixture(modes.maps, in_the_long_run / in_the_long_run.sum() if law is None else law)
 

@@ -140,7 +140,7 @@ class Gaussian(AbstractNoise):
         return True
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """One atom, the mean, with the covariance about it."""
+        """Return one atom, the mean, with the covariance about it."""
         return [NoiseAtom(1.0, self.mean, self.covariance)]
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:

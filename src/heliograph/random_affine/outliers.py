@@ -72,7 +72,7 @@ class StudentT(AbstractNoise):
         return True
 
     def branches(self) -> Branches:
-        """One for each of the PRECISIONS."""
+        """Return one for each of the PRECISIONS."""
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
         shares = xp.broadcast_to(_take_log(precision_shares(self.degrees)), shape)

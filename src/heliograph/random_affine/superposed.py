@@ -135,11 +135,11 @@ class Superposed(AbstractCombination):
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """That of the sum of a stack."""
+        """Return that of the sum of a stack."""
         return self.as_stack.moment_interval(order)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """A sum at the same places with such a noise, of maps that are covered one by one."""
+        """Return a sum at the same places with such a noise, of maps that are covered one by one."""
         if not isinstance(own, Superposed) or own.places != self.places or not same_noise(self.noise, own.noise):
             return False
         return self.covers_maps(own, same_noise)

@@ -271,7 +271,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Block matrices of the relays' gains, zero for the receiver."""
+    """Return the block matrices of the relays' gains, zero for the receiver."""
     gains = table("relay gains", gains, "arrays")
     missing = [name for name in network.relays if name not in gains]
     if missing or not network.relays:

@@ -116,7 +116,7 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
 
 
 def regression_gain(cross: Float[jax.Array, "n m"], received: Float[jax.Array, "m m"]) -> Float[jax.Array, "n m"]:
-    """K = Cov(e, i) Cov(i)^-1, which minimises tr Cov(e - K i); zero for what other innovations determine."""
+    """Return K = Cov(e, i) Cov(i)^-1, which minimises tr Cov(e - K i); zero for what other innovations determine."""
     return psd_solve(received, cross.T).T
 
 
@@ -194,7 +194,7 @@ def gain_hessian(
 def best_gain(
     predicted: Float[Array, "z z"], ahead: Float[Array, "d d"], old: Float[Array, "Fn R"], step: RelaySteps
 ) -> Float[jax.Array, "Fn R"]:
-    """argmin over gains K of tr Lam [I -(0; K)] Z [I -(0; K)]', nearly; all filters together.
+    """Return argmin over gains K of tr Lam [I -(0; K)] Z [I -(0; K)]', nearly; all filters together.
 
     (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab for each free entry ab: a linear system of the size of the gains.
     """

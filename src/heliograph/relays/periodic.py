@@ -341,7 +341,7 @@ def _penalise(
 
 
 def _make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
-    """Value, gradient and power of a cost given by its traces, soundness and power."""
+    """Return the value, gradient and power of a cost given by its traces, soundness and power."""
 
     def evaluate(
         x: Array,

@@ -171,7 +171,7 @@ def _compute_cost_with_barrier(
 def _evaluate_barrier(
     problem: Limited, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
-    """`_compute_cost_with_barrier` of all variables in one vector."""
+    """Return `_compute_cost_with_barrier` of all variables in one vector."""
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
 

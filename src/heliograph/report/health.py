@@ -219,7 +219,7 @@ def _say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]
 
 
 def _say_memory(name: str, test: MemoryTest) -> str:
-    """The sentence on innovations that are correlated in time."""
+    """Return the sentence on innovations that are correlated in time."""
     return (
         f"{name} could know more: each of its innovations is correlated with the one before "
         f"({test.correlation[0]:.2f}); "

@@ -161,7 +161,7 @@ class _Job(Module):
 
 
 def _run_chunks(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
-    """Sums over all runs, and what is collected of them, chunk by chunk."""
+    """Return the sums over all runs, and what is collected of them, chunk by chunk."""
     with jax.enable_x64(True):
         lanes = RunLanes(
             lambda blocks, carry: _lane((job, blocks), carry),
@@ -210,7 +210,7 @@ def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTr
 
 
 def _simulate_block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
-    """Sums by batch of one block of runs and flags likewise, and what is collected, (run, time, ...)."""
+    """Return the sums by batch of one block of runs and flags likewise, and what is collected, (run, time, ...)."""
     recorded = _reduced(job.reducer, job.later, _simulate_outputs(job, runs))
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 

@@ -128,7 +128,7 @@ def _smoothed_means(planned: PlannedSmoother, z: Array) -> jax.Array:
 
 @compile_on_call
 def _plan_or_none(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
-    """Planned filter with its smoother steps; None where gains depend on data."""
+    """Return the planned filter with its smoother steps; None where gains depend on data."""
     planned = plan_with_past(filter, u)
     return None if planned is filter else planned
 

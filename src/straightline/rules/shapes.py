@@ -78,7 +78,7 @@ def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
 
 
 def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
-    """One of several arrays, the first for numbers below 0 and the last for numbers beyond."""
+    """Return one of several arrays, the first for numbers below 0 and the last for numbers beyond."""
     from straightline.rules.elementwise import select
 
     selected = cases[-1]

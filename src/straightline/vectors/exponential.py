@@ -59,7 +59,7 @@ def format_of(x: Vector) -> Format:
 
 
 def exp(x: Vector) -> Vector:
-    """e^x = 2^n e^r, r = x - n ln 2."""
+    """Return e^x = 2^n e^r, r = x - n ln 2."""
     form = format_of(x)
     count, n = nearest(x * LOG2_E)
     r = fma(n, -form.ln2[1], fma(n, -form.ln2[0], x))
@@ -67,7 +67,7 @@ def exp(x: Vector) -> Vector:
 
 
 def exp_of_sum(x: Vector, low: Vector) -> Vector:
-    """e^(x + low), |low| small against 1, within 0.6 units of rounding: 1 + r as a sum of two numbers."""
+    """Return e^(x + low), |low| small against 1, within 0.6 units of rounding: 1 + r as a sum of two numbers."""
     form = format_of(x)
     count, n = nearest(x * LOG2_E)
     first, rest = _reduce_argument(x, n)
@@ -79,7 +79,7 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
 
 
 def expm1(x: Vector) -> Vector:
-    """e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
+    """Return e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
     form = format_of(x)
     count, n = nearest(select(x < -50.0, -50.0, x) * LOG2_E)
     r, low = _reduce_argument(select(x < -50.0, -50.0, x), n)
@@ -91,7 +91,7 @@ def expm1(x: Vector) -> Vector:
 
 
 def log(x: Vector) -> Vector:
-    """log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
+    """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
     form = format_of(x)
     small, lifted = x < form.tiny, form.fraction + 2
     k, m = _split_exponent(select(small, x * 2.0**lifted, x))
@@ -100,7 +100,7 @@ def log(x: Vector) -> Vector:
 
 
 def log1p(x: Vector) -> Vector:
-    """log(1 + x) = log(u) + log((1 + x) / u), u = 1 + x as rounded."""
+    """Return log(1 + x) = log(u) + log((1 + x) / u), u = 1 + x as rounded."""
     u = 1 + x
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
     k, m = _split_exponent(u)
@@ -109,7 +109,7 @@ def log1p(x: Vector) -> Vector:
 
 
 def tanh(x: Vector) -> Vector:
-    """-t / (2 + t), t = e^(-2|x|) - 1; beyond 1/2, 1 - 2 / (2 + t), t = e^(2|x|) - 1."""
+    """Return -t / (2 + t), t = e^(-2|x|) - 1; beyond 1/2, 1 - 2 / (2 + t), t = e^(2|x|) - 1."""
     size = abs(x)
     large = size > 0.5
     t = expm1(select(large, 2 * size, -2 * size))

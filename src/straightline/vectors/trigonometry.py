@@ -51,7 +51,7 @@ TURNS = [
 
 
 def sin(x: Vector) -> Vector:
-    """Sine: that or the cosine of what is left of x beyond the nearest multiple of pi / 2."""
+    """Return the sine: that or the cosine of what is left of x beyond the nearest multiple of pi / 2."""
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
     value = select((quarter & 2).equals(0), value, -value)
@@ -59,7 +59,7 @@ def sin(x: Vector) -> Vector:
 
 
 def cos(x: Vector) -> Vector:
-    """Cosine: the sine a quarter further."""
+    """Return the cosine: the sine a quarter further."""
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
     value = select(((quarter + 1) & 2).equals(0), value, -value)
@@ -108,7 +108,7 @@ def _of_any_size(x: Vector, value: Vector, name: str) -> Vector:
 
 
 def atan(x: Vector) -> Vector:
-    """Arcus tangent: a known angle and that of (x - tan angle) / (1 + x tan angle)."""
+    """Return the arcus tangent: a known angle and that of (x - tan angle) / (1 + x tan angle)."""
     return copy_sign(_atan_of_positive(abs(x)), x)
 
 

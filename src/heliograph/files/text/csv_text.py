@@ -131,7 +131,7 @@ def csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
 
 
 def read_csv_header(path: Path) -> list[str]:
-    """Names of the columns of a CSV file; none of a file that is none."""
+    """Return the names of the columns of a CSV file; none of a file that is none."""
     text = CsvText(str(path), path, marked=True)
     try:
         with open_text(path) as file:

@@ -161,7 +161,7 @@ def _variational_update(
     rule: AbstractWeights | None,
     law: NoiseBranches | None,
 ) -> VariationalUpdate:
-    """One step of variational Bayes: alternate x given R = b / a and b given x, `ITERATIONS` times.
+    """Do one step of variational Bayes: alternate x given R = b / a and b given x, `ITERATIONS` times.
 
     Each R_i has the law of an inverse gamma variable, R = b / a. Both parameters are forgotten towards the prior, a
     grows by 1/2 for each value that arrived, and b by E[(z - t)^2] / 2 times its weight. The state is corrected with

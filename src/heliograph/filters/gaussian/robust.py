@@ -56,7 +56,7 @@ class Huber(AbstractWeights):
         self.c = scalar("constant of Huber's rule", c, TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """min(1, c / |d|)."""
+        """Return min(1, c / |d|)."""
         within = squared <= self.c**2
         return jnp.where(within, 1.0, self.c / jnp.sqrt(jnp.where(within, 1.0, squared)))
 

@@ -67,7 +67,7 @@ def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
 
 
 def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array) -> jax.Array:
-    """Omega = base + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) mean_part."""
+    """Return Omega = base + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) mean_part."""
     return base + (1 / beta[0] + 1 / beta[1]) * shift + (1 + beta[1]) * mean_part
 
 

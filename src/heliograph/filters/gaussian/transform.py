@@ -139,7 +139,7 @@ class PolynomialMoments(AbstractTransform):
 
 
 def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:
-    """f(m + L xi) = c + sum a_i xi_i + sum b_i xi_i^2 + sum_i<j b_ij xi_i xi_j, xi standard normal.
+    """Return f(m + L xi) = c + sum a_i xi_i + sum b_i xi_i^2 + sum_i<j b_ij xi_i xi_j, xi standard normal.
 
     Mean c + sum b_i, slopes a_i, and uncorrelated with xi: 2 sum b_i b_i' + sum b_ij b_ij'. From the values at m,
     m + L_i, m - L_i and m + L_i + L_j for i < j.

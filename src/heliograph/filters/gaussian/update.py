@@ -127,7 +127,7 @@ class Polytope(AbstractUpdate):
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
-        """ "upper" where the law is uncertain."""
+        """Return "upper" where the law is uncertain."""
         return "upper" if uncertain else "exact"
 
 
@@ -199,7 +199,7 @@ class Interval(AbstractUpdate):
         return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
-        """ "upper" where the law is uncertain."""
+        """Return "upper" where the law is uncertain."""
         return "upper" if uncertain else "exact"
 
 

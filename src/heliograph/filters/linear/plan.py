@@ -34,7 +34,7 @@ class LinearStep(NamedTuple):
     innovation: jax.Array
 
     def predict(self, mean: Float[Array, " N"]) -> Float[jax.Array, " N"]:
-        """m- = F m + f."""
+        """Return m- = F m + f."""
         return jnp.asarray(self.transition @ mean + self.drift)
 
     def expect(self, mean: Float[Array, " N"]) -> Float[jax.Array, " m"]:

@@ -372,7 +372,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
 
 
 def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:
-    """ "exact" if all laws are known, "nominal" if some probability is uncertain.
+    """Return "exact" if all laws are known, "nominal" if some probability is uncertain.
 
     Where noise is known by a bound of its covariance alone, "upper" at degree 1, and "nominal" beyond, since no higher
     moment has a bound.

@@ -30,7 +30,7 @@ class AbstractMerging(Module):
         return places, places
 
     def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
-        """Components after the update of all pairs, and the probability of each present mode."""
+        """Return the components after the update of all pairs, and the probability of each present mode."""
         return parts, weight
 
 
@@ -63,7 +63,7 @@ class MergeByMode(AbstractMerging):
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
     def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
-        """One component for each present mode."""
+        """Return one component for each present mode."""
         modes = math.isqrt(len(weight))
         pairs = weight[:, None] * (self.update_pairs(modes)[1][:, None] == np.arange(modes))
         return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs)), jnp.sum(pairs, axis=0)

@@ -285,13 +285,13 @@ def observe_modes(
 
 
 def transition_with_constant(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) of x~ = (x, 1)."""
+    """Return A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) of x~ = (x, 1)."""
     move = pad_with_zeros(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
     return move, pad_with_zeros(plant.noise_covariance(u))
 
 
 def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
-    """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0) of y~ = (y, 1)."""
+    """Return C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0) of y~ = (y, 1)."""
     measure = pad_with_zeros(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
     return measure, pad_with_zeros(jnp.asarray(sensor.noise.covariance))
 
@@ -320,13 +320,13 @@ def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
 
 
 def centred_transition(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A~ and Q~ of x - c, which no known input moves, and c one step later."""
+    """Return A~ and Q~ of x - c, which no known input moves, and c one step later."""
     move, noise = transition_with_constant(plant, jnp.asarray(u))
     return move.at[:-1, -1].set(0.0), noise, move[:-1] @ jnp.append(centre, 1.0)
 
 
 def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """C~ and R~ of the centred state: y = C (x - c) + C c + E v."""
+    """Return C~ and R~ of the centred state: y = C (x - c) + C c + E v."""
     measure, noise = measurement_with_constant(sensor)
     return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
 
@@ -381,5 +381,5 @@ def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
 
 
 def claim_of_modes(channel: Channel) -> Claim:
-    """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
+    """Return "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
     return "exact" if all(m.corner_count() == 1 for c in unstack(channel) for m in joint_modes(c).maps) else "nominal"

@@ -131,7 +131,7 @@ def _invert_distribution(law: jax.Array, uniform: jax.Array) -> jax.Array:
 
 
 def _resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
-    """Systematic resampling: indices where the distribution function passes (start + 0 ... N - 1) / N."""
+    """Resample systematically: indices where the distribution function passes (start + 0 ... N - 1) / N."""
     return _invert_distribution(weight, (start + jnp.arange(len(weight))) / len(weight))
 
 

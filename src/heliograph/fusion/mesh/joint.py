@@ -29,7 +29,7 @@ def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Ar
 def measurement_weights(
     gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]
 ) -> Float[Array, "node degree n n"]:
-    """W_i of the measurements that arrived, zero for the others."""
+    """Return W_i of the measurements that arrived, zero for the others."""
     taken: Float[Array, "node degree n n"] = library(gain, arrived).where(arrived[..., None, None], gain[:, None], 0.0)
     return taken
 

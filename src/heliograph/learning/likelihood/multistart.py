@@ -108,7 +108,7 @@ class Search:
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
     def _draw_around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "points p"]:
-        """Points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away.
+        """Return points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away.
 
         Besides one for each number that has an end of its domain, which is near it there.
         """

@@ -41,7 +41,7 @@ class Domains(NamedTuple):
 
     @staticmethod
     def unbounded(count: int) -> "Domains":
-        """Plain real numbers."""
+        """Return plain real numbers."""
         none = np.zeros(count, dtype=bool)
         return Domains(none, none, none)
 

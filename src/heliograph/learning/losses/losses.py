@@ -245,7 +245,7 @@ class RunningRateLosses(AbstractLossLaw):
         return RunningRateLosses(*estimate_shares(likelihood, top, value, intervals))
 
     def shares(self) -> dict[str, Share]:
-        """Base, weight and step with likelihood intervals."""
+        """Return the base, weight and step with likelihood intervals."""
         return {name: getattr(self, name) for name in ("base", "weight", "step")}
 
     def predicted(self, fate: Packets) -> Packets:

@@ -141,7 +141,7 @@ class Envelope(NamedTuple):
     ray: PathValues
 
     def information(self, total: PathValues) -> tuple[PathValues, PathValues]:
-        """Envelope and its slope at these powers of the paths."""
+        """Return the envelope and its slope at these powers of the paths."""
         exact = split(self.whole, total)
         on_ray = total < self.touch
         return np.where(on_ray, self.ray * total, exact.information), np.where(on_ray, self.ray, exact.slope)

@@ -95,7 +95,7 @@ class SignalNoise(NamedTuple):
 
 
 def stack_branches(parts: Sequence[Branches]) -> Branches:
-    """Components of several laws one above the other, as many branches each as the one with most has."""
+    """Return the components of several laws one above the other, as many branches each as the one with most has."""
     xp, most = library(parts), max(law.mean.shape[1] for law in parts)
     fills = (-np.inf, 0.0, 1.0)
 

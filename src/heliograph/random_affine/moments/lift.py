@@ -67,7 +67,7 @@ class Lift(AbstractWrapper):
         return Moments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
 
     def degree_in(self, identity: str) -> int:
-        """`degree` times that of the map."""
+        """Return `degree` times that of the map."""
         return self.degree * self.base.degree_in(identity)
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:

@@ -156,7 +156,7 @@ def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variab
 
 @cache_arrays
 def degrees(dimension: int, order: int) -> np.ndarray:
-    """Degree of each monomial in the variables other than 1."""
+    """Return the degree of each monomial in the variables other than 1."""
     return np.array([order - powers[-1] for powers in exponents(dimension + 1, order)])
 
 

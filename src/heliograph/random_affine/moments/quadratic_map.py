@@ -35,7 +35,7 @@ class QuadraticMap(Module):
         return center + jnp.diag(unit * jnp.sum(entries / unit, axis=1))
 
     def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
-        """C:W alone, which is all where the law is known."""
+        """Return C:W alone, which is all where the law is known."""
         return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 
 

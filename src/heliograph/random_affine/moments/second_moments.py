@@ -83,7 +83,7 @@ def divide_spread(spread: Tensor) -> tuple[Tensor, Columns]:
 
 
 def _pad_columns(noise: Columns) -> Columns:
-    """Columns of a covariance, with columns of zeros to as many as it has rows."""
+    """Return the columns of a covariance, with columns of zeros to as many as it has rows."""
     xp, lacking = library(noise), len(noise.matrix) - noise.matrix.shape[1]
     return Columns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
 
@@ -232,7 +232,7 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
 
 
 def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
-    """Mean and spread of a map of known law: of independent maps the spreads of each alone, and no more."""
+    """Return mean and spread of a map of known law: of independent maps the spreads of each alone, and no more."""
     if not isinstance(channel, Superposed | Stack):
         moments = channel.moments(2)
         mean = moments.mean[:-1]
@@ -248,7 +248,7 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
 
 
 def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.ndarray, "m m"]:
-    """Cov(z | y) of a channel of known gain, as that of its parts where these are independent."""
+    """Return Cov(z | y) of a channel of known gain, as that of its parts where these are independent."""
     covariance: Matrix
     if isinstance(channel, Stack):
         covariance = block_diagonal([_noise_covariance(affine) for affine in channel.maps])
@@ -260,7 +260,7 @@ def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.nda
 
 
 def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
-    """Spreads of independent maps side by side, as diagonal blocks of that of all outputs."""
+    """Return the spreads of independent maps side by side, as diagonal blocks of that of all outputs."""
     sizes, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
     outputs = sum(sizes)
     rows = [np.arange(start, start + m) for start, m in zip(np.cumsum([0, *sizes]), sizes, strict=False)]
@@ -298,7 +298,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
 
 
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
-    """Weighted sum of the maps of parts, each at the places of what its part takes."""
+    """Return the weighted sum of the maps of parts, each at the places of what its part takes."""
     parts = {i: scale_map(part, weight) for i, (part, weight) in weighted.items()}
     center = channel.in_places({i: part.center for i, part in parts.items()}, 2)
     return QuadraticMap(center, channel.in_places({i: part.radius for i, part in parts.items()}, 2))

@@ -26,7 +26,7 @@ def tensors_of_law(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tens
 
 
 def dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
-    """One map above all of the (law, m, m, p + 1, p + 1) tensors.
+    """Return one map above all of the (law, m, m, p + 1, p + 1) tensors.
 
     Where y enters as s_v M y y' M' and the noise part has a largest matrix, that of the largest s_v and the largest
     noise; else the middle of the range of each entry, with its half as radius.

@@ -59,7 +59,7 @@ def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
 
 
 def _error_numbers(record: Record) -> dict[str, dict[str, Json]]:
-    """Errors by node and filter, where the truth is known."""
+    """Return the errors by node and filter, where the truth is known."""
     errors: dict[str, dict[str, Json]] = {}
     for of_filter in compare_with_truth(record):
         size = None if np.isnan(of_filter.nees) else of_filter.nees

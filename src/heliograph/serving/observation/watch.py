@@ -334,7 +334,7 @@ def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
 
 
 def _make_test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, object]:
-    """One row of the page's table of tests."""
+    """Return one row of the page's table of tests."""
     low, high = test.band()
     names = {"node": node, "filter": filter_name, "claim": test.claim, "doubt": test.doubt() is not None, "by": []}
     return names | {"ratio": test.ratio, "low": low, "high": high, "numbers": test.numbers}

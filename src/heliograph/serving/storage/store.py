@@ -225,7 +225,7 @@ class Store:
     def _commit_at_once(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """One transaction: check the versions, then write plants, journal and counts."""
+        """Commit in one transaction: check the versions, then write plants, journal and counts."""
         with self._engine.begin() as connection:
             # The count locks the store for the other processes, which then see the new versions.
             newest = self._count(connection, NEWEST, len(entries))

@@ -92,7 +92,7 @@ class LinearisedCentre(Module):
 
 
 def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
-    """e+ = F_i (A e + w) - K_i nu: errors of mean zero keep it."""
+    """Return e+ = F_i (A e + w) - K_i nu: errors of mean zero keep it."""
     nodes, n, _ = keep.shape
     return ErrorStep(
         transition=ErrorMap(motion.matrix, jnp.zeros_like(keep), keep @ motion.matrix),
@@ -113,7 +113,7 @@ def _keep_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMomen
 
 
 def _drift(state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:
-    """F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
+    """Return F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
     nodes, n, _ = keep.shape
     before = state.gaussian.mean[n:].reshape(nodes, n)
     return jnp.einsum("iab,ib->ia", keep, moved - linear.predicted - before @ matrix.T)

@@ -229,7 +229,7 @@ class Mesh(Module):
         self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n *n"],
         mean: jax.Array, sent: Float[jax.Array, "node degree n"],
     ) -> Float[jax.Array, "node n"]:  # fmt: skip
-        """front_i sum_j parts_ij (xs_ij - xhat_i) over the neighbours j of i and what it has of them."""
+        """Return front_i sum_j parts_ij (xs_ij - xhat_i) over the neighbours j of i and what it has of them."""
         away = (sent - mean[:, None]).at[:, 0].set(0.0)
         off = jnp.einsum("idab,idb->ia", parts, away) if parts.ndim == 4 else jnp.sum(parts * away, axis=1)
         return jnp.einsum("iab,ib->ia", front, off)

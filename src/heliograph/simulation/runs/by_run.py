@@ -90,7 +90,7 @@ def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[j
 
 
 def _drop_unused(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Program without operations that none of its results needs, such as unused likelihoods."""
+    """Return the program without operations that none of its results needs, such as unused likelihoods."""
     jaxpr, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=True)
     return ClosedJaxpr(jaxpr, program.consts)
 
@@ -111,7 +111,7 @@ def _dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
 
 
 def _unchanging(following: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
-    """Fixed point of the marks of a carry under a step."""
+    """Return the fixed point of the marks of a carry under a step."""
     more = [a or b for a, b in zip(marks, following(marks), strict=True)]
     return marks if more == marks else _unchanging(following, more)
 
