@@ -113,7 +113,7 @@ def transform_held_out(
     uniform = []
     for name, z in measurements.items():
         of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
-        by_law = _integrate_law(network, node, z, inputs) if isinstance(node, Node) else None
+        by_law = _transform_by_laws(network, node, z, inputs) if isinstance(node, Node) else None
         if by_law is not None:
             uniform.append(Uniformity(name, by_law[cut:], True))
         elif of_node:
@@ -121,8 +121,11 @@ def transform_held_out(
     return uniform
 
 
-def _integrate_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
-    """Return transforms of measurements by the laws of its gains in full; None of laws without nodes or with memory."""
+def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
+    """Return P(z_k <= what came | rows before) of each measurement, by the node's laws of gain and noise.
+
+    None where such laws have no nodes to sum over, vary over time, or remember.
+    """
     parts = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in parts) or first(node.channel).remembers:
         return None

@@ -102,11 +102,13 @@ class Judges:
 
         What was found of a filter is said again, and none is tried more than TRIES times: a plant may send for ever.
         """
+        # The row, the one before it, and what the filters estimated there.
         _, plant, event, row = candidate
         pool, index = self.fleet.pool, plant.rows.index(row.key)
         before, after = plant.rows.held[index - 1], pool.table[row.slot, pool.outputs]
         known = pool.table[before.slot, pool.outputs]
         for place in self.fleet.program.places:
+            # Filters that judged this row to be no number, of the event's node or of all nodes.
             filter = filter_of(self.fleet, place)
             judged = place.judgement is not None and Judgement.is_spoilt(after[place.judgement.reason])
             concerned = event.node_index < 0 or place.node in (
@@ -115,6 +117,7 @@ class Judges:
             )
             if filter is None or not judged or not concerned:
                 continue
+            # Call the filter's functions from the estimate before the row: which of them returns no number?
             tried, said = self._faults.get((place.node, place.filter), (0, ""))
             if not said and tried < TRIES:
                 n = len(filter.states)
@@ -134,10 +137,12 @@ class Judges:
 
         That is the first, from the largest on, without which the row is plausible; the largest if there is none.
         """
+        # Events of nodes without a filter of their own, by row.
         rows: dict[int, list[int]] = {}
         for i in reasons:
             if taken[i][2].node_index in self._central:
                 rows.setdefault(taken[i][-1].slot, []).append(i)
+        # Of several nodes' events in a row keep the one without which the row is plausible.
         for those in rows.values():
             if len({taken[i][2].node_index for i in those}) > 1:
                 one = Judgement.find_culprit(
@@ -149,12 +154,14 @@ class Judges:
 
     def _plausible_without(self, candidate: Candidate) -> bool:
         """Step a row without what it has of a node; is it plausible then?"""
+        # A copy of the row in a slot of its own, with NaN for the node's numbers.
         _, plant, event, row = candidate
         pool, rows = self.fleet.pool, plant.rows
         there = HeldRow(row.key, pool.take(), self.fleet.width)
         there.numbers = row.numbers.copy()
         at = rows.places[event.node_index]
         there.numbers[at] = [nan] * (at.stop - at.start)
+        # Stepped from the row before, judged, and let go.
         self.fleet.step_row(rows.held[rows.index(row.key) - 1], there)
         plausible = (
             Judgement.why_values(pool.table[there.slot, pool.outputs][self._judgement_columns[event.node_index]])

@@ -154,15 +154,18 @@ def gain_nodes(
         ValueError: another law; uncertain probabilities.
     """
     check_density(law)
+    # Finitely many values: the law itself.
     if isinstance(law, Constant | Discrete):
         weights, values = np.array(law.list_atoms(), dtype=float).T
         return values[:, None], weights
+    # E f(g) = int f(g(t)) p(g(t)) g'(t) dt with g = e^t or t^4, which takes nodes to where p changes fast, near 0.
     x, w = np.polynomial.legendre.leggauss(GAINS)
     low, high = (float(end) for end in law.bulk())
     with jax.enable_x64(True):
         ends = np.log([low, high]) if law.logarithmic else np.array([low, high]) ** 0.25
         t = ends.mean() + (ends[1] - ends[0]) / 2 * x
         g = np.exp(t) if law.logarithmic else t**4
+        # log(p g'), g' = e^t or 4 t^3, up to a constant that the sum of the weights takes off.
         nats = np.asarray(jax.vmap(law.log_density)(jnp.asarray(g))) + (t if law.logarithmic else 3 * np.log(t))
     weights = w * np.exp(nats - nats.max())
     return g[:, None], weights / weights.sum()

@@ -63,14 +63,16 @@ class ChannelGroup(Module):
 
 
 def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
-    """Stack channels by structure; each is looked at once, however many names have it."""
+    """Stack channels by structure, names of memories aside; a group has one copy of each channel, and rows by name."""
     listed, memories = list(channels.values()), list(memory_places(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
+    # Of each structure its channels, by identity: one object under many names is looked at once.
     kinds = {id(channel): drop_names(channel) for channel in {id(c): c for c in listed}.values()}
     alike: dict[object, dict[int, int]] = {}
     for which, kind in kinds.items():
         same = alike.setdefault(structure(kind), {})
         same[which] = len(same)
+    # A group for each structure: its channels stacked, then one row for each name that has one of them.
     groups = []
     for same in alike.values():
         places = np.array([e for e, channel in enumerate(listed) if id(channel) in same])

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from heliograph.disk.quoting import unquote_cell
-from heliograph.files.text.dialects import NO_VALUE, check_header, hint_of_cell, recoding, rewriting
+from heliograph.files.text.dialects import NO_VALUE, check_header, hint_of_cell, recoding, suggest_rewrite
 from heliograph.files.text.text_file import is_text, open_text
 from heliograph.numerics.check import InputError, fail, show_value
 
@@ -109,7 +109,7 @@ class CsvText:
         if not is_text(line):
             return fail(where, "a text in UTF-8 or UTF-16", f"{show_value(line)}{recoding(self.path, line)}")
         if line.lstrip().startswith("#") and not (self._marked and len(cells) == len(self.header)):
-            remedy = "" if self.path is None else f": {rewriting(self.path, comment='#')}"
+            remedy = "" if self.path is None else f": {suggest_rewrite(self.path, comment='#')}"
             return fail(where, "numbers", f"a comment, {show_value(cells[0])}{remedy}")
         if len(cells) != len(self.header):
             hint = ": numbers have a decimal point" if len(cells) > len(self.header) else ""

@@ -61,8 +61,8 @@ def names_in(line: str) -> set[str]:
     }
 
 
-def rewriting(path: Path, **how: object) -> str:
-    """Return the pandas call that converts a table written in another dialect."""
+def suggest_rewrite(path: Path, **how: object) -> str:
+    """Write the pandas call that converts a table written in another dialect, read with the arguments `how`."""
     given = "".join(f", {name}={value!r}" for name, value in how.items())
     return f"pandas.read_csv({str(path)!r}{given}).to_csv({str(path)!r}, index=False) rewrites it"
 
@@ -73,21 +73,21 @@ def recoding(path: Path | None, line: str) -> str:
         return ""
     encoding = "utf-16-le" if "\0" in line else "latin-1"
     commented = line.startswith(COMMENTS)
-    return f": {_rewriting_without_comments(path, encoding) if commented else rewriting(path, encoding=encoding)}"
+    return f": {_rewriting_without_comments(path, encoding) if commented else suggest_rewrite(path, encoding=encoding)}"
 
 
 def hint_of_cell(cell: str, name: str, path: Path | None) -> str:
     """Return what is probably meant by a cell that is no number, with what rewrites the table; "" if nobody knows."""
     if day := DAY_FIRST.fullmatch(cell):
         first = int(day[1]) > 12 or (day[2] == "." and int(day[3]) <= 12)
-        remedy = "" if path is None else f": {rewriting(path, parse_dates=[name], dayfirst=first)}"
+        remedy = "" if path is None else f": {suggest_rewrite(path, parse_dates=[name], dayfirst=first)}"
         return f": dates begin with the year; if this has the {'day' if first else 'month'} first{remedy or ' ...'}"
     if re.fullmatch(r"[-+.\de]+(?: +[-+.\de]+)+", cell):
-        return ": several numbers" + ("" if path is None else f": {rewriting(path, sep=chr(92) + 's+')}")
+        return ": several numbers" + ("" if path is None else f": {suggest_rewrite(path, sep=chr(92) + 's+')}")
     if re.fullmatch(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", cell):
-        return ": thousands have no comma" + ("" if path is None else f": {rewriting(path, thousands=',')}")
+        return ": thousands have no comma" + ("" if path is None else f": {suggest_rewrite(path, thousands=',')}")
     if re.fullmatch(r"[+-]?\d+,\d+", cell):
-        return ": numbers have a decimal point" + ("" if path is None else f": {rewriting(path, decimal=',')}")
+        return ": numbers have a decimal point" + ("" if path is None else f": {suggest_rewrite(path, decimal=',')}")
     return ""
 
 
@@ -97,7 +97,7 @@ def _rewriting_separated(path: Path, mark: str) -> str:
     if start.lstrip().startswith(COMMENTS):
         return _rewriting_without_comments(path)
     commas = re.search(r"\d,\d", start)
-    return rewriting(path, sep=mark, decimal=",") if commas else rewriting(path, sep=mark)
+    return suggest_rewrite(path, sep=mark, decimal=",") if commas else suggest_rewrite(path, sep=mark)
 
 
 def _rewriting_without_comments(path: Path, encoding: str = "") -> str:
@@ -110,7 +110,7 @@ def _rewriting_without_comments(path: Path, encoding: str = "") -> str:
     first = re.split(mark if mark == r"\s+" else re.escape(mark), following)[0]
     sep = ({} if mark == "," else {"sep": mark}) | ({"encoding": encoding} if encoding else {})
     if not re.match(r"[-+.\d]", first):  # names of their own
-        return rewriting(path, comment=lines[0][0], **sep)
+        return suggest_rewrite(path, comment=lines[0][0], **sep)
     title = lines[comments - 1].lstrip("".join(COMMENTS) + " ")
     split = [part.strip() for part in re.split(mark if mark == r"\s+" else re.escape(mark), title) if part.strip()]
-    return rewriting(path, skiprows=comments, names=split, **sep)
+    return suggest_rewrite(path, skiprows=comments, names=split, **sep)

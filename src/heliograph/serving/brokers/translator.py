@@ -178,7 +178,7 @@ class Translator:
             came = arrival if time > arrival or (known is not None and not again) else None
         sequence, name = reading.sequence, (reading.plant, reading.node)
         if sequence is None:
-            sequence = self._counts[name] if reading.time is None else self._count_equals(reading, again)
+            sequence = self._counts[name] if reading.time is None else self._number_among_simultaneous(reading, again)
             self._counts[name] += 1
         # Checked already, and dates are no texts here.
         return Message.model_construct(
@@ -191,8 +191,11 @@ class Translator:
             arrival=came,
         )
 
-    def _count_equals(self, reading: Reading, again: bool) -> int:
-        """Return the number of a message without a count among those of its node and time."""
+    def _number_among_simultaneous(self, reading: Reading, again: bool) -> int:
+        """Return the sequence number of a message without a count: how many of its node and time came before.
+
+        A message that comes `again`, with the same values, has the number that it had.
+        """
         assert reading.time is not None
         values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
         mine = reading.values.tobytes()

@@ -60,6 +60,7 @@ class FusedInnovation(Module):
 
         `skip`: reasons not to use a node's measurement, by kind.
         """
+        # x = N(xf-, Pf-), d = 0; then for each node i: x, e_i, S_i by its correction, d += e_i' S_i^-1 e_i.
         carry: tuple[Gaussian, jax.Array, jax.Array] | None = None
         for kind, f in self.sources:
             # Numbers of each node's filter, its state and what it receives.
@@ -77,6 +78,7 @@ class FusedInnovation(Module):
                 carry = gaussian_of(start), jnp.zeros(()), jnp.zeros(())
 
             def correct(carry: PyTree, row: PyTree, static: PyTree = static) -> tuple[PyTree, None]:
+                """Correct x by one node's filter, and add its squared innovation."""
                 x, distance, arrived = carry
                 numbers, prior, z_i = row
                 after, innovation = eqx.combine(numbers, static).correct(with_gaussian(prior, x), z_i, k)

@@ -141,6 +141,7 @@ class Mesh(Module):
 
         `ahead` has weights that were computed before.
         """
+        # Measurements (node, m), which estimates arrive, and the gains that follow from both.
         there = jnp.concatenate([self._rows(rows) for rows in z])[self.observation_model.order]
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
         present = ~jnp.isnan(there)
@@ -148,13 +149,13 @@ class Mesh(Module):
         arrived = arrived if messages is None else messages.fresh
         parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead, messages)
         gains, motion = parts.gains, parts.motion
-        # All rounds but the last only intersect.
+        # All rounds but the last only intersect: xhat_i + front_i sum_j parts_ij (xhat_j - xhat_i).
         mean = state.mean
         for weights in parts.exchanges:
             mean = mean + self._pull_to_neighbours(weights.front, weights.parts, mean, mean[self.senders])
         sent = self._send_estimates(mean, state, jnp.asarray(arrived[:, -1]), messages)
         mean = mean[self.senders[:, 0]]  # of the nodes that are stepped
-        # Innovations about one common prediction, so that no digits of the means themselves are lost.
+        # s_i = sum_j H' R^-1 (z_j - H m) about one common prediction m, so that no digits of the means are lost.
         predicted = mean @ motion.matrix.T + motion.shift
         common = jnp.mean(predicted, axis=0)
         observation = parts.data.observation

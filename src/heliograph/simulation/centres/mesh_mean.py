@@ -65,12 +65,13 @@ def mean_mesh_errors(
         ValueError: no such fusion, a rule whose gains remember losses (intersection), losses in bursts, too many
             neighbours.
     """
+    # Only gains that depend on what arrives at this step alone are independent of J.
     mesh = mesh_named(network, fusion)
     between = network.meshes[fusion]
     if not (between.rule.needs_joint or isinstance(between.rule, FrozenWeights)):
         expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
         raise fail(f"mean errors of fusion {fusion!r}", expected, type(between.rule).__name__)
-    # Probability of each pattern of arrivals.
+    # P(pattern) = prod_j p_ij over the edges that deliver, 1 - p_ij over those that do not.
     network.check_horizon(check_count("horizon", horizon))
     u = inputs_of(network, inputs, horizon)
     names = mesh.nodes
@@ -85,7 +86,7 @@ def mean_mesh_errors(
     rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
-    # Joint errors, step after step, averaged over the patterns.
+    # J_k -> J_k+1 by the formula above: gains of every pattern from J_k, then means over the patterns.
     joint, covariance, moments = np.tile(start.plant[1], (len(names),) * 2), start.covariance, start.plant
     errors = []
     for k, u_k in enumerate(u):
@@ -106,6 +107,10 @@ def mean_mesh_errors(
 def _compute_gains(
     rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: MeshStep
 ) -> NodeGains:
+    """Return the gains of each pattern: what arrives of information is summed, and weights are solved for it.
+
+    Shapes: covariance (node, n, n) before the step, blocks (node, degree, n, degree, n) of J at each neighbourhood.
+    """
     information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
     complete = jnp.asarray(step.information)[patterns.node]
     held = jnp.asarray(blocks)[patterns.node]
@@ -116,22 +121,23 @@ def _compute_gains(
 def _average_joint(
     mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: NodeGains, step: MeshStep
 ) -> np.ndarray:
-    """Return the joint covariance (N, N) after a step."""
+    """Return J+ (N, N): of two nodes by products of mean gains, of one node by the mean over its patterns."""
     count, degree = mesh.senders.shape
     q, s, n = np.asarray(step.motion.noise), np.asarray(step.data.information), len(step.motion.shift)
 
     def mean(values: np.ndarray) -> np.ndarray:
+        """Return E[value] of each node, sum_r p_r value_r over its patterns r."""
         weighted = values * patterns.probability.reshape(-1, *[1] * (values.ndim - 1))
         return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
 
-    # Gains of every pattern, M_i with the node itself first.
+    # Of every pattern r: M_r (the node itself first), F_r and the weights of what arrived, K_r H' R^-1.
     m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
     w = np.asarray(measurement_weights(gains.gain, patterns.present))
-    # Different receivers: products of means.
+    # i != j: J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'.
     held = mean(w)
     everywhere = [scatter_blocks(x, mesh.senders, mesh.edges.present) for x in (mean(m), held @ s[mesh.senders], held)]
     after = joint_after(joint, everywhere[0], mean(f), q, *everywhere[1:])
-    # One receiver: the mean over its patterns.
+    # i = j: J_ii+ = E[M_r J M_r' + F_r Q F_r' + sum_l K_rl R_l K_rl'], with J of the neighbourhood of i.
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
     noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)

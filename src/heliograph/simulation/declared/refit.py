@@ -204,6 +204,7 @@ def find_end(declared: Declared, best: Refit, number: int, sign: int) -> float:
 
 def _search(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: int | None = None) -> Refit:
     """Climb the likelihood from a start, all numbers free but one that is fixed."""
+    # Limits of the logarithms: FARTHEST nats either way; of a bias's memory FAST steps and SLOW recordings.
     free = np.arange(len(start)) != fixed
     low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
     if len(start) > declared.classes:
@@ -212,6 +213,7 @@ def _search(declared: Declared, start: Float[np.ndarray, " numbers"], fixed: int
     likelihood, steps = Likelihood(declared), DIFFERENCE * np.eye(len(start))[free]
 
     def lost(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
+        """Return -l and its slope by central differences, all points in one call."""
         every = start.copy()
         every[free] = logs
         points = np.clip(np.stack([every, *(every + steps), *(every - steps)]), low, high)  # flat beyond

@@ -156,8 +156,9 @@ def _statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> 
 
 
 def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
-    """Runs by batch; of each kind and fused estimate sums of pairs and NEES, mean claimed covariances, and failures.
+    """Split the sums into runs by batch, and for each kind and fused estimate its sums, mean claims and failures.
 
+    The sums are those of pairs of errors and of NEES; claims are covariances that differ by run, or are shared.
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
     # The axis of batches first.

@@ -44,6 +44,7 @@ def filter_step(
     `skip`: the reason not to use z, if any: then nothing of it arrived, and where the prediction itself is no number
     the state before it stays.
     """
+    # What is not used did not arrive.
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
     # With a smoother step, and a judgement of the same step.
     judgement, weighed = None, None
@@ -59,6 +60,7 @@ def filter_step(
         weighed = get_weighed(innovation)
     else:
         after, estimate = filter.step(state, z, u, k)
+    # A prediction that is no number leaves the state as it was.
     if skip is not None:
         stays, known = skip == Reason.PREDICTION, (state, filter.estimate(state))
         after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), known, (after, estimate))
