@@ -75,6 +75,7 @@ def test_the_filter_is_better_on_rows_it_has_not_seen(folder):
     assert item["gain"] == pytest.approx(gain, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_page_says_what_was_learned(folder, fits):
     fits(folder / "out" / "report.html")
     page = (folder / "out" / "report.html").read_text()

@@ -75,7 +75,9 @@ def simulated_estimates():
     return hg.monte_carlo(hg.Network(plant, {"a": node}), 4, 3, 1).estimates["a"]["f"].mean
 
 
-@pytest.mark.parametrize("compute", [results_of_many_runs, live_estimates, simulated_estimates])
+@pytest.mark.parametrize(
+    "compute", [results_of_many_runs, live_estimates, pytest.param(simulated_estimates, marks=pytest.mark.slow)]
+)
 def test_xla_computes_where_llvm_makes_no_code_which_is_said_once(compute, monkeypatch):
     def fails(*_):
         raise RuntimeError(f"LLVM ERROR: out of registers in {compute.__name__}")

@@ -126,6 +126,7 @@ def test_what_is_smoothed_is_turned_too(east_and_west):
             assert np.all(np.abs(other[:, 2]) <= np.pi)
 
 
+@pytest.mark.slow
 def test_numbers_on_a_line_give_the_same_where_nothing_crosses_and_are_lost_where_something_does(east_and_west):
     east, west = east_and_west
     worst = []

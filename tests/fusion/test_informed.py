@@ -126,24 +126,36 @@ def test_monte_carlo_agrees_with_what_is_claimed(world, record):
         np.testing.assert_allclose(again.estimates["fused"][name].mean, estimate.mean[0], rtol=1e-9, atol=1e-11)
 
 
-def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
-    """Two relays of two and three nodes and a root, against W P W' by hand, and against simulated errors."""
+def relayed(world):
+    """Errors of five nodes, those of two relays that fuse two and three of them, and the relays' weights by hand."""
     groups = {"a": [0, 3], "b": [1, 2, 4]}
     leaves = hg.simulation.cross_covariances(world, "local", 6)
     level = leaves.fused({name: [f"node {i}" for i in mine] for name, mine in groups.items()})
     by_hand = np.zeros((2, 2, 5, 2))
     for r, mine in enumerate(groups.values()):
         by_hand[r][:, mine] = hg.fusion.MatrixWeights().weights(leaves.joint[mine][:, :, mine])
+    return leaves, level, by_hand
+
+
+def test_a_tree_of_relays_is_its_weights_on_the_leaves(world):
+    """Two relays and a root against W P W' by hand."""
+    leaves, level, by_hand = relayed(world)
     joint = np.einsum("raib,ibjc,sdjc->rasd", by_hand, leaves.joint, by_hand)
     np.testing.assert_allclose(level.joint, joint, rtol=1e-7, atol=1e-9)  # weights lose the digits of cond(P)
-    weights, covariance = level.matrix_weights()
+    covariance = level.matrix_weights()[1]
     flat = leaves.matrix_weights()[1]
     assert np.trace(flat) <= np.trace(covariance) <= min(np.trace(joint[r, :, r]) for r in (0, 1))
+    with pytest.raises(ValueError, match=r"nodes: expected one relay for each, got several for \['node 1'\]"):
+        leaves.fused({"a": ["node 1"], "b": ["node 1", "node 2"]})
+
+
+@pytest.mark.slow
+def test_simulated_errors_of_a_tree_are_those_of_its_covariance(world, record):
+    _, level, by_hand = relayed(world)
+    weights, covariance = level.matrix_weights()
     errors = np.stack([record.errors(node, "local")[:, -1] for node in world.names], axis=1)
     square = np.sum(np.einsum("ars,rsib,kib->ka", weights, by_hand, errors) ** 2, axis=-1)
     assert abs(square.mean() - np.trace(covariance)) < 3 * square.std() / np.sqrt(len(square))
-    with pytest.raises(ValueError, match=r"nodes: expected one relay for each, got several for \['node 1'\]"):
-        leaves.fused({"a": ["node 1"], "b": ["node 1", "node 2"]})
 
 
 def along_and_linear(plant, parts):
@@ -173,6 +185,7 @@ def test_losses_that_are_said_count_with_the_pattern_that_happened(engine, monke
     np.testing.assert_allclose(fused["local matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_losses_at_random_keep_the_claim():
     """Each run has the covariances of its own losses: mean squares agree within three standard errors."""
     plant, parts = random_case(5)

@@ -87,6 +87,7 @@ def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     np.testing.assert_allclose(result.covariance[-1], stacked(arrives), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_every_second_step_sends(record):
     for report in record.reports["second"].values():
         values = np.asarray(report.values)

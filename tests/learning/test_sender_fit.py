@@ -31,6 +31,7 @@ def test_delta_and_loss_are_recovered_within_their_intervals():
     assert fitted.network.nodes["a"].trigger.delta == rows["delta"].estimate
 
 
+@pytest.mark.slow
 def test_the_likelihood_of_heartbeats_is_largest_at_the_true_one():
     channel = hg.erasure(hg.perfect(), 0.8)
     z = recording(hg.SendOnDelta(1.0, heartbeat=5), channel, 300)

@@ -195,6 +195,7 @@ def test_skewed_vector_noise_gains_in_every_direction():
     assert np.linalg.eigvalsh(both[0] - both[1]).min() > 0
 
 
+@pytest.mark.slow
 def test_steps_after_the_moments_have_come_to_stay_are_copied():
     """To rounding they are what is computed step by step, which a model in `over_time` is."""
     plant, sensor = hg.LinearPlant([[0.5]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)

@@ -80,6 +80,7 @@ def test_an_angle_that_becomes_too_wide_is_said_once(turning):
     line.push("a", 2, 2, [np.nan])
 
 
+@pytest.mark.slow
 def test_a_service_says_it_once(turning):
     said = []
     service = Service(Fleet(NetworkProgram(turning), Options(0.0, 0.1)), InMemoryStore(), said.append)

@@ -61,6 +61,7 @@ def wait(service, clock, until):
     return results
 
 
+@pytest.mark.slow
 def test_four_silent_thermometers_write_and_tell_next_to_nothing(program, clock, tmp_path):
     """Ten minutes from the last value on, as a share of 10 MB a day; the database and its log, and what is told."""
     service = begun(program, tmp_path / "a.db")

@@ -58,6 +58,7 @@ def test_three_components_are_those_of_draws():
         np.testing.assert_allclose(result.covariance, np.cov(some.T), atol=0.006)
 
 
+@pytest.mark.slow
 def test_inside_and_outside_are_the_whole_and_what_is_known_stays():
     random = np.random.default_rng(1)
     law = Gaussian(random.normal(size=(1, 4)), random.normal(size=(1, 6)), random.uniform(0.5, 4, size=(1, 4)))

@@ -141,6 +141,7 @@ def test_uncertain_probabilities_make_the_claim_nominal():
         )
 
 
+@pytest.mark.slow
 def test_claims_hold_in_the_drivers_monte_carlo():
     """Exact claims of every degree and of memory, in one network on one data set: NEES and covariances."""
     horizon, s = 10, model(EXAMPLE, 10, initial=0.01 * np.eye(2))

@@ -128,6 +128,7 @@ def test_a_true_clock_that_falls_silent_is_none():
     assert seen == [True] * 5 + [False] * 3
 
 
+@pytest.mark.slow
 def test_two_wrong_clocks_may_be_wrong_together():
     """Only a third, right, tells them from a shift of everything in time."""
     clocks = {name: hg.model.Clock(*DEVIATION) for name in "bc"}

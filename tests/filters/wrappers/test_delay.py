@@ -206,6 +206,7 @@ def test_simulated_errors_are_as_known_before(simulated):
     assert abs(published.mean() - 0.460) < 3 * published.std() / 32
 
 
+@pytest.mark.slow
 def test_relays_that_are_late_by_chance(simulated):
     """What a relay forwards twice has one noise: the relay's signal stands in the oracle as the sensor's does."""
     (network, record), generator = simulated, np.random.default_rng(0)

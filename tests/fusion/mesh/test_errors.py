@@ -86,6 +86,7 @@ def test_as_many_rounds_as_the_graph_is_long_make_every_node_the_central_filter(
         assert np.linalg.eigvalsh(errors.claimed - errors.actual).min() > -1e-12
 
 
+@pytest.mark.slow
 def test_rounds_with_losses_claim_at_least_the_error_and_beat_one_round():
     rules = {"m": hg.fusion.TraceIntersection()}
     result = {}

@@ -166,6 +166,7 @@ def test_independent_losses_are_called_independent(seed):
     assert repr(found.channel(hg.hop(1.0, 0.1))) == repr(hg.erasure(hg.hop(1.0, 0.1), 1 - loss.estimate))
 
 
+@pytest.mark.slow
 def test_a_drifting_rate_that_predicts_best_leaves_the_next_best_to_the_channel():
     """Rates from 5 % to 60 % and back, slowly: `best` is a rate that no channel has."""
     rate = 0.325 - 0.275 * np.cos(np.arange(3000) / 240)

@@ -19,7 +19,7 @@ from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names
-from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
@@ -208,16 +208,24 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
 
     def columns(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> Columns:
         rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
-
-        def of_step(own: Columns, seconds: jax.Array, lost: jax.Array) -> Columns:
-            return triangularise(join_columns(own, rounding_of(seconds), Columns(np.eye(len(lost)), lost)))
-
-        each: Callable[..., Columns] = jax.vmap(of_step)
-        factors = each(columns_of_each(covariances), rounding, lost)
-        return Columns(np.asarray(factors.matrix), np.asarray(factors.weights))
+        return _factor_with_rounding(columns_of_each(covariances), rounding, lost)
 
     process = columns(np.asarray(s.process), moved, np.zeros(moved.shape))
     return SystemNoises(process, columns(np.asarray(s.noise), sent, system.received_rounding))
+
+
+@compile_in_float64
+def _factor_with_rounding(own: Columns, seconds: Array, lost: Array) -> Columns:
+    """Return the factors of each step's noise, the rounding of numbers of these second moments, and what was lost.
+
+    Shapes: own (steps, n, columns), seconds and lost (steps, n).
+    """
+
+    def of_step(own: Columns, seconds: jax.Array, lost: jax.Array) -> Columns:
+        return triangularise(join_columns(own, rounding_of(seconds), Columns(np.eye(len(lost)), lost)))
+
+    each: Callable[..., Columns] = jax.vmap(of_step)
+    return each(own, seconds, lost)
 
 
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
