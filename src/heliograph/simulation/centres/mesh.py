@@ -141,7 +141,6 @@ class Mesh(Module):
 
         `ahead` has weights that were computed before.
         """
-        # Measurements (node, m), which estimates arrive, and the gains that follow from both.
         there = jnp.concatenate([self._rows(rows) for rows in z])[self.observation_model.order]
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
         present = ~jnp.isnan(there)
