@@ -46,19 +46,20 @@ LADDER = Lengths(2048, 512), Lengths(8192, 2048)
 
 
 class Recursion(Module):
-    """Linear filters over rows: of their state, Gaussians and what no data change, the means alone depend on data."""
+    """Linear filters over rows (z, u): of their state, Gaussians and what no data change, only means depend on data."""
 
-    def step(self, state: PyTree, row: PyTree, k: Array) -> tuple[PyTree, PyTree]:
+    def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
         """Return the state after row k, and what is kept of the row."""
         raise unwritten(self, "step")
 
-    def predict(self, state: PyTree, row: PyTree, k: Array) -> PyTree:
-        """Return the state after row k of which no data are used."""
-        raise unwritten(self, "predict")
+    def predict(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> PyTree:
+        """Return the state after row k where none of its data arrived."""
+        missing = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), row[0])
+        return self.step(state, (missing, row[1]), k)[0]
 
 
 class FilterRows(Recursion):
-    """A filter over rows (z, u), and what is kept of each: output(filter, state, innovation, k)."""
+    """A filter over rows, and what is kept of each: output(filter, state, innovation, k)."""
 
     filter: Any
     output: Callable[..., PyTree] = eqx.field(static=True)
@@ -68,10 +69,6 @@ class FilterRows(Recursion):
         z, u = row
         after, innovation = self.filter.correct(self.filter.predict(state, u, k), z, k)
         return after, self.output(self.filter, after, innovation, k)
-
-    def predict(self, state: PyTree, row: tuple[Array, Array], k: Array) -> PyTree:
-        """Predict alone."""
-        return self.filter.predict(state, row[1], k)
 
 
 class Pass(NamedTuple):

@@ -18,6 +18,7 @@ from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_spacin
 from heliograph.model.unequal_steps import common_dates, judge_dates
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.linalg import find_lost
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -121,7 +122,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> F
     whole = filter_in_chunks(filter, rows_z, rows_u, _tell_estimate)
     state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u))
     mean, covariance, innovation = outputs
-    lost = ~np.isfinite(mean).all(axis=1)
+    lost = find_lost(mean, 1)
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
         warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)

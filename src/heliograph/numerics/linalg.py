@@ -195,3 +195,16 @@ def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
     """Return L^-1 x for a positive semidefinite A = L L'; NaN for a component that those before it determine."""
     lower, scales = factor(a)
     return jnp.where(scales == 0, jnp.nan, _substitute(lower, scales, x[:, None])[:, 0] * scales)
+
+
+def find_lost(values: np.ndarray, axes: int) -> np.ndarray:
+    """Return which arrays of the last `axes` axes have a number that is not finite.
+
+    The sum of all is one too then, and takes a third of the time: only if it is not finite, by which it may also have
+    overflowed, is each number looked at.
+    """
+    with np.errstate(all="ignore"):
+        if np.isfinite(np.sum(values)):
+            return np.zeros(values.shape[: values.ndim - axes], dtype=bool)
+    lost: np.ndarray = ~np.isfinite(values).all(axis=tuple(range(-axes, 0)))
+    return lost

@@ -10,6 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
+from heliograph.filters.chunks import Recursion, scan_in_chunks
 from heliograph.model.estimate import Estimate
 from heliograph.model.origin import Origin, last_input, usual_spacing
 from heliograph.model.plant import TIME_STEP
@@ -17,7 +18,7 @@ from heliograph.model.unequal_steps import common_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.times.row_times import check_times
-from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
@@ -253,9 +254,34 @@ def _collect_central_states(
 
 def _filter_rows(*arguments: PyTree) -> PyTree:
     """Run `_run_filters`, with results as NumPy arrays, by native code where it supports the filters."""
+    in_chunks = _filter_in_chunks(*arguments)
+    if in_chunks is not None:
+        return in_chunks
     # Joint covariances are stored at places that the graph, an argument here, decides: XLA's.
     by_xla = any(mesh.is_long or mesh.needs_joint for mesh in arguments[0].meshes.values())
     return _scan_in_parts(*arguments) if by_xla else compute_once(_run_filters, _by_xla, arguments)
+
+
+class NetworkRows(Recursion):
+    """All filters of a network over rows, with all that is said of them kept."""
+
+    filters: AllFilters
+
+    def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
+        """Step all filters."""
+        z, u = row
+        return self.filters.step(state, z, jnp.asarray(u), jnp.asarray(k), {})
+
+
+def _filter_in_chunks(
+    filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
+    without: bool,
+) -> PyTree | None:  # fmt: skip
+    """Filter rows in chunks side by side; None where a part is not linear, is smoothed or fused, or rows are few."""
+    if without or later is not None or not filters.are_linear:
+        return None
+    whole = scan_in_chunks(NetworkRows(filters), to_numpy(initial_states(filters)), (z, u))
+    return None if whole is None else _results(later, z, *whole)
 
 
 def _scan_in_parts(

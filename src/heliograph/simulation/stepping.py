@@ -123,6 +123,13 @@ class AllFilters(Module):
         return centre.init([x.mean.reshape(count, -1, self.n)[f] for x, count, f in beliefs])
 
     @property
+    def are_linear(self) -> bool:
+        """Test whether all are filters, and of each no gain depends on data."""
+        filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
+        alone = not (self.fusions or self.centres or self.reporting or self.meshes)
+        return alone and all(filter.is_linear for filter in filters)
+
+    @property
     def informed(self) -> tuple[Centre, ...]:
         """Centres of filters whose gains do not depend on data."""
         return tuple(centre for centre in self.centres if isinstance(centre, Centre))

@@ -42,7 +42,7 @@ class SmoothedRows(NamedTuple):
 
 
 class SmootherRows(Recursion):
-    """A filter over rows (z, u), of each of which its smoother step is kept; `own`: rows of a chunk."""
+    """A filter over rows, of each of which its smoother step is kept; `own`: rows of a chunk."""
 
     filter: Any
     own: int = eqx.field(static=True)
@@ -54,10 +54,6 @@ class SmootherRows(Recursion):
         after, innovation = self.filter.correct(prior, z, k)
         trace = StepTrace(state, prior, after, innovation, z, u, jnp.asarray(k))
         return after, add_nis(self.filter.smoother_step(trace), innovation)
-
-    def predict(self, state: PyTree, row: tuple[Array, Array], k: Array) -> PyTree:
-        """Predict alone."""
-        return self.filter.predict(state, row[1], k)
 
 
 class SmoothedChunk(NamedTuple):

@@ -15,6 +15,7 @@ from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.origin import KeptOrigin, Origin
 from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.linalg import find_lost
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import units_in
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
@@ -361,9 +362,9 @@ def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel:
             warnings.warn(f"{what}: no finite number {when}", stacklevel=stacklevel + 1)
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
-            bad = ~np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
+            bad = find_lost(np.asarray(estimate.mean), 1)
             if estimate.claim != "none" and node != FUSED:  # there a quantizer may say that it knows no bound
-                bad |= ~np.isfinite(np.asarray(estimate.covariance)).all(axis=(-1, -2))
+                bad |= find_lost(np.asarray(estimate.covariance), 2)
             what = "mean" if estimate.claim == "none" else "covariance"
             for when in _describe_when(bad):
                 warnings.warn(f"{node}/{name}: no valid {what} {when}", stacklevel=stacklevel + 1)
