@@ -7,7 +7,8 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_site"))
 
-import reference  # noqa: E402  (found in the folder above)
+import notebooks  # noqa: E402  (found in the folder above)
+import reference  # noqa: E402
 
 project = "heliograph"
 author = "The heliograph authors"
@@ -42,6 +43,7 @@ sphinx_gallery_conf = {
     "image_scrapers": ("matplotlib",),
     "matplotlib_animations": False,
     "capture_repr": (),
+    "first_notebook_cell": notebooks.INSTALL,
 }
 
 html_theme = "pydata_sphinx_theme"

@@ -86,12 +86,15 @@ FEW, SOME, LARGE = 4, 8, 20  # numbers of an array, items on a line, rows of a t
 def readable(kind: T) -> T:
     """Give a class, and those made from it, the short `repr`, the table for notebooks and an `==` with one answer.
 
+    A class that draws itself for notebooks, by a `_repr_html_` of its own, keeps that.
+
     An attribute that there is not is refused with the names most like it.
     """
     if not hasattr(kind, "__getattr__"):
         kind.__getattr__ = refuse_attribute  # type: ignore[attr-defined]
     for name, method in (("__repr__", _write_repr), ("_repr_html_", _html), ("__eq__", _equal)):
-        setattr(kind, name, method)
+        if name != "_repr_html_" or name not in vars(kind):
+            setattr(kind, name, method)
     return kind
 
 

@@ -40,6 +40,7 @@ from heliograph.simulation.results.plots import (
     make_panels,
     state_places,
 )
+from heliograph.simulation.results.record_html import draw_record
 from heliograph.simulation.results.saved import Saved
 
 if TYPE_CHECKING:  # extras
@@ -98,6 +99,10 @@ class Record(Saved):
         """Take the units of states whose names have one; units given apart come first."""
         if isinstance(self.states, tuple) and (units := units_in(self.states)):
             object.__setattr__(self, "units", units | self.units)
+
+    def _repr_html_(self) -> str:
+        """Draw the estimates with their bands, for notebooks."""
+        return draw_record(self)
 
     def with_origin(self, origin: Origin) -> "Record":
         """Return the same record with the states in which its filters ended."""

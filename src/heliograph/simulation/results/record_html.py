@@ -1,0 +1,177 @@
+"""A record as HTML for notebooks: each state's estimates with their bands, without a plotting package."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from typing import Protocol
+
+import numpy as np
+
+from heliograph.disk.palette import COLOURS
+from heliograph.disk.quoting import label_with_unit, visible
+from heliograph.model.estimate import Estimate
+
+PANELS, FILTERS, POINTS = 6, 4, 500  # drawn at most: states, filters of a node, and rows of them
+SIGMAS = 2.0  # half-width of bands in claimed deviations
+WIDE, HIGH = 1000.0, 100.0  # the units of a drawing, which is as wide as there is room
+LEAST = 1e-12  # the part of a value that is the least height of a panel
+
+
+class Trajectories(Protocol):
+    """What is drawn of a record."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """Return numbers or dates, (time,)."""
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Return the names of the states."""
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Return units by name."""
+
+    @property
+    def truth(self) -> np.ndarray | None:
+        """Return the true states, where they are known."""
+
+    @property
+    def estimates(self) -> dict[str, dict[str, Estimate]]:
+        """Return estimates by node and filter."""
+
+    @property
+    def runs(self) -> int | None:
+        """Return the number of Monte Carlo runs."""
+
+    def of_run(self, run: int) -> "Trajectories":
+        """Return one of the runs."""
+
+
+def draw_record(record: Trajectories) -> str:
+    """Draw the estimates of the first node that has any: means with bands of two claimed deviations, and the truth.
+
+    Args:
+        record: a record; of Monte Carlo runs the first is drawn.
+
+    Returns:
+        HTML that fetches nothing, runs nothing, and fits any width.
+    """
+    node = next((name for name, filters in record.estimates.items() if filters), None)
+    rows, runs = len(record.time), record.runs
+    title = f"{type(record).__name__}: {rows} row{'s' * (rows != 1)}"
+    title += "" if runs is None else f" of {runs} runs, the first drawn"
+    if node is None or rows == 0 or runs == 0:
+        return f"<div>{title}, no estimates</div>"
+    one = record if runs is None else record.of_run(0)
+    filters = dict(list(one.estimates[node].items())[:FILTERS])
+    chosen = np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).round().astype(int))
+    left = len(one.estimates[node]) - len(filters), len(one.states) - PANELS
+    more = [f"{count} more {what}" for count, what in zip(left, ("filters", "states"), strict=True) if count > 0]
+    more += [f"{len(chosen)} rows of {rows} drawn"] if len(chosen) < rows else []
+    panels = [_draw_panel(one, filters, i, chosen) for i in range(min(len(one.states), PANELS))]
+    times = "".join(f"<span>{escape(_print_time(record.time[k]))}</span>" for k in (0, -1))
+    note = f"<div>{escape('; '.join(more))}</div>" if more else ""
+    return (
+        '<div style="max-width:640px;font-size:13px;line-height:1.4">'
+        f"<div><b>{escape(visible(title))}</b>, node {escape(visible(node))}</div>{_make_legend(filters, one)}"
+        f'{"".join(panels)}<div style="display:flex;justify-content:space-between">{times}</div>{note}</div>'
+    )
+
+
+def _make_legend(filters: Mapping[str, Estimate], record: Trajectories) -> str:
+    """Return a line of the filters with their colours and claims, and of the truth where it is drawn."""
+    entries = [
+        (f"background:{colour}", f"{name} ({estimate.claim})")
+        for colour, (name, estimate) in zip(COLOURS, filters.items(), strict=False)
+    ]
+    entries += [("border-top:2px dashed;height:0", "truth")] if record.truth is not None else []
+    marks = [
+        f'<span style="margin-right:12px"><span style="display:inline-block;width:14px;height:8px;{style};'
+        f'margin-right:4px"></span>{escape(visible(said))}</span>'
+        for style, said in entries
+    ]
+    return f"<div>{''.join(marks)}</div>"
+
+
+def _draw_panel(record: Trajectories, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
+    """Return one state: its name and last value, the range of its axis, and the drawing."""
+    curves = [_read_curve(estimate, state, chosen) for estimate in filters.values()]
+    truth = None if record.truth is None else np.asarray(record.truth)[chosen, state]
+    low, high = _find_range([part for curve in curves for part in curve] + ([] if truth is None else [truth]))
+
+    def scaled(values: np.ndarray) -> np.ndarray:
+        return HIGH * (high - values) / (high - low)
+
+    parts = []
+    for colour, (mean, lower, upper) in zip(COLOURS, curves, strict=False):
+        parts += [f'<path d="{d}" fill="{colour}" fill-opacity="0.2" stroke="none"/>'
+                  for d in _outline(scaled(lower), scaled(upper))]  # fmt: skip
+        parts.append(_draw_line(scaled(mean), colour))
+    if truth is not None:
+        parts.append(_draw_line(scaled(truth), "currentColor", ' stroke-dasharray="4 3"'))
+    (mean, _, upper), *_ = curves
+    last = f"{mean[-1]:.4g}" + (f" ± {upper[-1] - mean[-1]:.2g}" if np.isfinite(upper[-1]) else "")
+    name = escape(visible(label_with_unit(record.states[state], record.units)))
+    return (
+        f'<div style="display:flex;justify-content:space-between;margin-top:6px"><span>{name}</span>'
+        f"<span>last {last}</span></div>"
+        '<div style="display:grid;grid-template-columns:auto minmax(0,1fr);gap:0 6px">'
+        '<div style="display:flex;flex-direction:column;justify-content:space-between;text-align:right">'
+        f"<span>{high:.3g}</span><span>{low:.3g}</span></div>"
+        f'<svg viewBox="0 0 {WIDE:g} {HIGH:g}" preserveAspectRatio="none" role="img" aria-label="{name}" '
+        f'style="width:100%;height:110px;border:1px solid rgba(128,128,128,0.4)">{"".join(parts)}</svg></div>'
+    )
+
+
+def _read_curve(estimate: Estimate, state: int, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean, lower and upper end of the band; NaN where nothing is claimed."""
+    mean = np.asarray(estimate.mean)[chosen, state]
+    variance = np.asarray(estimate.covariance)[chosen, state, state]
+    claimed = (variance >= 0) & (estimate.claim != "none")
+    half = SIGMAS * np.sqrt(np.where(claimed, variance, np.nan))
+    return mean, mean - half, mean + half
+
+
+def _find_range(parts: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the range of all finite values, a little wider, and never empty."""
+    values = np.concatenate(parts)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    room = max(0.04 * (high - low), LEAST * max(abs(low), abs(high), 1.0))
+    return low - room, high + room
+
+
+def _places(count: int) -> np.ndarray:
+    """Return where the points of a curve are from left to right."""
+    return WIDE * (np.arange(count) + 0.5) / count if count == 1 else np.linspace(0, WIDE, count)
+
+
+def _pieces(finite: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the numbers of points that follow one another without a gap."""
+    numbers = np.flatnonzero(finite)
+    yield from (piece for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(piece))
+
+
+def _draw_line(y: np.ndarray, colour: str, more: str = "") -> str:
+    """Return a curve, broken where there is no value."""
+    x = _places(len(y))
+    d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _pieces(np.isfinite(y)))
+    return (
+        f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"'
+        f' stroke-linecap="round"{more}/>'
+    )
+
+
+def _outline(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
+    """Yield the outlines of a band, one for each piece without a gap."""
+    x = _places(len(lower))
+    for piece in _pieces(np.isfinite(lower) & np.isfinite(upper)):
+        ends = [f"{x[k]:.1f} {upper[k]:.2f}" for k in piece] + [f"{x[k]:.1f} {lower[k]:.2f}" for k in piece[::-1]]
+        yield f"M{'L'.join(ends)}Z"
+
+
+def _print_time(time: np.generic) -> str:
+    """Return a time to the second, or a number."""
+    return np.datetime_as_string(time, "s") if isinstance(time, np.datetime64) else f"{float(time):g}"
