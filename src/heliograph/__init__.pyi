@@ -88,6 +88,9 @@ from .filters.gaussian.unscented import (
 from .filters.linear.linear import (
     linear_filter as linear_filter,
 )
+from .filters.words.word_filter import (
+    word_filter as word_filter,
+)
 from .filters.linear.polynomial import (
     polynomial_filter as polynomial_filter,
 )

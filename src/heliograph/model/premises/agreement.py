@@ -89,6 +89,7 @@ def join_premises(premises: Sequence[Premise]) -> Premise:
         sensor=sensor,
         channel=channel,
         trigger=triggers[0] if triggers else None,
+        encoder=next((premise.encoder for premise in premises if premise.encoder is not None), None),
         range=ranges[0] if ranges else None,
         order=None if any(premise.order is None for premise in premises) else MEAN_AND_COVARIANCE,
     )

@@ -1,0 +1,167 @@
+"""What the received words say of each bit that was sent: likelihoods of a zero and a one, back along the links."""
+
+from collections.abc import Sequence
+from itertools import product
+from math import prod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.word_route import refuse_link
+from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Float
+from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.flips import Flips
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.mixture import Mixture
+from heliograph.random_affine.modes import ModeOutput, Modes
+
+MOST = 64  # combinations of error rates
+
+Pairs = jax.Array  # (words, bits, 2): likelihoods of a zero and a one
+
+
+class LinkOfBits(Module):
+    """A channel of words as the laws that it may have at a step, each with known error rates.
+
+    Args:
+        links: the channel with each combination of error rates.
+        weights: probabilities of these, for each mode where modes are told, (modes, combinations).
+        flag: output at which the mode is told; None without modes.
+    """
+
+    links: tuple[AbstractRandomAffine, ...]
+    weights: Float[np.ndarray, "modes combinations"]
+    flag: int | None = eqx.field(static=True)
+
+    def weigh(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
+        """Return the probabilities of the combinations given what was told; all modes alike where nothing was."""
+        weights = jnp.asarray(self.weights)
+        if self.flag is None:
+            return weights[0]
+        told = z[self.flag]
+        chosen = jnp.where(jnp.isnan(told), 1 / len(weights), told == np.arange(len(weights)))
+        return chosen @ weights
+
+    def pairs(self, received: Pairs) -> list[Pairs]:
+        """Return for each combination what the received bits say of those that were sent, (components, bits, 2)."""
+        return [send_back(link, received) for link in self.links]
+
+
+def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
+    """Describe a channel of words by its laws with known error rates.
+
+    Raises:
+        ValueError: a channel that is late, modes that are not told, more than 64 combinations of error rates.
+    """
+    if channel.past:
+        expected = "a link that is not late (linear_filter takes delays)"
+        raise fail("channel of a word filter", expected, f"one late by up to {channel.past} steps")
+    if not channel.remembers:
+        fixed = _fix_rates(channel)
+        weights = np.array([[share for share, _ in fixed]], dtype=float)
+        return LinkOfBits(tuple(link for _, link in fixed), weights, None)
+    parts = channel.in_parallel
+    flags = [part for part in parts if isinstance(part, ModeOutput)]
+    chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
+    told = len(flags) == 1 and set(chains) == {flags[0].memory.identity}
+    if not told or parts[-1] is not flags[0] or len(parts) < 2:
+        expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
+        raise fail("channel of a word filter", expected, "modes that are not told")
+    modes = next(iter(chains.values())).modes
+    links, rows = list[AbstractRandomAffine](), list[np.ndarray]()
+    for mode in range(modes):
+        fixed = _fix_rates(Stack([_choose_mode(part, mode) for part in parts[:-1]]))
+        links += [link for _, link in fixed]
+        rows.append(np.array([share for share, _ in fixed], dtype=float))
+    weights = np.zeros((modes, len(links)))
+    start = 0
+    for mode, row in enumerate(rows):
+        weights[mode, start : start + len(row)] = row
+        start += len(row)
+    return LinkOfBits(tuple(links), weights, channel.outputs - 1)
+
+
+def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
+    inside = [mode for inner in inner_maps(link) for mode in _list_modes(inner)]
+    return [link, *inside] if isinstance(link, Modes) else inside
+
+
+def _choose_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
+    """Return a map in one mode of its chain."""
+    if isinstance(link, Modes):
+        return link.given(mode)
+    return replace_inner_maps(link, [_choose_mode(inner, mode) for inner in inner_maps(link)])
+
+
+def _fix_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractRandomAffine]]:
+    """List the combinations of error rates and choices of a link, each with its probability."""
+    if isinstance(link, Flips):
+        atoms = link.error.list_atoms()
+        return [(float(share), Flips(Constant(p), link.dimension, link.per_message)) for share, p in atoms]
+    if isinstance(link, Mixture):
+        shares = zip(np.asarray(link.choice.probabilities), link.maps, strict=True)
+        return [(float(share) * p, fixed) for share, one in shares for p, fixed in _fix_rates(one)]
+    inner = [_fix_rates(part) for part in inner_maps(link)]
+    if prod(len(fixed) for fixed in inner) > MOST:
+        raise fail("channel of a word filter", f"at most {MOST} combinations of error rates", "more")
+    combinations = list(product(*inner))
+    return [
+        (prod(share for share, _ in chosen), replace_inner_maps(link, [fixed for _, fixed in chosen]))
+        for chosen in combinations
+    ]
+
+
+def send_back(link: AbstractRandomAffine, received: Pairs) -> Pairs:
+    """Return the likelihoods of the bits that went into a link, from those of the bits that came out.
+
+    A bit that may have been flipped: l(s) = (1 - p) l'(s) + p l'(-s); one that was copied: the product; one that
+    nobody received: 1.
+
+    Args:
+        link: of known error rates.
+        received: likelihoods at its outputs, (words, bits, 2).
+    """
+    match link:
+        case Flips():
+            p = jnp.asarray(link.error.moment(1))
+            return (1 - p) * received + p * received[..., ::-1]
+        case GainAndNoise():
+            rows = np.asarray(link.matrix) > 0
+            into = [_multiply([received[i] for i in np.flatnonzero(column)], received.shape[1:]) for column in rows.T]
+            return jnp.stack(into)
+        case Series():
+            for part in reversed(link.maps):
+                received = send_back(part, received)
+            return received
+        case Stack():
+            ends = np.cumsum([part.outputs for part in link.maps])[:-1]
+            pieces = zip(link.maps, jnp.split(received, ends), strict=True)
+            return _multiply([send_back(part, piece) for part, piece in pieces], ())
+        case Erasure():
+            return send_back(link.base, received)
+    raise refuse_link(type(link).__name__)
+
+
+def _multiply(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array:
+    """Return the product; ones of nothing."""
+    result = jnp.ones(shape) if not factors else factors[0]
+    for factor in factors[1:]:
+        result = result * factor
+    return result
+
+
+def is_free_of_flips(link: LinkOfBits) -> bool:
+    """Test whether no bit is ever flipped."""
+    return all(float(flips.error.moment(1)) == 0 for one in link.links for flips in _list_flips(one))
+
+
+def _list_flips(link: AbstractRandomAffine) -> list[Flips]:
+    inside = [flips for inner in inner_maps(link) for flips in _list_flips(inner)]
+    return [link, *inside] if isinstance(link, Flips) else inside

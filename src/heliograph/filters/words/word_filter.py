@@ -1,0 +1,289 @@
+"""The filter behind words that knows what a rounded number and a flipped bit are: exact moments of a Gaussian prior."""
+
+from copy import copy
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, join_columns, rounding_of
+from heliograph.factors.gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
+from heliograph.factors.repeated import triangularise_noise
+from heliograph.filters.base import Step, corrects, make_sizes
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.words.cells import Change, Grid, Prior, change_by_bits, change_by_cell
+from heliograph.filters.words.received import LinkOfBits, describe_link, is_free_of_flips
+from heliograph.model.channel import Channel, check_link, perfect
+from heliograph.model.estimate import Innovation
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.sensor import AbstractSensor, AnySensor, refuse_angles
+from heliograph.model.word_route import FLAG, about_centres, find_places
+from heliograph.model.words import Dither, Words
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.types import Array, ArrayLike
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.modes import ModeOutput
+from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.rounded import LARGEST, Rounded, find_rounded
+
+OFF = 1e-6  # steps by which a received number may miss a word
+
+
+class WordFilter(AbstractBeliefFilter):
+    """The Gaussian filter that conditions on the received words themselves.
+
+    Of y ~ N(m, S), component after component in the joint Gaussian of the state and what is measured, a word leaves the
+    mean m + S (ln M)' and the variance S + S^2 (ln M)'', by m, with M(m) the probability of what came; x follows
+    y: mean + k (E y - m), P - k k' (S - Var y), k = Cov(x, y)/S. The variance may grow, where y is on either
+    side of a flipped bit.
+
+    Args:
+        sensor: h and the law of v, without rounding.
+        links: the laws of the bits, None where no bit flips and the words have no end.
+        numbers: second moments of the words as numbers about their centres, for the innovation.
+        low: of each component, a word.
+        spacing: D of each component.
+        centre: of the words of each component.
+        places: component of each output of the channel, FLAG of what is told.
+        bits: of a word; 0 without end.
+        dither: of the encoder.
+        certain: True if no bit flips.
+    """
+
+    sensor: AnySensor
+    links: LinkOfBits | OverTime
+    numbers: SecondOrder | OverTime
+    low: Array
+    spacing: Array
+    centre: Array
+    places: tuple[int, ...] = eqx.field(static=True)
+    bits: int = eqx.field(static=True)
+    dither: Dither = eqx.field(static=True)
+    certain: bool = eqx.field(static=True)
+
+    @corrects
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
+        """Correct with the words that arrived, one component of y after another."""
+        z, n = jnp.asarray(z), len(self.states)
+        signal = self._measure(state, k)
+        noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
+        joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
+        words = self._read(z, at(self.links, k))
+        for i in range(len(self.low)):
+            row = joint.root[n + i]
+            prior = Prior(joint.mean[n + i], jnp.sqrt(row**2 @ joint.variances))
+            change = self._condition(i, words, prior)
+            there = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
+            row = jnp.where(there, row, 0.0)
+            shift, ratio = jnp.where(there, change.shift, 0.0), jnp.where(there, change.ratio, 1.0)
+            joint = impose_moments_of_combination(joint, row, shift * prior.deviation, ratio)
+            total = total + jnp.where(words.present[i], change.log_mass, 0.0)
+        total = jnp.where(words.are_words, total, -jnp.inf)
+        return take_leading(joint, n), self._innovation(signal, words, z, at(self.numbers, k), total)
+
+    @property
+    def of_atoms(self) -> bool:
+        """Always True: a number that is no word is excluded."""
+        return True
+
+    def _measure(self, state: Gaussian, k: Step) -> Signal:
+        """Return the moments of y before it is rounded."""
+        plant, sensor = at(self.plant, k), at(self.sensor, k)
+        return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
+
+    def _read(self, z: jax.Array, link: LinkOfBits) -> "Received":
+        """Read which words were received, and what their bits say of those that were sent."""
+        outputs = len(self.places)
+        rows = [i for i, place in enumerate(self.places) if place != FLAG]
+        places = np.array([self.places[i] for i in rows])
+        d = z[outputs:] if len(z) > outputs else jnp.zeros(len(rows))
+        index = (z[np.array(rows)] - jnp.asarray(self.low)[places]) / jnp.asarray(self.spacing)[places]
+        there = ~jnp.isnan(index) & ~jnp.isnan(d)
+        number = jnp.round(jnp.where(there, index, 0.0))
+        tolerance = OFF + 8 * np.finfo(float).eps * jnp.abs(number)
+        wrong = jnp.abs(jnp.where(there, index, 0.0) - number) > tolerance
+        if self.bits:
+            wrong = wrong | (number < 0) | (number > 2.0**self.bits - 1)
+        # The first copy of each component, and its dither, which all copies share.
+        count = len(self.low)
+        copies = [[j for j, place in enumerate(places) if place == i] for i in range(count)]
+        first_copy = [_pick_first([(there[j], number[j], d[j]) for j in of]) for of in copies]
+        present = jnp.stack([came for came, _, _ in first_copy])
+        numbers, dithers = (jnp.stack([one[part] for one in first_copy]) for part in (1, 2))
+        pairs, weights = list[jax.Array](), jnp.ones(1)
+        if not self.certain:
+            bit = jnp.mod(jnp.floor(number[:, None] / 2.0 ** np.arange(self.bits)), 2.0)
+            sure = jnp.stack([1 - bit, bit], axis=-1)
+            pairs = link.pairs(jnp.where(there[:, None, None], sure, 1.0))
+            weights = link.weigh(z[:outputs])
+        return Received(numbers, dithers, present, pairs, weights, ~jnp.any(wrong & there))
+
+    def _condition(self, i: int, words: "Received", prior: Prior) -> Change:
+        """Condition y_i on what was received of its word."""
+        grid = Grid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
+        if self.certain:
+            return change_by_cell(words.numbers[i], grid, prior, self.dither)
+        pairs = [one[i] for one in words.pairs]
+        return change_by_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
+
+    def _innovation(
+        self, signal: Signal, words: "Received", z: jax.Array, numbers: SecondOrder, total: jax.Array
+    ) -> Innovation:
+        """Return the innovation of the words as numbers about their centres, flags and dithers as not received."""
+        error = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
+        mean = signal.mean - jnp.asarray(self.centre)
+        noise = join_columns(signal.noise, Columns(np.eye(len(self.low)), error))
+        second = signal.covariance + jnp.diag(error) + jnp.outer(mean, mean)
+        about = signal._replace(mean=mean, noise=noise, second=second)
+        rows = np.array([i for i, place in enumerate(self.places) if place != FLAG])
+        places = np.array(self.places)[rows]
+        gain = jnp.asarray(numbers.mean_gain)
+        values = z[rows] - jnp.asarray(self.centre)[places]
+        taken = jnp.sum(gain, axis=1) * z[len(self.places) :] if len(z) > len(self.places) else 0.0
+        value = values - taken - (gain @ mean + jnp.asarray(numbers.offset))
+        covariance = innovation_covariance(about, numbers)
+        there = ~jnp.isnan(value)
+        covariance = jnp.where(there[:, None] & there, covariance, jnp.nan)
+        whole = jnp.full((len(z), len(z)), jnp.nan).at[rows[:, None], rows].set(covariance)
+        return Innovation(jnp.full(len(z), jnp.nan).at[rows].set(value), whole, total)
+
+
+class Received(NamedTuple):
+    """What was received: number of the word, dither and presence of each component, and what the bits say.
+
+    Shapes: numbers, dithers, present (components,), pairs (components, bits, 2) of each combination of error rates,
+    weights of these; are_words () says whether all that came are words.
+    """
+
+    numbers: jax.Array
+    dithers: jax.Array
+    present: jax.Array
+    pairs: list[jax.Array]
+    weights: jax.Array
+    are_words: jax.Array
+
+
+def _pick_first(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
+    """Return presence, number and dither of the first copy that came; zeros of none."""
+    chosen = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
+    for came, number, d in reversed(copies):
+        chosen = came | chosen[0], jnp.where(came, number, chosen[1]), jnp.where(came, d, chosen[2])
+    return chosen
+
+
+class Alphabet(NamedTuple):
+    """The words of each component: a word, the step and the centre, bits (0 without end), and the dither."""
+
+    low: np.ndarray
+    step: np.ndarray
+    centre: np.ndarray
+    bits: int
+    dither: Dither
+
+
+def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> Alphabet:
+    """Return the words of an encoder, or of a sensor that reports multiples of its resolution."""
+    m = len(sensor.outputs)
+    rounded = find_rounded(sensor)
+    if encoder is not None:
+        instance("encoder", encoder, Words, "Words").check_outputs(m)
+        if rounded:
+            expected = "one without resolution, as words have their own"
+            raise fail("sensor of a node with an encoder", expected, "a resolution")
+        low, step, centre = (encoder.each(end, m) for end in (encoder.low, encoder.step, encoder.centre))
+        return Alphabet(low, step, centre, encoder.bits, encoder.dither)
+    if not isinstance(sensor.noise, Rounded):
+        raise fail("word filter", "an encoder (Words), or a sensor with a resolution", "neither")
+    return Alphabet(np.zeros(m), np.asarray(sensor.noise.step), np.zeros(m), 0, "none")
+
+
+def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
+    """Return the sensor with the noise that it has before it rounds."""
+    if not isinstance(sensor.noise, Rounded):
+        return sensor
+    twin = copy(sensor)
+    object.__setattr__(twin, "noise", sensor.noise.source)
+    return twin
+
+
+def _describe_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
+    """Return the second moments of the words that arrive as numbers about their centres, modes averaged over."""
+    words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
+    link = words[0] if len(words) == 1 else Stack(words)
+    numbers = link if encoder is None else about_centres(encoder, link)
+    forgets = without_memory(first(numbers).condition_on_arrival())
+    return second_order(first(forgets))
+
+
+def word_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel | None = None,
+    encoder: Words | None = None,
+    transform: AbstractTransform | None = None,
+) -> WordFilter:
+    """Return the filter that knows what a rounded number is, and what a flipped bit does.
+
+    Given the Gaussian prior its update has the exact mean and covariance: of words of at most 6 bits, and of all whose
+    step is a quarter of the deviation of y or more, to rounding; finer words are merged to cells of an eighth to a
+    quarter of it, which changes the mean by 1e-4 deviations and the variance by .6 %. At p = .01 and 8 bits it has half
+    the error of the best linear filter, and is as good as with a checksum that costs no bit.
+
+    One word over several paths is used as one: the bits of all that came are weighed together. Error rates that are
+    drawn are averaged over. Modes that are told with each message (`hg.model.with_flag`) have their own rates.
+
+    Args:
+        plant: linear or not; n states.
+        sensor: linear or not; with a `resolution` if there is no encoder.
+        channel: of words, from the sensor to the filter: all arrives by default.
+        encoder: `Words` of the sender; None for a sensor that reports multiples of its resolution.
+        transform: moments of a plant or sensor that is not linear, `Cubature()` by default.
+
+    Claim: "nominal": the prior is not Gaussian after the first word. The squared error is as claimed within a tenth
+    where a step is at most three deviations of y, and everywhere with a dither that is taken off.
+
+    Raises:
+        ValueError: parts that do not fit, angles, neither encoder nor resolution or both, a channel that is late, modes
+            that are not told, words without end behind more than losses.
+
+    Source: Curry, Estimation and control with quantized measurements (1970), the Gaussian fit, for any word channel.
+    """
+    start = check_plant(plant)
+    channel = perfect(len(first(sensor).outputs)) if channel is None else channel
+    check_link(first(sensor), first(channel), len(start.states), late=True)
+    refuse_angles("word filter", plant, sensor)
+    words = _alphabet_of(first(sensor), encoder)
+    places = find_places(channel)
+    links = at_each_step(describe_link, channel)
+    certain = all(is_free_of_flips(link) for link in unstack(links))
+    if encoder is None and not certain:
+        raise fail("encoder", "Words, whose bits the channel flips", "none")
+    rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
+    dithers = sum(place != FLAG for place in places) if words.dither == "subtracted" else 0
+    filter = WordFilter(
+        plant=plant,
+        transform=rule,
+        initial_mean=start.initial_mean,
+        initial_covariance=start.initial_covariance,
+        sensor=at_each_step(_take_off_rounding, sensor),
+        links=links,
+        numbers=at_each_step(partial(_describe_numbers, encoder), channel),
+        low=words.low,
+        spacing=words.step,
+        centre=words.centre,
+        places=places,
+        bits=words.bits,
+        dither=words.dither,
+        certain=certain,
+        **make_sizes("nominal", start, len(places) + dithers),
+    )
+    return believing(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))
