@@ -13,7 +13,7 @@ from heliograph.factors.columns import eliminate
 from heliograph.numerics.check import fail, scalar, show_value
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
 from heliograph.random_affine.chain import AbstractMemory, CertainChain, MarkovChain, Nodes, identify_memory
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
@@ -279,6 +279,16 @@ def told_maps(channel: AbstractRandomAffine) -> list[AbstractTold]:
         if _is_told(leaf):
             by_identity.setdefault(leaf.memory.identity, leaf)
     return list(by_identity.values())
+
+
+def numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarray, "outputs told"]:
+    """Return which of the numbers told each output of a channel depends on: those of the map that it comes out of."""
+    identities = [affine.memory.identity for affine in told_maps(channel) for _ in range(affine.memory.announced)]
+    rows = list[list[bool]]()
+    for part in channel.in_parallel:
+        own = {affine.memory.identity for affine in told_maps(part)}
+        rows += [[identity in own for identity in identities]] * part.outputs
+    return np.array(rows)
 
 
 def believe_told(channel: T, numbers: Numbers) -> T:

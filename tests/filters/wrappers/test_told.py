@@ -144,6 +144,24 @@ def test_fusion_centre_that_is_told_by_each_node():
     np.testing.assert_allclose(record.estimates["fused"]["all"].mean, expected.means, rtol=1e-11, atol=1e-13)
 
 
+def test_of_several_links_only_the_value_is_not_used_whose_number_is_missing():
+    """A centre that is told a gain by one node and a variance by the other, and hears one or the other alone."""
+    sensors = {"a": SENSOR, "b": hg.LinearSensor([[0.0, 1.0]], 0.2)}
+    links = {"a": LINKS["gain"][0], "b": LINKS["variance"][0]}
+    centre = hg.linear_filter(PLANT, hg.model.joint_sensor(sensors), hg.parallel(list(links.values())))
+    z, a, b = np.concatenate([rows(gains()), rows(gains()[::-1])], axis=1), gains(), gains()[::-1]
+    z[2, 1], z[5, 3], z[7, [1, 3]], z[9, 2:] = np.nan, np.nan, np.nan, np.nan
+    given = [hg.parallel([hg.hop(g, 0.1), hg.hop(1.0, r)]) for g, r in zip(a, b, strict=True)]
+    heard = np.where(np.isnan(z[:, [1, 3]]), np.nan, z[:, [0, 2]])
+    expected = hg.linear_filter(PLANT, hg.model.joint_sensor(sensors), over_time(given)).run(heard)
+    found = centre.run(z)
+    np.testing.assert_allclose(found.means, expected.means, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(found.covariances, expected.covariances, rtol=1e-11, atol=1e-14)
+    nodes = {name: hg.Node(sensors[name], links[name], {}) for name in links}
+    record = hg.run(hg.Network(PLANT, nodes, {"all": centre}), {"a": z[:, :2], "b": z[:, 2:]})
+    np.testing.assert_allclose(record.estimates["fused"]["all"].mean, expected.means, rtol=1e-11, atol=1e-13)
+
+
 def test_message_without_its_number_is_not_used_but_without_a_pilot_by_the_law():
     a = gains()
     z = rows(a)

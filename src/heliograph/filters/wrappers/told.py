@@ -34,7 +34,7 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.told import believe_told, give_law, made_certain, told_maps
+from heliograph.random_affine.told import believe_told, give_law, made_certain, numbers_of_outputs, told_maps
 
 ROUNDING = 1e-12  # of squared gains
 
@@ -56,8 +56,8 @@ class MakeFilter(Module):
 class ToldFilter(AbstractSizedFilter):
     """The filter that `make` builds, for each message behind the link whose law its numbers give.
 
-    Between messages all such filters are one: how a state moves depends on the plant, not on the link. A message with
-    a number missing is not used, but for a pilot: without a reading the gain has its own law.
+    Between messages all such filters are one: how a state moves depends on the plant, not on the link. A value is not
+    used where a number is missing that tells of its own link, but for a pilot: without a reading the gain has its law.
 
     Args:
         base: the filter for typical numbers, which predicts.
@@ -164,9 +164,10 @@ class ToldFilter(AbstractSizedFilter):
         return Estimate(estimate.mean, estimate.covariance, self.claim)
 
     def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Values and numbers of a message; no values where a number is missing without which they mean nothing."""
+        """Values and numbers of a message; no value where a number is missing without which it means nothing."""
         numbers = z[np.array(self.numbers)]
-        usable = jnp.all(~jnp.isnan(numbers) | self._optional)
+        there = ~jnp.isnan(numbers) | self._optional
+        usable = jnp.all(there | ~numbers_of_outputs(first(self.link)), axis=1)
         return jnp.where(usable, z[np.array(self.values)], jnp.nan), numbers
 
     @property
