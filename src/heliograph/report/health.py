@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from heliograph.filters.base import AbstractFilter
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.trigger import Periodic
@@ -18,7 +17,7 @@ from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.constant_error import ConstantError, find_constant_error
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
-from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared
+from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
@@ -43,7 +42,7 @@ class FilterHealth:
         white: innovations in units of their claim (time, m); None for a filter without a claim.
         test: of their whiteness; None also where there are too few rows.
         trusted: whether the network relies on it (default True).
-        declared: the judgement of variances that messages declare; None where they declare none.
+        declared: judgements of the variances that messages declare, one for each link that does.
         unit: of the plant's time (default "steps").
     """
 
@@ -53,7 +52,7 @@ class FilterHealth:
     white: np.ndarray | None
     test: MemoryTest | None
     trusted: bool = True
-    declared: DeclaredJudgement | None = None
+    declared: tuple[DeclaredJudgement, ...] = ()
     unit: str = "steps"
 
     @property
@@ -133,7 +132,7 @@ class Health:
             yield _say_off(name, off)
             if off.nothing_else:
                 return
-        said = [] if health.declared is None else health.declared.sentences(health.unit)
+        said = _say_declared(health)
         yield from (f"{name}: {sentence}" for sentence in said)
         if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
             return
@@ -285,7 +284,7 @@ def examine(
             test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
         lost = np.any(record.estimates[node][name].claims == "none")
         claim = "none" if lost else filter.claim
-        declared = None if test is None else _judge_declared(filter, z, u)
+        declared = () if test is None else judge_declared_links(filter, z, u)
         unit = _time_unit(record) if TIME_STEP in network.inputs else "steps"
         filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit))
     others = tuple(belief.words for belief in network.beliefs())
@@ -309,12 +308,14 @@ def _find_off(network: Network, health: Health, judged: FilterHealth, inputs: np
     return off if off.nothing_else or off.explained > MOST else None
 
 
-def _judge_declared(filter: AbstractFilter, z: np.ndarray, inputs: np.ndarray) -> DeclaredJudgement | None:
-    """Judge the variances that messages declare; None where they declare none, or are too few."""
-    try:
-        return judge_declared(filter, z, inputs)
-    except InputError:
-        return None
+def _say_declared(health: FilterHealth) -> list[str]:
+    """Return what is to be said of variances that messages declare, of several links after the names of the outputs."""
+    several = len(health.declared) > 1
+    return [
+        f"{', '.join(judgement.outputs)}: {sentence}" if several else sentence
+        for judgement in health.declared
+        for sentence in judgement.sentences(health.unit)
+    ]
 
 
 def _time_unit(record: Record) -> str:

@@ -146,12 +146,13 @@ def _make_declared_table(health: Health) -> list[Table]:
     """Return what the innovations say of variances that messages declare, by class; nothing where none do."""
     rows = []
     for judged in health.filters:
-        for one in () if judged.declared is None else judged.declared.classes:
+        for names, one in [(j.outputs, one) for j in judged.declared for one in j.classes]:
             said = f"{one.low:.3g}" if one.low == one.high else f"{one.low:.3g} to {one.high:.3g}"
             size = f"{one.nis:.3g} ({one.nis_low:.2f} to {one.nis_high:.2f})"
             scale = "–" if one.scale_low == one.scale_high else (
                 f"{one.scale:.3g} ({one.scale_low:.3g} to {one.scale_high:.3g})")  # fmt: skip
-            rows.append([visible(f"{judged.node}/{judged.filter}"), said, f"{one.numbers:,}", size, scale])
+            name = f"{judged.node}/{judged.filter}" + f": {', '.join(names)}" * (len(judged.declared) > 1)
+            rows.append([visible(name), said, f"{one.numbers:,}", size, scale])
     caption = (
         "**Declared**: variances that came with the messages, in classes. **Size**: mean square of the innovations "
         "over the claimed one, and where it lies for true variances in 99 of 100 recordings. **Scale**: the factor of "

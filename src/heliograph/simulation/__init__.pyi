@@ -27,6 +27,7 @@ from .declared.judgement import (
     DeclaredClass as DeclaredClass,
     DeclaredJudgement as DeclaredJudgement,
     judge_declared as judge_declared,
+    judge_declared_links as judge_declared_links,
 )
 from .description.wide_angles import (
     WideAngles as WideAngles,

@@ -112,7 +112,7 @@ def test_report_says_it():
     rows = fixes([0, 120], 120, True)
     health = examine(network, hg.run(network, {"gps": rows}), np.zeros((120, 0)))
     assert [line for line in health.warnings() if line.startswith("gps/f: ")] == [
-        f"gps/f: {line}" for line in health.filters[0].declared.sentences()
+        f"gps/f: {line}" for line in health.filters[0].declared[0].sentences()
     ]
     assert all(said(health.warnings())) and "steps" in health.warnings()[-1]
 
@@ -121,3 +121,51 @@ def test_check_says_whose_noise_is_taken_as_told():
     network = hg.Network(PLANT, {"gps": hg.Node(SENSOR, LINK, {"f": FILTER})})
     (line,) = [doubt for doubt in hg.simulation.doubts_before_data(network) if doubt.words.startswith("declared")]
     assert not line.serious and "'gps'" in line.words
+
+
+ROAD = hg.LinearPlant(
+    [[1.0, 1.0], [0.0, 1.0]], Q * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]), [0.0, 0.0], np.diag([25.0, 0.25])
+)
+ALONG = hg.LinearSensor([[1.0, 0.0]], 0.0, outputs=["along"])
+ONE = hg.model.told(lambda a: hg.hop(1.0, a[0]), ["variance"], typical=[1.0])
+SENDERS = ("car", "phone")
+
+
+def two_senders(seed, rows, bias, declared):
+    """Fixes of two senders of one path, each with its bias, white noise of WHITE and what it declares: (rows, 4)."""
+    path = fixes([seed, rows, 7], rows, 0.0, 0.0)[:, 0]
+    rng, a = np.random.default_rng([seed, 3]), np.exp(-1 / MEMORY)
+    columns = []
+    for size, given in zip(bias, declared, strict=True):
+        b = size * rng.normal()
+        slow = [b := a * b + size * np.sqrt(1 - a**2) * rng.normal() for _ in range(rows)]
+        columns += [path + slow + WHITE * rng.normal(size=rows), np.full(rows, given**2)]
+    return np.column_stack(columns)
+
+
+def centre():
+    joint = hg.model.joint_sensor(dict.fromkeys(SENDERS, ALONG))
+    return hg.linear_filter(ROAD, joint, hg.parallel([ONE, ONE]))
+
+
+@pytest.mark.slow
+def test_of_a_centre_each_sender_is_judged():
+    """The phone's bias and what it declares are told, the car is not doubted; its rows come every second step alone."""
+    data = two_senders(0, 240, (0.0, DECLARED), (WHITE, DECLARED))
+    data[1::2, :2] = np.nan
+    car, phone = hg.simulation.judge_declared_links(centre(), data)
+    assert (car.outputs, phone.outputs) == (("car_along",), ("phone_along",))
+    assert (car.classes[0].numbers, phone.classes[0].numbers) == (120, 240)
+    assert all(said(phone.sentences())) and not any(said(car.sentences()))
+    assert phone.bias.time_low < 3 * MEMORY and phone.bias.times_white_low > 20
+    network = hg.Network(ROAD, {name: hg.Node(ALONG, ONE, {}) for name in SENDERS}, {"all": centre()})
+    record = hg.run(network, {"car": data[:, :2], "phone": data[:, 2:]})
+    warnings = examine(network, record, np.zeros((240, 0))).warnings()
+    assert [f"fused/all: phone_along: {line}" for line in phone.sentences()] == [w for w in warnings if "fused" in w]
+
+
+def test_of_several_links_judge_declared_says_what_judges_them():
+    with pytest.raises(ValueError, match="one of 2 such links, which judge_declared_links judges"):
+        hg.simulation.judge_declared(centre(), np.zeros((50, 4)))
+    assert hg.simulation.judge_declared_links(centre(), np.full((50, 4), np.nan)) == ()
+    assert hg.simulation.judge_declared_links(hg.kalman_filter(ROAD, hg.LinearSensor([[1.0, 0.0]], 1.0)), [[0.0]]) == ()

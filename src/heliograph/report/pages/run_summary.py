@@ -53,8 +53,8 @@ def _filter_numbers(tested: FilterHealth) -> dict[str, Json]:
             "correlation": float(tested.test.correlation[0]),
             "p_value": tested.test.p_value,
         }
-    if tested.declared is not None:
-        numbers["declared"] = [dict(one._asdict()) for one in tested.declared.classes]
+    if tested.declared:
+        numbers["declared"] = [dict(one._asdict()) for j in tested.declared for one in j.classes]
     return numbers
 
 

@@ -13,17 +13,19 @@ from heliograph.filters.wrappers.told import ToldFilter
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
-from heliograph.random_affine.told import AbstractTold, told_maps
+from heliograph.random_affine.told import AbstractTold
 from heliograph.simulation.declared.refit import (
     Declared,
+    Place,
     Refit,
     declared_noises,
-    declares_noise,
     find_end,
+    find_place,
+    list_declaring,
     refit_filter,
     refit_scales,
     refit_with_bias,
@@ -93,9 +95,10 @@ class DeclaredBias(NamedTuple):
 @readable
 @dataclass(frozen=True)
 class DeclaredJudgement:
-    """Judgement of declared variances by a recording.
+    """Judgement of the variances that messages of one link declare, by a recording.
 
     Args:
+        outputs: names of the outputs that the link carries; none where its values are not outputs one by one.
         classes: messages by declared variance, in its order.
         correlation: of innovations one message apart, as declared.
         p_value: of correlations over up to ten messages, if there were none.
@@ -104,6 +107,7 @@ class DeclaredJudgement:
         bias: what explains the innovations where no scale does; None where one does, or nothing is wrong.
     """
 
+    outputs: tuple[str, ...]
     classes: tuple[DeclaredClass, ...]
     correlation: float
     p_value: float
@@ -156,28 +160,69 @@ def judge_declared(
         inputs: rows (steps, inputs); by default a filter without inputs is assumed.
 
     Raises:
-        ValueError: a filter that is told no noise, data or inputs of the wrong shape, fewer than 20 rows with values.
+        ValueError: a filter that is told no noise, or by several links (`judge_declared_links`), data or inputs of the
+            wrong shape, fewer than 20 rows with values.
     Source: Ljung and Box (1978) for the correlations; Newey and West (1987) for errors where gains are random.
     """
-    if not (isinstance(filter, ToldFilter) and declares_noise(filter)):
+    links = list_declaring(filter) if isinstance(filter, ToldFilter) else []
+    if len(links) != 1:
         got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
-        raise fail("filter", "one whose link tells the variance of its Gaussian noise (hg.model.told)", got)
+        expected = "one whose link tells the variance of its Gaussian noise (hg.model.told)"
+        several = f"one of {len(links)} such links, which judge_declared_links judges"
+        raise fail("filter", expected, several if links else got)
+    assert isinstance(filter, ToldFilter)  # it has a link that declares
     z, u = (np.asarray(rows)[:MOST] for rows in check_data(filter, data, inputs))
-    declared, classes = _classify(filter, z, u)
-    if np.sum(classes >= 0) < FEWEST:
-        raise fail(
-            "data", f"at least {FEWEST} rows with values and what is declared of them", int(np.sum(classes >= 0))
-        )
+    judgement, heard = _judge_link(filter, links[0], z, u)
+    if judgement is None:
+        raise fail("data", f"at least {FEWEST} rows with values and what is declared of them", heard)
+    return judgement
+
+
+def judge_declared_links(
+    filter: AbstractFilter,
+    data: "Float[ArrayLike, 'steps received']",
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+) -> tuple[DeclaredJudgement, ...]:
+    """Judge what each link declares of its noise, as `judge_declared` does, with the others as they declare it.
+
+    Of a filter that receives several nodes, one after another in their order; of a filter that is told no noise, and
+    of links of fewer than 20 rows with values, none.
+
+    Args:
+        filter: a filter.
+        data: values and what was declared of them (steps, received), NaN where a component did not arrive; the first
+            2,000 rows count.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+
+    Raises:
+        ValueError: no filter, data or inputs of the wrong shape.
+    """
+    instance("filter", filter, AbstractFilter, "a filter")
+    z, u = (np.asarray(rows)[:MOST] for rows in check_data(filter, data, inputs))
+    if not isinstance(filter, ToldFilter):
+        return ()
+    judged = [_judge_link(filter, link, z, u)[0] for link in list_declaring(filter)]
+    return tuple(judgement for judgement in judged if judgement is not None)
+
+
+def _judge_link(
+    filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
+) -> tuple[DeclaredJudgement | None, int]:
+    """Judge one link; None where too few of its values came, and how many rows had some."""
+    declared, classes = _classify(filter, link, z, u)
+    heard = int(np.sum(classes >= 0))
+    if heard < FEWEST:
+        return None, heard
     before = _test(declared, filter, classes)
     if not before.contradicts:
         plain = np.ones(declared.classes)
-        return _judgement(declared, classes, (before, before), (plain, plain, plain), None)
+        return _judgement(declared, classes, (before, before), (plain, plain, plain), None), heard
     refit = refit_scales(declared)
     again = _test(declared, refit_filter(declared, refit.logs), classes)
     bias = _find_bias(declared, refit) if again.p_value < LEVEL else None
     ends = [[find_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1)]
     scales = np.exp(refit.logs), np.exp(ends[0]), np.exp(ends[1])
-    return _judgement(declared, classes, (before, again), scales, bias)
+    return _judgement(declared, classes, (before, again), scales, bias), heard
 
 
 class _Tested(NamedTuple):
@@ -201,31 +246,40 @@ class _Noises(eqx.Module):
         return declared_noises(self.told.believed(numbers))
 
 
+def _declared_variances(place: Place, z: Float[np.ndarray, "steps received"]) -> Float[np.ndarray, "steps outputs"]:
+    """Return the variances that each row declares, NaN where a number is missing."""
+    numbers = z[:, place.numbers]
+    complete = ~np.isnan(numbers).any(axis=1)[:, None]
+    variances = np.asarray(over_runs(_Noises(place.told), np.where(complete, numbers, np.asarray(place.told.typical))))
+    return np.asarray(np.where(complete, variances, np.nan))
+
+
 def _classify(
-    filter: ToldFilter, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
+    filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[Declared, Int[np.ndarray, " steps"]]:
-    """Return the recording with its classes of declared variances, and that of each row: -1 of one that is not used."""
-    (told,) = told_maps(first(filter.link))
-    numbers = z[:, list(filter.numbers)]
-    complete = ~np.isnan(numbers).any(axis=1)
-    variances = np.asarray(over_runs(_Noises(told), np.where(complete[:, None], numbers, np.asarray(told.typical))))
-    heard = complete & ~np.isnan(z[:, list(filter.values)]).all(axis=1) & (variances > 0).all(axis=1)
+    """Return the recording with the link's classes of declared variances, and that of each row: -1 of one not used."""
+    z, place = z.copy(), find_place(filter, link)
     with np.errstate(all="ignore"):
+        for other in list_declaring(filter):  # what gives no law would spoil the state
+            where = find_place(filter, other)
+            law = np.all(_declared_variances(where, z) > 0, axis=1, keepdims=True)
+            z[~law & np.isin(np.arange(z.shape[1]), where.values + where.numbers)] = np.nan
+        variances = _declared_variances(place, z)
         size = np.mean(np.log(variances), axis=1)
-    z = np.where(heard[:, None], z, np.nan)  # what gives no law would spoil the state
-    count = int(np.sum(~np.isnan(z[:, list(filter.values)])))
+    heard = ~np.isnan(size) & ~np.isnan(z[:, place.values]).all(axis=1)
+    count = int(np.sum(~np.isnan(z[heard][:, place.values])))
     most = min(CLASSES, len(np.unique(size[heard])), max(count // EACH, 1))
     inner = np.quantile(size[heard], np.arange(1, most) / most, method="lower") if heard.any() else []
     edges = np.array([edge for edge in np.unique(inner) if edge < size[heard].max()])
-    outputs = len(filter.sensor.outputs) if isinstance(filter.sensor, AbstractSensor) else variances.shape[1]
+    outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
     usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
     deviation = usual if len(usual) == outputs else np.full(outputs, np.exp(np.mean(np.log(usual))))
-    return Declared(filter, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, size), -1)
+    return Declared(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, size), -1)
 
 
 def _test(declared: Declared, filter: ToldFilter, classes: Int[np.ndarray, " steps"]) -> _Tested:
     """Test the innovations of a filter: their mean squares by class, and their correlation over messages."""
-    white = whitened_innovations(declared.z, filter, declared.u)[:, list(filter.values)]
+    white = whitened_innovations(declared.z, filter, declared.u)[:, declared.place.values]
     tail, nis = LEVEL / declared.classes / 2, list[tuple[float, float, float]]()
     for number in range(declared.classes):
         squares = white[classes == number] ** 2
@@ -260,8 +314,9 @@ def _correlate(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, 
 def _find_bias(declared: Declared, scales: Refit) -> DeclaredBias | None:
     """Fit a bias of each output beside the scales; None where the likelihood does not take it, at 1 %."""
     filter = declared.filter
-    if not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor)):
-        return None  # which vary over time
+    vary = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
+    if vary or declared.place.outputs is None:
+        return None
     best = refit_with_bias(declared, scales)
     gain = best.likelihood - scales.likelihood
     if gain < scipy.special.gammainccinv(1, LEVEL):  # half of a chi-squared number with two degrees of freedom
@@ -283,16 +338,17 @@ def _judgement(
 ) -> DeclaredJudgement:
     """Put together what was found, class by class."""
     before, again = tested
-    filter, results = declared.filter, []
-    (told,) = told_maps(first(filter.link))
+    place, results = declared.place, []
     for number, (nis, low, high) in enumerate(before.nis):
         rows = declared.z[classes == number]
-        variances = np.asarray(over_runs(_Noises(told), rows[:, list(filter.numbers)]))
-        size = np.exp(np.mean(np.log(variances), axis=1))
-        count = int(np.sum(~np.isnan(rows[:, list(filter.values)])))
+        size = np.exp(np.mean(np.log(_declared_variances(place, rows)), axis=1))
+        count = int(np.sum(~np.isnan(rows[:, place.values])))
         ends = (float(values[number]) for values in scales)
         results.append(DeclaredClass(float(size.min()), float(size.max()), count, nis, low, high, *ends))
-    return DeclaredJudgement(tuple(results), before.correlation, before.p_value, again.correlation, again.p_value, bias)
+    names = first(declared.filter.sensor).outputs
+    outputs = tuple(names[i] for i in place.outputs or ())
+    correlations = before.correlation, before.p_value, again.correlation, again.p_value
+    return DeclaredJudgement(outputs, tuple(results), *correlations, bias)
 
 
 def _say_bias(bias: DeclaredBias, unit: str) -> list[str]:

@@ -10,6 +10,7 @@ import scipy
 
 from heliograph.filters.wrappers.told import ToldFilter
 from heliograph.model.bias import with_bias
+from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.model.told import LinkGivenNumbers
@@ -17,7 +18,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.told import GainTold, Told, told_maps
+from heliograph.random_affine.told import AbstractTold, GainTold, Told, numbers_of_outputs, told_maps
 from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.runs.over_runs import over_runs
 
@@ -33,17 +34,19 @@ LOST = 1e12  # nats that numbers lose which give no likelihood
 
 
 class Declared(NamedTuple):
-    """A filter of messages that declare noise, with what they declared in the rows of a recording.
+    """A filter of messages that declare noise, with what those of one link declared in the rows of a recording.
 
     Args:
         filter: the filter.
+        link: which of the links that tell numbers (`told_maps`): its noise is judged, that of others is as declared.
         edges: logarithms of declared variances at which one class of messages ends and the next begins (classes - 1,).
-        deviation: usual declared deviation of each output (outputs,).
+        deviation: usual declared deviation of each output of the link (outputs,).
         z: measurements (steps, received).
         u: inputs (steps, inputs).
     """
 
     filter: ToldFilter
+    link: int
     edges: Float[np.ndarray, " edges"]
     deviation: Float[np.ndarray, " outputs"]
     z: Float[np.ndarray, "steps received"]
@@ -53,6 +56,48 @@ class Declared(NamedTuple):
     def classes(self) -> int:
         """Number of classes of messages."""
         return len(self.edges) + 1
+
+    @property
+    def place(self) -> "Place":
+        """Return where the link stands in what is received."""
+        return find_place(self.filter, self.link)
+
+
+class Place(NamedTuple):
+    """Where a link that tells numbers stands in what is received, and which of the sensor's outputs it carries.
+
+    Args:
+        told: the map of which numbers are told.
+        numbers: rows of z of these numbers.
+        values: rows of z of the values whose law they give.
+        outputs: outputs of the sensor that the link carries; None where values are not outputs one by one.
+    """
+
+    told: AbstractTold
+    numbers: list[int]
+    values: list[int]
+    outputs: list[int] | None
+
+
+def find_place(filter: ToldFilter, link: int) -> Place:
+    """Return the place of one of the links that tell numbers.
+
+    Args:
+        filter: the filter of all.
+        link: its number among `told_maps`.
+    """
+    maps, sensor = told_maps(first(filter.link)), first(filter.sensor)
+    before = sum(affine.memory.announced for affine in maps[:link])
+    columns = list(range(before, before + maps[link].memory.announced))
+    of_link = np.flatnonzero(numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
+    whole = len(of_link) == len(filter.values)
+    outputs = list(range(len(sensor.outputs))) if whole else of_link
+    return Place(
+        maps[link],
+        [filter.numbers[column] for column in columns],
+        [filter.values[row] for row in of_link],
+        outputs if whole or len(sensor.outputs) == len(filter.values) else None,
+    )
 
 
 class ScaledNoise(eqx.Module):
@@ -80,10 +125,10 @@ def declared_noises(link: AbstractRandomAffine) -> jax.Array:
     return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _noises(link)])
 
 
-def declares_noise(filter: ToldFilter) -> bool:
-    """Return whether messages tell the variances of one Gaussian noise, which a scale may correct."""
+def list_declaring(filter: ToldFilter) -> list[int]:
+    """Return the links, by number, whose messages tell the variances of Gaussian noise, which a scale may correct."""
     maps = told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
-    return len(maps) == 1 and isinstance(maps[0], Told) and _declares(maps[0])
+    return [number for number, affine in enumerate(maps) if isinstance(affine, Told) and _declares(affine)]
 
 
 @in_float64
@@ -105,7 +150,7 @@ def _is_noise(leaf: object) -> bool:
 
 
 def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
-    """Return the filter with the noise scaled, and with a bias of each output where there are two numbers more.
+    """Return the filter with the link's noise scaled, and a bias of each of its outputs with two numbers more.
 
     Args:
         declared: the filter and the recording.
@@ -113,11 +158,13 @@ def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
             root of its memory, which data tell better than the deviation, and its memory, in the time of the plant
             (classes,) or (classes + 2,).
     """
-    filter, numbers = declared.filter, jnp.exp(jnp.asarray(logs))
+    filter, numbers, place = declared.filter, jnp.exp(jnp.asarray(logs)), declared.place
 
     def rescale(leaf: object) -> object:
-        scaled = ScaledNoise(leaf.make, declared.edges, numbers[: declared.classes]) if isinstance(leaf, Told) else None
-        return leaf if scaled is None else eqx.tree_at(lambda affine: affine.make, leaf, scaled)
+        if not isinstance(leaf, Told) or leaf.memory.identity != place.told.memory.identity:
+            return leaf
+        scaled = ScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
+        return eqx.tree_at(lambda affine: affine.make, leaf, scaled)
 
     link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, Told))
     plant, sensor = filter.plant, filter.sensor
@@ -125,7 +172,8 @@ def refit_filter(declared: Declared, logs: Array) -> ToldFilter:
         assert isinstance(plant, AbstractPlant) and isinstance(sensor, AbstractSensor)
         rate, time = numbers[declared.classes :]
         dt = TIME_STEP if TIME_STEP in plant.inputs else 1.0
-        plant, sensor = with_bias(plant, sensor, rate * jnp.sqrt(time) * declared.deviation, time, dt)
+        deviation, loading = rate * jnp.sqrt(time) * declared.deviation, np.eye(len(sensor.outputs))[:, place.outputs]
+        plant, sensor = with_bias(plant, sensor, deviation, time, dt, loading=loading)
     return filter.with_models(plant, sensor, link)
 
 

@@ -26,7 +26,7 @@ from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, list_other_beliefs
-from heliograph.simulation.declared.refit import declares_noise
+from heliograph.simulation.declared.refit import list_declaring
 from heliograph.simulation.description.diagram import list_rounded, list_shared
 from heliograph.simulation.description.fallbacks import list_fallbacks
 from heliograph.simulation.description.separable import separate_nodes
@@ -194,7 +194,7 @@ def _find_unheard(network: Network) -> Iterator[Doubt]:
 def _find_declared_noise(network: Network) -> Iterator[Doubt]:
     """Yield the nodes whose messages declare their noise, which is true as far as a recording says."""
     names = [name for name, node in network.nodes.items() if isinstance(node, Node) for filter in node.filters.values()
-             if isinstance(filter, ToldFilter) and declares_noise(filter)]  # fmt: skip
+             if isinstance(filter, ToldFilter) and list_declaring(filter)]  # fmt: skip
     if names:
         who = join_names([repr(name) for name in dict.fromkeys(names)])
         yield Doubt(
