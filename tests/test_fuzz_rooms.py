@@ -51,6 +51,10 @@ PAIR = {"plant": MOVING, "sensor": model.joint_sensor(SEEN), "channel": hg.paral
 CALLS = [  # what is called, and arguments with which it works
     (hg.random_affine.MarkovChain, {"transition": CHAIN, "initial": [0.5, 0.5], "name": "c", "radius": 0.0}),
     (hg.gilbert_elliott, {"good": HOP, "bad": HOP, "fail": 0.1, "recover": 0.2, "name": "g"}),
+    (hg.markov_plant, {"models": [PLANT, PLANT], "transition": CHAIN, "initial": [0.5, 0.5], "name": "m",
+                       "modes": None}),
+    (hg.markov_sensor, {"models": [SENSOR, SENSOR], "transition": CHAIN, "initial": [0.5, 0.5], "name": "m",
+                        "modes": None}),
     (hg.markov_fading, {"gains": [1.0, 0.5], "transition": CHAIN, "noise": 0.1, "name": "m"}),
     (hg.model.autoregressive_fading, {"mean": 1.0, "deviation": 0.3, "correlation": 0.9, "noise": 0.1, "dimension": 1,
                                 "name": "f"}),

@@ -48,6 +48,10 @@ from .model.sensor import (
 from .model.sensor import (
     state_space as state_space,
 )
+from .model.modes_of_motion import (
+    markov_plant as markov_plant,
+    markov_sensor as markov_sensor,
+)
 from .model.channel import (
     amplify_and_forward as amplify_and_forward,
     dropout as dropout,

@@ -131,13 +131,16 @@ def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
 
     import numpy as np
 
-    from heliograph.model.estimate import Estimate
-
     if rows is None or rows.all():
         return record
     estimates = {
         node: {
-            name: Estimate(np.asarray(e.mean)[rows], np.asarray(e.covariance)[rows], e.claim)
+            name: replace(
+                e,
+                mean=np.asarray(e.mean)[rows],
+                covariance=np.asarray(e.covariance)[rows],
+                modes=None if e.modes is None else np.asarray(e.modes)[rows],
+            )
             for name, e in filters.items()
         }
         for node, filters in record.estimates.items()

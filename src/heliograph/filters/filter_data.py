@@ -71,6 +71,7 @@ class Filtered:
         weights: of each component in its update (steps, received), from 0 (left out) to 1 (in full); None of a filter
             that weighs nothing.
         origin: the state after the last row, from which `hg.forecast` predicts; None where it was not kept.
+        modes: probabilities of the modes (steps, M); None of a filter that weighs none.
     """
 
     means: np.ndarray
@@ -79,8 +80,9 @@ class Filtered:
     innovation_covariances: np.ndarray
     log_likelihoods: np.ndarray
     claim: Claim
-    weights: np.ndarray | None = None
+    weights: "Array | None" = None
     origin: KeptOrigin = field(default=None, compare=False, repr=False)
+    modes: "Array | None" = None
 
     @property
     def log_likelihood(self) -> float:
@@ -121,7 +123,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> F
     rows_z, rows_u = check_data(filter, z, u)
     whole = filter_in_chunks(filter, rows_z, rows_u, _tell_estimate)
     state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u))
-    mean, covariance, innovation = outputs
+    mean, covariance, innovation, modes = outputs
     lost = find_lost(mean, 1)
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
@@ -131,7 +133,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> F
     origin = Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), last, spacing)
     return Filtered(
         mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
-        innovation.weight, origin,
+        innovation.weight, origin, modes,
     )  # fmt: skip
 
 
@@ -143,7 +145,7 @@ def _compute_filtered(filter: SteppedFilter, z: Array, u: Array) -> PyTree:
 def _tell_estimate(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
     """Return the estimate of a row, and its innovation."""
     estimate = filter.after_step(state, k)
-    return estimate.mean, estimate.covariance, innovation
+    return estimate.mean, estimate.covariance, innovation, estimate.modes
 
 
 _by_xla = quickly_compiled(_compute_filtered)

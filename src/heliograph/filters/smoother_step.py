@@ -69,7 +69,7 @@ class SmootherStep(Module):
     """
 
     after: Gaussian
-    before: BackwardGain
+    before: BackwardGain  # None of a filter of modes with several laws of motion, which goes back by pairs
     projection: Float[jax.Array, "*time n N"] | None = eqx.field(default=None, kw_only=True)
     shift: Float[jax.Array, "*time n"] | None = eqx.field(default=None, kw_only=True)
     nis: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
@@ -87,6 +87,11 @@ class SmootherStep(Module):
         """Covariance of the filter's state after the step."""
         covariance: Array = self.after.covariance
         return covariance
+
+    @property
+    def end(self) -> Any:
+        """The law after the step, from which a pass back starts."""
+        return self.after
 
     def back(self, later: Gaussian) -> Gaussian:
         """Smooth the state before the step from the state after it, both given the same later data (one RTS step)."""

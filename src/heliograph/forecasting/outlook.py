@@ -14,6 +14,7 @@ from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
+from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.forecasting.prediction import Prediction
 from heliograph.model.estimate import Claim, weakest
@@ -24,6 +25,7 @@ from heliograph.numerics.angle import Angles, nearest, wrap_angles
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
+from heliograph.random_affine.memory import memories
 
 
 @runtime_checkable
@@ -67,10 +69,13 @@ class Outlook(Module):
         """Return the moments of the states as they are now, as NumPy arrays."""
         return _now(self, state)
 
-    def measured(self, states: Moments, k: jax.Array) -> Moments | None:
-        """Return the moments of what the sensor would measure, part by part."""
+    def measured(self, prior: PyTree, states: Moments, k: jax.Array) -> Moments | None:
+        """Return the moments of what the sensor would measure, part by part; where modes change it, in each mode."""
         if self.sensor is None or self.plant is None:
             return None
+        if isinstance(self.filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
+            signal, weights = self.filter.prior_signals(prior, k)
+            return Moments(weights, signal.mean, jax.vmap(lambda each: each.covariance)(signal))
         plant, sensor, start = at(self.plant, k), at(self.sensor, k), second_moments_at_start(self.plant)
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -91,7 +96,7 @@ class Outlook(Module):
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
         prior = self.filter.predict(state, u, k)
         states = self.mixture(prior)
-        return prior, (states, self.measured(states, k), self.received(prior, k))
+        return prior, (states, self.measured(prior, states, k), self.received(prior, k))
 
 
 def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:

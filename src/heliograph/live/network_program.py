@@ -13,6 +13,7 @@ from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.memory import memories
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.rows.row_smoother import RowSmoother
@@ -36,7 +37,11 @@ def time_input(network: Network) -> int | None:
         raise fail("timeline", expected, f"one that covers {steps_covered(network)} steps")
     if network.relays is not None:
         raise fail("timeline", expected, "relays that talk in slots")
+    if memories(network.plant):
+        raise fail("timeline", expected, "a plant with modes, whose law a row that is inserted would change")
     for name, node in network.nodes.items():
+        if isinstance(node, Node) and memories(node.sensor):
+            raise fail("timeline", expected, f"a sensor with modes, at node {name!r}")
         if isinstance(node, Node) and first(node.channel).remembers:
             raise fail("timeline", expected, f"a channel that remembers, at node {name!r}")
         if isinstance(node, Node) and node.trigger is not None:

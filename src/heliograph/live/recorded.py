@@ -125,5 +125,6 @@ def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Map
 
 def _stack_estimates(parts: Sequence[Estimate], how: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
     """Join estimates of several times by `how`, `np.stack` or `np.concatenate`, with the weakest of their claims."""
-    mean, covariance = (how([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
-    return Estimate(mean, covariance, parts[0].claim)
+    names = ("mean", "covariance", *(["modes"] if parts[0].modes is not None else []))
+    mean, covariance, *modes = (how([np.asarray(getattr(e, name)) for e in parts]) for name in names)
+    return Estimate(mean, covariance, parts[0].claim, *modes)

@@ -31,5 +31,6 @@ def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str,
     for place in program.places:
         mean = outputs[..., place.mean : place.mean + n]
         covariance = outputs[..., place.covariance : place.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
-        estimates[place.node][place.filter] = lower_unsound_claim(Estimate(mean, covariance, place.claim))
+        modes = place.probabilities(outputs)
+        estimates[place.node][place.filter] = lower_unsound_claim(Estimate(mean, covariance, place.claim, modes))
     return estimates

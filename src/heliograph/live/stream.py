@@ -289,7 +289,11 @@ class _Placed:
         self.state: PyTree = jax.tree.structure(self._start)
         self.layout = {path: part.shape for path, part in split_by_path(self._start).items()}
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
-        self.estimate: PyTree = jax.tree.structure(JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, 0.0, 0))
+        with jax.enable_x64(True):
+            modes = jax.eval_shape(filter.estimate, self._start).modes
+        self.estimate: PyTree = jax.tree.structure(
+            JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, modes, 0.0, 0)
+        )
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def stepper(self) -> NativeFilterStepper | XlaFilterStepper:

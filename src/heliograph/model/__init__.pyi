@@ -26,6 +26,10 @@ from .fading import (
     without_memory as without_memory,
     autoregressive_fading as autoregressive_fading,
 )
+from .modes_of_motion import (
+    ModalPlant as ModalPlant,
+    ModalSensor as ModalSensor,
+)
 from .over_time import (
     at as at,
     over_time as over_time,

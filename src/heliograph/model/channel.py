@@ -7,6 +7,7 @@ from typing import Literal, overload
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_turns
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
@@ -343,7 +344,8 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
 def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
     start, senses = first(plant), first(sensor)
-    check_turns("sensor of a plant", senses.measure, start.initial_mean, start.angles, senses.angles)
+    for model in models_of(senses):
+        check_turns("sensor of a plant", model.measure, start.initial_mean, start.angles, senses.angles)
     steps = unstack(channel) if senses.circular else [first(channel)]
     results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
     if len(results) > 1:

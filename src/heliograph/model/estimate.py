@@ -27,12 +27,16 @@ class Estimate(Module):
     measurement. `claim` is what the filter claims of a sound estimate; of many, `claims` says
     where it holds.
 
+    modes: probabilities of the present mode (..., M), of a filter that weighs modes; None of all others. Chains of
+    plant, sensor and links are one joint chain, in this order, the first slowest (`joint_modes`).
+
     Shapes: mean (..., n), covariance (..., n, n).
     """
 
     mean: Float[Array, "... n"]
     covariance: Float[Array, "... n n"]
     claim: Claim = eqx.field(static=True)
+    modes: "Array | None" = None
 
     def __check_init__(self) -> None:
         check_claim(self.claim)

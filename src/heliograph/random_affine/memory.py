@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.module import Module, unwritten
@@ -22,6 +23,19 @@ class AbstractWithMemory(Module):
     def given(self, state: int | float | jax.Array | np.ndarray) -> Any:
         """Return the same without memory, for this state of the memory."""
         raise unwritten(self, "given")
+
+
+def select_alike(models: Sequence[T], state: jax.Array) -> T | None:
+    """Return the model of a traced mode, with its numbers, of models that differ in numbers alone; else None."""
+    leaves, trees = zip(*(jax.tree.flatten(model) for model in models), strict=True)
+    if any(not eqx.is_array_like(leaf) for of_mode in leaves for leaf in of_mode):
+        return None
+    shapes = {tuple(np.shape(leaf) for leaf in of_mode) for of_mode in leaves}
+    if len(set(trees)) > 1 or len(shapes) > 1:
+        return None
+    numbers = [jnp.stack([jnp.asarray(leaf) for leaf in same])[state] for same in zip(*leaves, strict=True)]
+    present: T = jax.tree.unflatten(trees[0], numbers)
+    return present
 
 
 class ChannelState(NamedTuple):
@@ -54,7 +68,11 @@ def memories(channel: PyTree) -> dict[str, AbstractMemory]:
 
 def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
     """The map that forgets which modes, for the states of its `memories`; whatever is combined of maps stays so."""
-    by_identity = dict(zip(memories(channel), states, strict=True))
+    return condition_on_states(channel, dict(zip(memories(channel), states, strict=True)))
+
+
+def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.Array | np.ndarray]) -> T:
+    """Return `condition_on_memories` for states by the identity of their memory, among which there may be others."""
 
     def chosen(leaf: PyTree) -> PyTree:
         return leaf.given(by_identity[leaf.memory.identity]) if is_modal(leaf) else leaf
@@ -72,6 +90,13 @@ def drop_names(channel: T) -> T:
     """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
     held = memories(channel)
     return replace_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
+
+
+def drop_identities(model: T) -> T:
+    """Return the model with its unnamed memories called by their number: models that differ in these look alike."""
+    held = enumerate(memories(model).items())
+    twins = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in held if memory.name is None}
+    return replace_memories(model, twins)
 
 
 def separate_memories(maps: Sequence[T]) -> list[T]:

@@ -20,7 +20,7 @@ from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, 
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, AbstractWrapper
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.memory import condition_on_memories, memories
+from heliograph.random_affine.memory import condition_on_states, memories, select_alike
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.moments.route import Position, Visit
@@ -56,13 +56,8 @@ class Modes(AbstractUniform, AbstractModal):
         """Return the map of this mode; for a traced mode, one with its numbers, or a choice among kinds of maps."""
         if isinstance(state, int | np.integer):
             return self.maps[state]
-        leaves, trees = zip(*(jax.tree.flatten(m) for m in self.maps), strict=True)
-        shapes = {tuple(np.shape(leaf) for leaf in of_mode) for of_mode in leaves}
-        if len(set(trees)) > 1 or len(shapes) > 1:
-            return _Chosen(self.maps, jnp.asarray(state))
-        numbers = [jnp.stack([jnp.asarray(leaf) for leaf in same])[state] for same in zip(*leaves, strict=True)]
-        present: AbstractRandomAffine = jax.tree.unflatten(trees[0], numbers)
-        return present
+        present = select_alike(self.maps, jnp.asarray(state))
+        return _Chosen(self.maps, jnp.asarray(state)) if present is None else present
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
         """Return modes of a chain that is believed possible, with maps that are covered one by one."""
@@ -208,19 +203,23 @@ class JointModes(Module):
         transition: law of the next mode by present mode (modes, modes).
         radius: how far each transition may be off, differently at each step (modes, modes).
         maps: the map in each mode.
+        beside: what else has the modes, in each of them.
     """
 
     initial: Law
     transition: Rows
     radius: Rows
     maps: tuple[AbstractRandomAffine, ...]
+    beside: tuple[PyTree, ...]
 
     def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
         """Return E[Sym^order(H) | mode] of each mode; times transition[i, j], it is block (j, i) of joint moments."""
         return stack_parts([m.moments(order).matrix for m in self.maps])
 
 
-def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: int = 1) -> JointModes:
+def joint_modes(
+    channel: AbstractRandomAffine, nodes: int | None = None, order: int = 1, beside: PyTree = ()
+) -> JointModes:
     """Combine the memories of a channel in one chain, the first slowest, with the map given each joint mode.
 
     The transition is Pi_a x Pi_b (Kronecker). f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j);
@@ -232,13 +231,14 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
             correlation, with probabilities. None (default): as many nodes as make the means in each mode and the
             products over time exact for monomials of H up to `order`; their transition may have negative entries.
         order: degree of H for which expectations are exact, 1 unless given.
+        beside: a tree of models, such as plant and sensor, whose memories come before the channel's; none unless given.
 
     Raises:
         ValueError: more than MODES modes, or a map inside with a memory of another kind.
     """
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
-    held = memories(channel)
+    held = memories((beside, channel))
     chains = [_nodes_of_memory(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
@@ -247,14 +247,16 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     # Independent memories: their laws multiply.
     initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
     transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
-    maps = tuple(
-        condition_on_memories(channel, [s.item() for s in chosen])
+    by_mode = [
+        dict(zip(held, [s.item() for s in chosen], strict=True))
         for chosen in product(*(chain.states for chain in chains))
-    )
+    ]
+    maps = tuple(condition_on_states(channel, states) for states in by_mode)
     for m in maps:
         check_forgets("channel of a filter", m)
     most = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
-    return JointModes(initial, transition, most - transition, maps)
+    others = tuple(condition_on_states(beside, states) for states in by_mode)
+    return JointModes(initial, transition, most - transition, maps, others)
 
 
 def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:

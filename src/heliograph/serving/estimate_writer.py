@@ -88,6 +88,8 @@ class EstimateWriter:
         negative = columns.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
         claim = columns.claim if numbers and not negative else "none"
         results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
+        if columns.modes is not None:
+            results["modes"] = outputs[slice(*columns.modes)]
         # Squared innovation: of a fusion that of what its nodes received, of a filter as it judged it.
         if columns.tested is not None:
             nis, received = (outputs[column] for column in columns.tested)

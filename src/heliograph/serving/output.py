@@ -53,6 +53,7 @@ class FilterOutput(BaseModel):
         received: number of received components, the expected value of `nis`.
         implausible: reason why this filter alone did not use the measurement; empty if it did.
         outputs: of a filter that weighs, what it made of each received number; left out of all others.
+        modes: of a filter that weighs modes, the probability of each; left out of all others.
     """
 
     mean: list[float | None]
@@ -64,6 +65,7 @@ class FilterOutput(BaseModel):
     received: int = Field(0, description="How many numbers were received: what nis should be on average.")
     implausible: str = Field("", description="Why this filter alone did not use what was received, where it did not.")
     outputs: WeighedOutputs | None = Field(None, description="Of a filter that weighs: what it made of each number.")
+    modes: list[float | None] | None = Field(None, description="Of a filter that weighs modes: their probabilities.")
 
 
 class SenderOutput(BaseModel):

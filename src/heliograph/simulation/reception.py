@@ -24,12 +24,12 @@ from heliograph.model.words import Reader, Words
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memory import condition_on_memories, drop_names, memories
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.side_by_side import map_all
-from heliograph.simulation.shared_fading import deliver, memory_places, start
+from heliograph.simulation.shared_fading import deliver, memory_places, move_modes, start, start_modes
 
 ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
 
@@ -65,13 +65,15 @@ class NodeGroup(Module):
 
     `encoder`: of the words that they send; the `channel` then carries their bits, which the `reader` puts together.
 
-    Shapes: checksums (node,), memories (node, memories of a channel): checksums of the channels' memories.
+    Shapes: checksums (node,), memories (node, memories of a channel) and modes (node, memories of a sensor): checksums
+    of the channels' and sensors' memories.
     """
 
     sensor: AnySensor
     channel: Channel
     checksums: jax.Array | np.ndarray
     memories: jax.Array | np.ndarray
+    modes: jax.Array | np.ndarray
     reference_filter: FedBackFilter | EventFilter | StochasticEventFilter | None
     trigger: AbstractTrigger | None
     encoder: Words | None
@@ -92,6 +94,7 @@ class LinkState(NamedTuple):
     memory: PyTree
     feed_back: jax.Array | None
     sender: Sender | None = None
+    modes: tuple[jax.Array, ...] = ()  # of the sensor
 
 
 class SeparateChannels(AbstractMedium):
@@ -106,7 +109,8 @@ class SeparateChannels(AbstractMedium):
             feed_back = None if group.reference_filter is None else _first_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
-            return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender)
+            modes = start_modes(group.sensor, key, group.modes)
+            return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender, modes)
 
         return tuple(
             () if isinstance(group, Silent) else map_all(single, len(group.checksums))(group) for group in self.groups
@@ -119,13 +123,14 @@ class SeparateChannels(AbstractMedium):
 
         def receive_one(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
             """Measure x at one node, let its trigger decide, and deliver through its channel."""
-            sensor = at(group.sensor, k)
+            sensor = condition_on_memories(at(group.sensor, k), reach.modes)
+            modes = move_modes(group.sensor, reach.modes, key, k, group.modes)
             y = measure(sensor, x, draw_key(key, k, group.checksums, SENSOR))
             if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
                 y = y - group.reference_filter.reference(reach.feed_back, u, k)
             y, z, memory = _send(group, reach.memory, y, key, k)
             if group.trigger is None or reach.sender is None:
-                return LinkState(memory, reach.feed_back), z
+                return LinkState(memory, reach.feed_back, modes=modes), z
             # The sender decides, by its own reference.
             sender = reach.sender
             if (
@@ -136,7 +141,7 @@ class SeparateChannels(AbstractMedium):
                 sender = sender._replace(reference=group.reference_filter.reference(reach.feed_back, u, k))
             drawn = draw_key(key, k, group.checksums, TRIGGER)
             sender, z = group.trigger.transmit(sender, y, z, drawn, k)
-            return LinkState(memory, reach.feed_back, sender), z
+            return LinkState(memory, reach.feed_back, sender, modes), z
 
         results = [
             (reach, jnp.zeros((group.count, 0)))
@@ -334,17 +339,18 @@ def make_reception(network: Network) -> AbstractMedium:
     groups: list[NodeGroup | Silent] = []
     places = network.places
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    memories = memory_places({name: node.channel for name, node in nodes.items()})
+    observed = {name: (node.sensor, node.channel) for name, node in nodes.items()}
+    places_of_memories = memory_places(observed, network.plant)
     for names in network.groups:
         if names[0] not in nodes:
             groups.append(Silent(len(names)))
             continue
         # Sensor, channel, and where their draws and memories stand.
-        sensors = [without_output_names(nodes[name].sensor) for name in names]
-        channels = [_drop_names(_carrying_channel(nodes[name]), memories[name]) for name in names]
-        stacked = stack(list(zip(sensors, channels, strict=True)))
+        pairs = [(without_output_names(nodes[name].sensor), _carrying_channel(nodes[name])) for name in names]
+        stacked = stack([_drop_names(pair, places_of_memories[name]) for pair, name in zip(pairs, names, strict=True)])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
-        memory_rows = np.stack([memories[name] for name in names])
+        rows_of = [_split_places(observed[name], places_of_memories[name]) for name in names]
+        of_sensor, memory_rows = (np.stack(parts) for parts in zip(*rows_of, strict=True))
         # What a sender that decides knows: its filter, its rule.
         informed_by = nodes[names[0]].informed_by or nodes[names[0]].predictor
         reference_filter: PyTree = (
@@ -358,7 +364,9 @@ def make_reception(network: Network) -> AbstractMedium:
         encoders: PyTree = [nodes[name].encoder for name in names]
         encoder, reader = (None, None) if encoders[0] is None else (stack(encoders), reader_of(nodes[names[0]].channel))
         groups.append(
-            NodeGroup(*stacked, checksums, memory_rows, reference_filter, trigger, encoder, informed_at, reader)
+            NodeGroup(
+                *stacked, checksums, memory_rows, of_sensor, reference_filter, trigger, encoder, informed_at, reader
+            )
         )
     return SeparateChannels(tuple(groups))
 
@@ -368,5 +376,12 @@ def _carrying_channel(node: Node) -> Channel:
     return node.channel if node.encoder is None else in_bits(node.encoder, node.channel)
 
 
-def _drop_names(channel: Channel, places: np.ndarray) -> Channel:
-    return drop_names(channel) if len(places) else channel
+def _drop_names(observed: tuple[AnySensor, Channel], places: np.ndarray) -> tuple[AnySensor, Channel]:
+    return drop_names(observed) if len(places) else observed
+
+
+def _split_places(observed: tuple[AnySensor, Channel], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places of the memories of a sensor, and of its channel, of those of both together."""
+    by_identity = dict(zip(memories(observed), places, strict=True))
+    of_sensor, of_channel = ([by_identity[identity] for identity in memories(part)] for part in observed)
+    return np.array(of_sensor, np.uint32), np.array(of_channel, np.uint32)

@@ -128,7 +128,7 @@ def run(
 def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray) -> Origin:
     """Where forecasts start: behind the last row, whose time between rows is dt where the plant has it."""
     last = {
-        node: {name: Estimate(np.asarray(e.mean)[-1], np.asarray(e.covariance)[-1], e.claim) for name, e in of.items()}
+        node: {name: jax.tree.map(lambda leaf: np.asarray(leaf)[-1], e) for name, e in of.items()}
         for node, of in record.estimates.items()
     }
     spacing = usual_spacing(record.time)

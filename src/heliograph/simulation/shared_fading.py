@@ -13,7 +13,7 @@ from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import unique_memories
+from heliograph.random_affine.chain import AbstractMemory, unique_memories
 from heliograph.random_affine.delay import signal_size
 from heliograph.random_affine.memory import draw_with_shared_memories, drop_names, init_with_shared_memories, memories
 from heliograph.random_affine.moments.route import apply
@@ -30,24 +30,40 @@ from heliograph.simulation.random_keys import (
 Places = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a channel
 
 
-def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
+PLANT = "plant"  # whose memories others may share, with a name or without
+
+
+def memory_places(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
     """Places of each channel's memories among all keys: by their names, or by the channel where they have none.
+
+    A channel may be any tree of models, such as a sensor and its channel; what is a memory of the plant's too is that.
 
     Raises:
         ValueError: one name for memories that differ.
     """
+    of_plant = {identity: i for i, identity in enumerate(memories(plant))}
+    _ = memories((plant, tuple({id(c): c for c in channels.values()}.values())))
     held = {id(channel): memories(channel) for channel in {id(c): c for c in channels.values()}.values()}
     unique_memories(memory for by_identity in held.values() for memory in by_identity.values())
     return {
         name: np.array(
             [
-                checksum(f"memory {i} of {name}" if memory.name is None else identity)
+                checksum(_place_of(memory, i, name, of_plant))
                 for i, (identity, memory) in enumerate(by_identity.items())
             ],
             dtype=np.uint32,
         )
         for name, by_identity in ((name, held[id(channel)]) for name, channel in channels.items())
     }
+
+
+def _place_of(memory: AbstractMemory, i: int, name: str, of_plant: Mapping[str, int]) -> str:
+    """Return what a memory's draws are seeded by: its name, the plant's number of it, or the channel's."""
+    if memory.name is not None:
+        return memory.identity
+    if memory.identity in of_plant:
+        return f"{PLANT}\tmemory {of_plant[memory.identity]}"
+    return f"memory {i} of {name}"
 
 
 class ChannelGroup(Module):
@@ -96,6 +112,21 @@ def start(channel: Channel, key: jax.Array, source: Number, shared: Places) -> P
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
     state = init_with_shared_memories(now, link_key, keys) if len(shared) else now.init(link_key)
     return Late(state, jnp.zeros(now.past * signal_size(now))) if now.past else state
+
+
+def start_modes(models: PyTree, key: jax.Array, shared: Places) -> tuple[jax.Array, ...]:
+    """Return the states of the memories of a plant or sensor at the first step."""
+    held = memories(models).values()
+    return tuple(m.begin(draw_key(key, 0, place, MEMORY_START)) for m, place in zip(held, shared, strict=True))
+
+
+def move_modes(
+    models: PyTree, states: tuple[jax.Array, ...], key: jax.Array, k: jax.Array, shared: Places
+) -> tuple[jax.Array, ...]:
+    """Return the states of the memories of a plant or sensor at the step after k; of one place, they move alike."""
+    held = memories(models).values()
+    moves = zip(held, states, shared, strict=True)
+    return tuple(m.move(state, draw_key(key, k, place, MEMORY)) for m, state, place in moves)
 
 
 def deliver(

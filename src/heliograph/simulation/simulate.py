@@ -17,6 +17,7 @@ from heliograph.numerics.check import check_count, check_progress, fail, instanc
 from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.random_affine.memory import drop_identities
 from heliograph.simulation.arguments import Precision, check_precision, inputs_of, key_of
 from heliograph.simulation.centres.mesh import build_meshes
 from heliograph.simulation.network import Network
@@ -114,7 +115,9 @@ def monte_carlo(
             return _warn_of_nan(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
-    world = World(network.plant, make_reception(network), plan(filters, u) if has_plan(filters) else filters)
+    world = World(
+        drop_identities(network.plant), make_reception(network), plan(filters, u) if has_plan(filters) else filters
+    )
     later, stop = smoothing and smoothing.smoother(filters), np.asarray(first_run + runs)
     job = _Job(world, later, u, base, stop, reducer, precision)
     if one_processor():

@@ -85,7 +85,7 @@ class Smoother(Module):
         def near(estimate: Estimate, which: Angles) -> Estimate:
             mean = jnp.asarray(estimate.mean)
             others = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
-            return Estimate(nearest(mean, others, which), estimate.covariance, estimate.claim)
+            return replace(estimate, mean=nearest(mean, others, which))
 
         every = next((which for which in angles if which), ())
         estimates = tuple(near(e, which) for e, which in zip(known["estimates"], angles, strict=True))
@@ -204,7 +204,7 @@ def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Abs
     def near(estimate: Estimate, x: np.ndarray) -> Estimate:
         mean = np.asarray(estimate.mean)
         known = np.where(np.isnan(x), mean, x)
-        return Estimate(first(plant).near(mean, known), estimate.covariance, estimate.claim)
+        return replace(estimate, mean=first(plant).near(mean, known))
 
     later = record.smoothed
     if later is not None and smoothing is not None:

@@ -1,7 +1,10 @@
 """One step of a simulation: the plant moves, its nodes receive measurements, every filter is stepped."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
@@ -9,8 +12,10 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
+from heliograph.random_affine.memory import condition_on_memories
 from heliograph.simulation.random_keys import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.reception import AbstractMedium
+from heliograph.simulation.shared_fading import PLANT, memory_places, move_modes, start_modes
 from heliograph.simulation.stepping import AllFilters
 from straightline import present
 
@@ -24,14 +29,20 @@ class World(Module):
 
     def init(self, key: jax.Array) -> PyTree:
         """Return the state before the first step of the run with this key."""
-        x = at(self.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
+        plant = at(self.plant, 0)
+        x, modes = plant.sample_initial(draw_key(key, 0, WORLD, INITIAL)), start_modes(plant, key, self._places)
         edges = {name: mesh.edges.init(key) for name, mesh in self.filters.meshes.items()}
-        return x, self.medium.init(key), self.filters.init(), edges
+        return x, self.medium.init(key), self.filters.init(), edges, modes
+
+    @property
+    def _places(self) -> np.ndarray:
+        """Places of the memories of the plant, (memories,)."""
+        return memory_places({PLANT: self.plant}, self.plant)[PLANT]
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step to k with the input u: next state, and truth (n,), measurements and estimates."""
-        (x, medium, states, edges), (k, u) = carry, row
-        plant = at(self.plant, k)
+        (x, medium, states, edges, modes), (k, u) = carry, row
+        plant = condition_on_memories(at(self.plant, k), modes)
         x = wrap_angles(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         medium, z = self.medium.receive(medium, x, u, key, k)
         z = tuple(present(values) if whole else values for values, whole in zip(z, self.filters.complete, strict=True))
@@ -40,7 +51,8 @@ class World(Module):
         edges = {name: state for name, (state, _) in across.items()}
         drawn |= {name: arrived for name, (_, arrived) in across.items()}
         states, outputs = self.filters.step(states, z, u, k, drawn)
-        after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges
+        modes = move_modes(self.plant, modes, key, k, self._places)
+        after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges, modes
         seen = {
             "truth": x,
             "measurements": z,
@@ -56,7 +68,7 @@ def _turn_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree
         return outputs
 
     def near(estimate: Estimate) -> Estimate:
-        return Estimate(plant.near(jnp.asarray(estimate.mean), x), estimate.covariance, estimate.claim)
+        return replace(estimate, mean=plant.near(jnp.asarray(estimate.mean), x))
 
     items = {key: outputs[key] for key in ("estimates", "fused")}
     return {**outputs, **jax.tree.map(near, items, is_leaf=lambda leaf: isinstance(leaf, Estimate))}

@@ -80,8 +80,8 @@ def sweep_back(steps: SmootherStep) -> Estimate:
 
     # From the last step, whose smoothed state is the filtered one.
     last = take_step(steps, -1)
-    _, earlier = jax.lax.scan(body, last.after, _pair_with_next(steps), reverse=True)
-    return _append_last(earlier, last.estimate_from(last.after))
+    _, earlier = jax.lax.scan(body, last.end, _pair_with_next(steps), reverse=True)
+    return _append_last(earlier, last.estimate_from(last.end))
 
 
 def sweep_means(steps: SmootherStep) -> jax.Array:
@@ -113,7 +113,7 @@ def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
         return passed
 
     # From the newest step that each one may use, as many steps back as the lag has.
-    newest = take_steps(steps.after, jnp.minimum(times + lag, last))
+    newest = take_steps(steps.end, jnp.minimum(times + lag, last))
     estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(
         steps, jax.lax.fori_loop(0, lag, body, newest)
     )

@@ -56,6 +56,8 @@ def simulation_smoother(
 def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
     """Draw one path for each key, by one filter pass."""
     _, steps = step_rows(filter, z, u, filter.init(), np.asarray(0))
+    if steps.before is None:
+        raise fail("paths", "a filter of one law of motion (rts_smoother takes several)", type(filter).__name__)
     drawn: jax.Array = jax.vmap(lambda key: _draw_path_back(steps, key))(keys)
     return drawn
 

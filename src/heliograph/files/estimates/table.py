@@ -69,6 +69,8 @@ def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Est
             for j in range(i + 1, len(states)):
                 of = " ".join(units[name] for name in (a, states[j]) if name in units)
                 columns.append((make_header(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
+    if estimate.modes is not None:
+        columns += [(f"mode.{i}", values) for i, values in enumerate(np.asarray(estimate.modes).T)]
     return [*columns, ("valid", is_sound(estimate))]
 
 

@@ -1,5 +1,6 @@
 """Filters whose state is a mean and a covariance: their prior, prediction and estimate, and the one without data."""
 
+from functools import reduce
 from typing import Protocol
 
 import jax
@@ -21,6 +22,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, l
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
+from heliograph.model.modes_of_motion import ModalPlant
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.model.premises.premise import believes
@@ -82,6 +84,8 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
     where it is added.
     """
     first_step = at(plant, 0)
+    if isinstance(first_step, ModalPlant):  # the largest of the models
+        return reduce(jnp.maximum, [second_moments_at_start(model, start) for model in first_step.models])
     start = first_step if start is None else start
     mean = jnp.asarray(start.initial_mean)
     size = mean * mean + jnp.diagonal(jnp.asarray(start.initial_covariance))

@@ -1,7 +1,8 @@
 """When the Gaussians of modes are merged, and how: mixtures of them by two moments, and what a plant makes of these."""
 
-import math
+from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,23 +16,42 @@ from heliograph.numerics.module import Module, unwritten
 
 
 class AbstractMerging(Module):
-    """Rule that decides when the Gaussians of modes are merged."""
+    """Rule that decides when the Gaussians of modes are merged.
+
+    Components c are K Gaussians, weight[c, j] the probability of component c and present mode j of M; K is M unless a
+    rule says otherwise.
+    """
+
+    @property
+    def corrects_pairs(self) -> bool:
+        """True if what was moved is merged after its correction alone, pair by pair of modes."""
+        return False
+
+    def start(self, law: jax.Array) -> jax.Array:
+        """Return the weights (K, M) of the components before any data, of the modes' law (M,)."""
+        return jnp.diag(law)
+
+    def by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+        """Return one Gaussian for each mode, of components and weights (K, M) as `kept` returns them."""
+        return parts
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Weights (M, K) of the components in K mixtures that replace them, and those after the chain's transition.
-
-        K is M, or 1 where all components become the same.
-        """
+        """Weights (K, G) of the components in G mixtures, and those (K, M) of the components that these become."""
         raise unwritten(self, "mixing")
+
+    def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return, of each component after the prediction, which mixture it was and which mode moved it."""
+        places = np.arange(modes)
+        return places, places
 
     def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs (component, mode) of the measurement update: all that can have a weight."""
         places = np.arange(modes)
         return places, places
 
-    def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
-        """Return the components after the update of all pairs, and the probability of each present mode."""
-        return parts, weight
+    def kept(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+        """Return the components after the update of all pairs, and their weights (K, M)."""
+        return parts, jnp.diag(weight)
 
 
 class MergeAll(AbstractMerging):
@@ -40,6 +60,10 @@ class MergeAll(AbstractMerging):
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Replace every component by the whole mixture."""
         return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ rows, axis=0))
+
+    def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Each mode moves the one mixture."""
+        return np.zeros(modes, int), np.arange(modes)
 
 
 class MergeByNextMode(AbstractMerging):
@@ -52,7 +76,12 @@ class MergeByNextMode(AbstractMerging):
 
 
 class MergeByMode(AbstractMerging):
-    """One Gaussian per mode, each updated in every next mode (GPB2)."""
+    """One Gaussian per mode, each updated in every next mode (GPB2), of a plant that all modes move alike."""
+
+    @property
+    def corrects_pairs(self) -> bool:
+        """Always True."""
+        return True
 
     def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Components keep the mode of their last update."""
@@ -62,11 +91,50 @@ class MergeByMode(AbstractMerging):
         """Pair every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
-    def kept(self, parts: Gaussian, weight: jax.Array) -> tuple[Gaussian, jax.Array]:
+    def kept(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return one component for each present mode."""
-        modes = math.isqrt(len(weight))
         pairs = weight[:, None] * (self.update_pairs(modes)[1][:, None] == np.arange(modes))
-        return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs)), jnp.sum(pairs, axis=0)
+        merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs))
+        return merged, jnp.diag(jnp.sum(pairs, axis=0))
+
+
+class MergePairs(AbstractMerging):
+    """One Gaussian per pair of the mode before and the present one (GPB2), merged by mode before each move."""
+
+    @property
+    def corrects_pairs(self) -> bool:
+        """Always True."""
+        return True
+
+    def by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+        """Merge the pairs of each present mode."""
+        return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight))
+
+    def start(self, law: jax.Array) -> jax.Array:
+        """Put the law of the modes on the pairs of equal modes."""
+        modes = len(law)
+        return self._by_mode(jnp.eye(modes).reshape(-1) * jnp.repeat(law, modes), modes)
+
+    def mixing_weights(self, weight: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Merge what ends in one mode; pair (j, l) has probability P(j) T_jl."""
+        modes = len(rows)
+        return weight, self._by_mode((jnp.sum(weight, axis=0)[:, None] * rows).reshape(-1), modes)
+
+    def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Each mode moves what ended in each mode."""
+        return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
+
+    def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Update each pair in its present mode."""
+        return np.arange(modes**2), np.tile(np.arange(modes), modes)
+
+    def kept(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
+        """Keep all pairs, until the next move."""
+        return parts, self._by_mode(weight, modes)
+
+    def _by_mode(self, weight: jax.Array, modes: int) -> jax.Array:
+        """Place the weights (M^2,) of pairs in the columns of their present modes."""
+        return jnp.asarray(weight[:, None] * (np.tile(np.arange(modes), modes)[:, None] == np.arange(modes)))
 
 
 def normalise_columns(weight: jax.Array) -> jax.Array:
@@ -98,4 +166,63 @@ def mix_and_predict(
         return from_covariance_by_elimination(mean, covariance + noise)
 
     moved: Gaussian = jax.vmap(mix, in_axes=1)(share)
+    return moved
+
+
+def move_by_law(
+    plants: Sequence[AbstractPlant],
+    plant_of: np.ndarray,
+    transform: AbstractTransform,
+    parts: Gaussian,
+    weight: jax.Array,
+    moves: tuple[np.ndarray, np.ndarray],
+    u: jax.Array,
+    start: jax.Array,
+) -> Gaussian:
+    """Move mixtures (components, mixtures) of Gaussians by the plants of modes: component c is mixture moves[0][c].
+
+    plant_of: which plant moves in each mode. Where all modes have one plant, each mixture is moved once.
+    """
+    source, mode = moves
+    if len(plants) == 1:
+        moved = mix_and_predict(plants[0], transform, parts, weight, u, start)
+        same = np.array_equal(source, np.arange(weight.shape[1]))
+        return moved if same else jax.tree.map(lambda leaf: leaf[source], moved)
+    mixtures = mix(parts, normalise_columns(weight))
+    which, results = plant_of[mode], []
+    for number, plant in enumerate(plants):
+        mine = source[which == number]
+        results.append(_predict_each(plant, transform, jax.tree.map(lambda leaf, mine=mine: leaf[mine], mixtures),
+                                     u, start))  # fmt: skip
+    place = np.argsort(np.concatenate([np.flatnonzero(which == number) for number in range(len(plants))]))
+    joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place], *results)
+    return joined
+
+
+class Moments(NamedTuple):
+    """Means (parts, n) and covariances (parts, n, n)."""
+
+    mean: jax.Array
+    covariance: jax.Array
+
+
+def mix(parts: Gaussian, share: jax.Array) -> Moments:
+    """Return the moments of mixtures of Gaussians, by their shares (components, mixtures)."""
+    covariances = jax.vmap(lambda x: x.covariance)(parts)
+    return Moments(*jax.vmap(lambda weights: moments_of_mixture(parts.mean, covariances, weights), in_axes=1)(share))
+
+
+def _predict_each(
+    plant: AbstractPlant, transform: AbstractTransform, x: Moments, u: jax.Array, start: jax.Array
+) -> Gaussian:
+    """Return f(x, u) + w of each of some moments; a linear plant moves the moments themselves."""
+    if not isinstance(plant, LinearPlant):
+        before = jax.vmap(from_covariance_by_elimination)(*x)
+        return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, start))(before)
+    matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
+
+    def move(mean: jax.Array, covariance: jax.Array) -> Gaussian:
+        return from_covariance_by_elimination(matrix @ mean + plant.shift(u), matrix @ covariance @ matrix.T + noise)
+
+    moved: Gaussian = jax.vmap(move)(*x)
     return moved

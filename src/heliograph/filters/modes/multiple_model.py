@@ -15,6 +15,7 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import (
+    BackwardGain,
     Gaussian,
     from_covariance,
     merge_mixture,
@@ -26,7 +27,6 @@ from heliograph.filters.base import (
     Step,
     corrects,
     estimates,
-    make_sizes,
     predicts,
 )
 from heliograph.filters.gaussian.belief import (
@@ -34,28 +34,30 @@ from heliograph.filters.gaussian.belief import (
     smoother_step_by_transform,
 )
 from heliograph.filters.gaussian.signal import Signal, condition_on_measurement, noise_behind_gain, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.modes.mixing import (
     AbstractMerging,
     MergeAll,
     MergeByMode,
     MergeByNextMode,
-    mix_and_predict,
+    MergePairs,
+    move_by_law,
 )
-from heliograph.filters.modes.patterns import SideInformation, describe_by_pattern, pattern_of
+from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
+from heliograph.filters.modes.pairs import ModalLaw, ModalSmootherStep, move_pairs
+from heliograph.filters.modes.patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.wrappers.told import takes_told
-from heliograph.model.channel import Channel, check_link, find_received_angles
+from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first, restack, unstack
+from heliograph.model.modes_of_motion import ModalPlant, models_of
+from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, nearest, wrap_angles
-from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
-from heliograph.random_affine.modes import joint_modes
 
 T = TypeVar("T", bound=PyTree)
 
@@ -99,34 +101,20 @@ def _correct_in_mode(
     return condition_on_measurement(signal.prior, slopes, noise, z, expected)
 
 
-def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
-    """Return the initial law of the modes, and the channel by mode and pattern of arrivals, at each step."""
-    steps = [joint_modes(c, nodes) for c in unstack(channel)]
-    no_flags = np.ones((len(steps[0].initial), 1))
-    parts = describe_by_pattern(steps, no_flags)
-    for step in parts if len(no_flags) > 1 else []:
-        _check_random(step)
-    return steps[0].initial, restack(parts, channel)
-
-
-def _check_random(channel: SideInformation) -> None:
-    """Check that z has a density in every combination of mode and pattern, for an x that has one."""
-    for j, a in np.argwhere(np.asarray(channel.chance) > 0):
-        rows, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
-        random = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a])))[np.ix_(rows, rows)]
-        if np.linalg.matrix_rank(random) < len(rows):
-            raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
-
-
 class ModalBeliefs(NamedTuple):
-    """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
+    """A Gaussian for each of K components, and weight[c, j], the probability of component c and present mode j of M.
 
-    Shapes: the Gaussians (M, n), weight (M, M). `moved` is true from the first prediction on.
+    Shapes: the Gaussians (K, n), weight (K, M). `moved` is true from the first prediction on.
     """
 
     gaussian: Gaussian
-    weight: Float[jax.Array, "M M"]
+    weight: Float[jax.Array, "K M"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def law(self) -> jax.Array:
+        """Probabilities (M,) of the present modes."""
+        return jnp.sum(self.weight, axis=0)
 
     @property
     def components(self) -> tuple[jax.Array, Gaussian]:
@@ -150,6 +138,8 @@ class MultipleModelFilter(AbstractSizedFilter):
     merging: AbstractMerging
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
+    plant_modes: tuple[int, ...] = eqx.field(static=True)  # which of the plant's models each mode has
+    sensor_modes: tuple[int, ...] = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles:
         """Return the angles of its plant, and those that its channel delivers."""
@@ -158,45 +148,105 @@ class MultipleModelFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes."""
-        start = at(self.plant, 0)
-        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(self.initial))
-        return ModalBeliefs(parts, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
+        start, weight = at(self.plant, 0), self.merging.start(jnp.asarray(self.initial))
+        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
+        return ModalBeliefs(parts, weight, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
         """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
-        plant, u = at(self.plant, k), jnp.asarray(u)
-        rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
-        mixing, weight = self.merging.mixing_weights(state.weight, rows)
-        moved = mix_and_predict(plant, self.transform, state.gaussian, mixing, u, second_moments_at_start(self.plant))
-        parts: Gaussian = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(rows), leaf.shape[1])), moved)
-        parts = parts._replace(mean=align_angles(plant, parts.mean, jnp.sum(weight, axis=1)))
+        plants, u, modes = models_of(at(self.plant, k)), jnp.asarray(u), len(self.initial)
+        mixing, weight = self.merging.mixing_weights(state.weight, self.transition_matrix(state, k))
+        parts = move_by_law(
+            plants, np.array(self.plant_modes), self.transform, state.gaussian, mixing, self.merging.moves(modes), u,
+            second_moments_at_start(self.plant),
+        )  # fmt: skip
+        parts = parts._replace(mean=align_angles(plants[0], parts.mean, jnp.sum(weight, axis=1)))
         return ModalBeliefs(parts, weight, jnp.asarray(True))
+
+    def transition_matrix(self, state: ModalBeliefs, k: Step) -> jax.Array:
+        """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
+        return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
         """Correct each component in each mode with z, and weight them by their likelihood."""
-        (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
+        channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
+        _, j = self.merging.update_pairs(modes)
+        (signal, weights), plant = self.prior_signals(state, k), models_of(at(self.plant, k))[0]
+        after, weight, mixed = correct_in_every_mode(signal, channel, jnp.asarray(j), weights, z, self.observed_angles)
+        parts = after._replace(mean=align_angles(plant, after.mean, weight))
+        return ModalBeliefs(*self.merging.kept(parts, weight, modes), state.moved), mixed
+
+    def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
+        """Return the signal of each pair (component, mode) that is corrected, and its weight before."""
         i, j = self.merging.update_pairs(len(self.initial))
-        start = second_moments_at_start(self.plant)
-        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.gaussian)
-        signal = jax.tree.map(lambda leaf: leaf[i], signals)
-        after, weight, mixed = correct_in_every_mode(
-            signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles
-        )
-        parts, law = self.merging.kept(after._replace(mean=align_angles(plant, after.mean, weight)), weight)
-        return ModalBeliefs(parts, jnp.diag(law), state.moved), mixed
+        return self.signals(state.gaussian, (i, j), k), state.weight[i, j]
+
+    def signals(self, parts: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
+        """Return the signal of each pair (component, mode): of the mode's sensor under the component's prior."""
+        plant, sensors = models_of(at(self.plant, k))[0], models_of(at(self.sensor, k))
+        (i, j), start = pairs, second_moments_at_start(self.plant)
+        which, results = np.array(self.sensor_modes)[j], list[Signal]()
+        for number, sensor in enumerate(sensors):
+            mine = np.unique(i[which == number])
+            own = parts if len(mine) == len(parts.mean) else jax.tree.map(lambda leaf, mine=mine: leaf[mine], parts)
+            signals = jax.vmap(lambda x, sensor=sensor: signal_of(plant, sensor, self.transform, x, start))(own)
+            back = np.searchsorted(mine, i[which == number])
+            results.append(jax.tree.map(lambda leaf, back=back: leaf[back], signals))
+        if len(results) == 1:
+            return results[0]
+        place = np.argsort(np.concatenate([np.flatnonzero(which == number) for number in range(len(sensors))]))
+        joined: Signal = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place], *results)
+        return joined
 
     @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
-        """Return the mean and covariance of the whole mixture, angles between -pi and pi."""
+        """Return the mean and covariance of the whole mixture, angles between -pi and pi, and the modes' law."""
         weights, parts = state.components
         mean, covariance = moments_of_mixture(parts.mean, parts.covariance, weights)
-        return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
+        return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim, state.law)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return that of the whole mixture's moments around the update; modes are not smoothed."""
-        return smoother_step_by_transform(self, step.map_states(_merge_mixture), first(self.plant))
+        """Return the step of smoothing by pairs of modes, with the moments of the whole mixture around the update."""
+        plants, modes, angles = models_of(at(self.plant, step.k)), len(self.initial), first(self.plant).angles
+        law = self._law_of(step.after)
+        known, pairs, weights, ways = self._describe_pairs(step, law)
+        whole = step.map_states(_merge_mixture)
+        moments: Any = None
+        if len(plants) == 1:
+            moments = smoother_step_by_transform(self, whole, first(self.plant)).before
+        return ModalSmootherStep(
+            whole.after, moments, claim=self.claim, angles=angles, law=law, known=known, ways=ways,
+            pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), pairs), weights=weights,
+        )  # fmt: skip
+
+    def _law_of(self, state: ModalBeliefs) -> ModalLaw:
+        """Return the law of a state after a correction, mode by mode."""
+        return ModalLaw(self.merging.by_mode(state.gaussian, state.weight), state.law)
+
+    def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> tuple[Gaussian, Gaussian, jax.Array, BackwardGain]:
+        """Return what ratios are to, the pairs (M^2, n) that the future is told to, their weights, and the ways back.
+
+        Where pairs are corrected before they are merged, they have taken z, and the ratio is to the filtered modes.
+        """
+        modes, k, before = len(self.initial), step.k, self._law_of(step.before)
+        plants, start = models_of(at(self.plant, k)), second_moments_at_start(self.plant)
+        moved = move_pairs(
+            plants, np.array(self.plant_modes), self.transform, before.gaussian, jnp.asarray(step.u), start
+        )
+        pairs = jax.tree.map(lambda leaf: leaf.reshape(modes**2, *leaf.shape[2:]), moved.gaussian)
+        weights = before.law[:, None] * self.transition_matrix(step.before, k)
+        known = after.gaussian if self.merging.corrects_pairs else step.prior.gaussian
+        pairs = pairs._replace(mean=plants[0].near(pairs.mean, jnp.tile(known.mean, (modes, 1))))
+        if not self.merging.corrects_pairs:
+            return known, pairs, weights, moved.back
+        j = np.tile(np.arange(modes), modes)
+        signal = self.signals(pairs, (np.arange(modes**2), j), k)
+        pairs, weight, _ = correct_in_every_mode(
+            signal, at(self.channel, k), jnp.asarray(j), weights.reshape(-1), jnp.asarray(step.z), self.observed_angles
+        )
+        return known, pairs, weight.reshape(modes, modes), moved.back
 
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:
@@ -214,20 +264,6 @@ def replicate(x: T, count: int) -> T:
 def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
     """Unwrap the angles of means (components, n) to lie near those of the most probable, so that they average."""
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
-
-
-def fields_of_mode_filters(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None, nodes: int
-) -> dict[str, Any]:
-    """Return the fields that all filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
-    start = instance("plant", first(plant), AbstractPlant, "a plant")
-    check_link(first(sensor), first(channel), len(start.states))
-    angles, (initial, described) = find_received_angles(plant, sensor, channel), describe_modes(channel, nodes)
-    return {
-        "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "observed_angles": angles,
-        "transform": Cubature() if transform is None else transform,
-        **make_sizes("nominal", start, first(channel).outputs),
-    }  # fmt: skip
 
 
 @believes
@@ -312,5 +348,6 @@ def gpb2_filter(
     Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
     """
     return MultipleModelFilter(
-        merging=MergeByMode(), **fields_of_mode_filters(plant, sensor, channel, transform, nodes)
+        merging=MergePairs() if isinstance(plant, ModalPlant) else MergeByMode(),
+        **fields_of_mode_filters(plant, sensor, channel, transform, nodes),
     )

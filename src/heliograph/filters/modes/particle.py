@@ -19,21 +19,22 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.multiple_model import (
     align_angles,
     correct_in_every_mode,
-    fields_of_mode_filters,
     replicate,
 )
 from heliograph.filters.modes.patterns import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrap_angles
-from heliograph.numerics.check import check_count
+from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
@@ -71,6 +72,8 @@ class ParticleFilter(AbstractSizedFilter):
     initial: Float[Array, " M"]
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
+    plant_modes: tuple[int, ...] = eqx.field(static=True)
+    sensor_modes: tuple[int, ...] = eqx.field(static=True)
     particles: int = eqx.field(static=True)
     seed: Int[Array, ""]  # a number, so that filters of all seeds are one program
 
@@ -176,6 +179,9 @@ def particle_filter(
     Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
         2001.
     """
+    for kind, model in (("plant", plant), ("sensor", sensor)):
+        if isinstance(model, ModalPlant | ModalSensor):
+            raise fail(kind, "one law (imm_filter and gpb2_filter take several)", f"a markov_{kind}")
     return ParticleFilter(
         particles=check_count("particles", particles),
         seed=np.asarray(check_count("seed", seed, 0)),

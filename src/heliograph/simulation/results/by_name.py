@@ -71,6 +71,17 @@ def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[st
     }
 
 
+def collect_modes(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
+    """Return the modes' probabilities (..., M) of the filters that weigh modes, by node and filter."""
+    parts, fused = batch["estimates"], batch["fused"] if network.fused else {}
+    central = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
+    return central | {
+        name: np.moveaxis(np.asarray(parts[kind].modes), (-3, -2), (0, 1))[f, i]
+        for name, (kind, f, i) in network.places.items()
+        if kind < len(parts) and parts[kind].modes is not None
+    }
+
+
 def collect_weighed(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
     """Innovations by component of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
     parts = batch.get("weighed", ())

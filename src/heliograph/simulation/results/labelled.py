@@ -21,6 +21,7 @@ LEVELS = ["node", "filter", "quantity", "component", "other"]
 Column = tuple[str, str, str, str, str]
 COVARIANCE: dict[str, Claim] = {f"covariance ({claim})": claim for claim in STRENGTH}
 SENT = ("saturated", "symbols")
+MODES = "mode probability"
 
 
 def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
@@ -76,7 +77,8 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
         if quantity in COVARIANCE:
             covariance = value.reshape(*lead, len(states), len(states))
             moments = values[node, name, "mean"], covariance
-            estimates.setdefault(node, {})[name] = Estimate(*moments, COVARIANCE[quantity])
+            modes = values.get((node, name, MODES))
+            estimates.setdefault(node, {})[name] = Estimate(*moments, COVARIANCE[quantity], modes)
         elif quantity == SENT[0]:
             uplinks.setdefault(name, []).append(node)
     return {
@@ -108,7 +110,29 @@ def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[s
     for i, state in enumerate(states):
         for j, other in enumerate(states):
             results[node, name, f"covariance ({estimate.claim})", state, other] = covariance[..., i, j]
+    if estimate.modes is not None:
+        modes = np.asarray(estimate.modes)
+        results |= {(node, name, MODES, str(i), ""): modes[..., i] for i in range(modes.shape[-1])}
     return results
+
+
+def modes_of(estimates: Mapping[str, Mapping[str, Estimate]]) -> int:
+    """Return the largest number of modes that a filter weighs; 0 where none weighs any."""
+    return max((read_modes(e).shape[-1] for of in estimates.values() for e in of.values()), default=0)
+
+
+def read_modes(estimate: Estimate) -> np.ndarray:
+    """Return the modes' probabilities (..., M) of an estimate; none of a filter that weighs none."""
+    mean = np.asarray(estimate.mean)
+    return np.zeros((*mean.shape[:-1], 0)) if estimate.modes is None else np.asarray(estimate.modes)
+
+
+def without_padding(modes: np.ndarray | None) -> np.ndarray | None:
+    """Return the modes' probabilities without those that are NaN at all times; None where nothing is left."""
+    if modes is None:
+        return None
+    there = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
+    return modes[..., there] if there.any() else None
 
 
 TIME = "time"
@@ -131,6 +155,7 @@ FIELDS = {
     "length": Field("node", "how many numbers the node receives; -1: it is no place that receives"),
     "mean": Field("... node filter state", "estimate of the state"),
     "covariance": Field("... node filter state other", "covariance of the error as the filter claims it"),
+    "modes": Field("... node filter mode", "probability of each mode, NaN of a filter that weighs fewer or none"),
     "claim": Field(
         "node filter",
         "what the claimed covariance is: exact, upper, nominal or none; empty where there is no such filter",

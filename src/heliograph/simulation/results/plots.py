@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from heliograph.disk.palette import COLOURS
-from heliograph.disk.quoting import label_with_unit
-from heliograph.numerics.check import fail
+from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import check_count, fail
 
 FAR = 10.0  # times the best filter's error: from there an axis is logarithmic
 
@@ -55,6 +56,46 @@ def make_panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, 
     if len(given) != count:
         raise fail("axes", f"{count}, one for each state", len(given))
     return given
+
+
+def check_run(run: int, runs: int | None) -> None:
+    """Raise ValueError unless there is such a run; of a recording, which has none, any number will do."""
+    if runs is not None and check_count("run", run, 0) >= runs:
+        raise fail("run", f"one of {runs}, counted from 0", run)
+
+
+def draw_band(
+    panel: "Axes", time: np.ndarray, mean: np.ndarray, squares: np.ndarray | None, drawn_as: tuple[str, str]
+) -> None:
+    """Draw a mean over time in a colour, by a name, with a band of squared half-widths; None for no band."""
+    colour, name = drawn_as
+    panel.plot(time, mean, color=colour, label=quote_for_figure(name))
+    if squares is not None:
+        band = np.sqrt(np.where(squares >= 0, squares, np.nan))
+        panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+
+
+def draw_modes(
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    node: str | None,
+    filters: Sequence[str] | None,
+    axes: object,
+    run: int | None,
+    clock: tuple[np.ndarray, Mapping[str, str]],
+) -> "Axes":
+    """Draw the probabilities of the modes of a node's filters: a colour for each filter, a style for each mode."""
+    weighing = {of: {f: e for f, e in mine.items() if e.modes is not None} for of, mine in estimates.items()}
+    node, chosen = choose_filters(weighing, node, filters)
+    panel, styles = make_panels(None if axes is None else [axes], 1, *clock)[0], ("-", "--", ":", "-.")
+    for number, name in enumerate(chosen):
+        modes = np.asarray(weighing[node][name].modes)[... if run is None else run]
+        for j in range(modes.shape[-1]):
+            panel.plot(clock[0], modes[:, j], styles[j % len(styles)], color=colour_of(number),
+                       label=quote_for_figure(f"{name}, mode {j}"))  # fmt: skip
+    panel.set_ylim(-0.02, 1.02)
+    panel.set_ylabel("probability")
+    legend_outside(panel)
+    return panel
 
 
 def legend_outside(axes: "Axes", title: str | None = None) -> None:

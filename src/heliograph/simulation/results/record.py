@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.disk.quoting import label_with_unit
 from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.origin import KeptOrigin, Origin
@@ -26,16 +26,22 @@ from heliograph.simulation.results.labelled import (
     FilterLabels,
     check_title,
     each_filter,
+    modes_of,
     names_of,
+    read_modes,
     read_units,
     read_uplinks,
     read_values,
     record_fields,
     record_frame,
+    without_padding,
 )
 from heliograph.simulation.results.plots import (
+    check_run,
     choose_filters,
     colour_of,
+    draw_band,
+    draw_modes,
     legend_outside,
     make_panels,
     state_places,
@@ -215,8 +221,8 @@ class Record(Saved):
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         rows = {TIME: len(self.time)} if self.runs is None else {"run": self.runs, TIME: len(self.time)}
         longest = max((z.shape[-1] for _, z in received), default=0)
-        labels = FilterLabels(nodes, self.estimates, self.states, rows, {"received": longest}, self.uplinks)
-        # Fields, NaN where a node has no such filter or component.
+        longest_of = {"received": longest} | ({"mode": modes} if (modes := modes_of(self.estimates)) else {})
+        labels = FilterLabels(nodes, self.estimates, self.states, rows, longest_of, self.uplinks)
         lengths = {node: z.shape[-1] for node, z in self.measurements.items()}
         fields = {
             "measurement": labels.fill("measurement", received),
@@ -227,6 +233,8 @@ class Record(Saved):
             "covariance": labels.of_filters("covariance", lambda estimate: estimate.covariance),
             **labels.sent(),
         }
+        if modes:
+            fields["modes"] = labels.of_filters("modes", read_modes)
         if self.truth is not None:
             fields["truth"] = self.truth
         return labels.dataset(RECORD, fields, self.time, self.units)
@@ -241,11 +249,12 @@ class Record(Saved):
         check_title(dataset, RECORD)
         lead, nodes = ["run", TIME] if "run" in dataset.dims else [TIME], names_of(dataset, "node")
         measurement, length = read_values(dataset, "measurement", lead), read_values(dataset, "length", lead)
-        # Back to nodes and filters by name.
         there = np.flatnonzero(read_values(dataset, "estimated", lead))
         estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in there}
-        for node, name, claim, values in each_filter(dataset, ("mean", "covariance"), lead):
-            estimates[node][name] = Estimate(values["mean"], values["covariance"], claim)
+        fields = ("mean", "covariance", *(["modes"] if "modes" in dataset else []))
+        for node, name, claim, values in each_filter(dataset, fields, lead):
+            modes = without_padding(values.get("modes"))
+            estimates[node][name] = Estimate(values["mean"], values["covariance"], claim, modes)
         return cls(
             time=np.asarray(dataset[TIME].values),
             states=tuple(names_of(dataset, "state")),
@@ -261,7 +270,7 @@ class Record(Saved):
     def to_pandas(self) -> "pd.DataFrame":
         """Return the table: a row for each time (and run), columns (node, filter, quantity, component, other).
 
-        Quantities: truth, measurement, mean, "covariance (CLAIM)" of component and other, saturated, symbols.
+        Quantities: truth, measurement, mean, "covariance (CLAIM)", "mode probability", saturated, symbols.
 
         Raises:
             ModuleNotFoundError: without pandas (extra "results").
@@ -304,28 +313,41 @@ class Record(Saved):
             ValueError: a node, filter, state or run that there is not, another number of axes.
             ModuleNotFoundError: without matplotlib (extra "report").
         """
-        # What is drawn, on which axes.
         node, filters = choose_filters(self.estimates, node, filters)
         places = state_places(states, self.states)
-        if self.runs is not None and check_count("run", run, 0) >= self.runs:
-            raise fail("run", f"one of {self.runs}, counted from 0", run)
+        check_run(run, self.runs)
         which: Any = ... if self.runs is None else run
         drawn = make_panels(axes, len(places), self.time, self.units)
-        # Mean and +- sigmas claimed deviations, then the truth.
         for panel, i in zip(drawn, places, strict=True):
             for number, name in enumerate(filters):
-                estimate, colour = self.estimates[node][name], colour_of(number)
-                mean = np.asarray(estimate.mean)[which][..., i]
-                variance = np.asarray(estimate.covariance)[which][..., i, i]
-                panel.plot(self.time, mean, color=colour, label=quote_for_figure(name))
-                if estimate.claim != "none":
-                    band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
-                    panel.fill_between(self.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+                estimate = self.estimates[node][name]
+                mean, variance = np.asarray(estimate.mean)[which][..., i], np.asarray(estimate.covariance)[which]
+                claimed = None if estimate.claim == "none" else sigmas**2 * variance[..., i, i]
+                draw_band(panel, self.time, mean, claimed, (colour_of(number), name))
             if self.truth is not None:
                 panel.plot(self.time, self.truth[which][..., i], color="0.25", linestyle=":", label="truth")
             panel.set_ylabel(label_with_unit(self.states[i], self.units))
         legend_outside(drawn[0])
         return drawn
+
+    def plot_modes(
+        self, node: str | None = None, filters: Sequence[str] | None = None, axes: "Axes | None" = None, run: int = 0
+    ) -> "Axes":
+        """Draw the probabilities of the modes over time, of the filters of a node that weigh modes.
+
+        Args:
+            node: name of the node; the first by default.
+            filters: names of its filters; all that weigh modes by default.
+            axes: to draw on; new ones by default.
+            run: number of the Monte Carlo run; 0 by default.
+
+        Raises:
+            ValueError: no filter that weighs modes, a node, filter or run that there is not.
+            ModuleNotFoundError: without matplotlib (extra "report").
+        """
+        check_run(run, self.runs)
+        return draw_modes(self.estimates, node, filters, axes, None if self.runs is None else run,
+                          (self.time, self.units))  # fmt: skip
 
     def failures(self) -> list[str]:
         """List filters whose estimate became non-finite or whose bound lost positive semidefiniteness, a line each.

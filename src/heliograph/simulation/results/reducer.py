@@ -16,6 +16,7 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import (
+    collect_modes,
     collect_weighed,
     reports_by_name,
     split_by_name,
@@ -146,8 +147,12 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
     measurements = split_measurements(network, batch["measurements"])
     mean = split_by_name(network, batch, attrgetter("mean"), -3)
     covariance = split_by_name(network, batch, attrgetter("covariance"), -4)
+    modes = collect_modes(network, batch)
     estimates = {
-        node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
+        node: {
+            name: Estimate(mean[node][name], covariance[node][name], claim, modes.get((node, name)))
+            for name, claim in claims.items()
+        }
         for node, claims in network.claims().items()
     }
     uplinks, reports = uplinks_by_name(network, batch["uplinks"]), reports_by_name(network, batch["reports"])

@@ -10,9 +10,9 @@ import numpy as np
 from heliograph.model.estimate import Claim
 from heliograph.numerics.module import readable
 from heliograph.numerics.trees.flat import Flat
-from heliograph.numerics.types import PyTree
+from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.results.by_name import split_by_name
+from heliograph.simulation.results.by_name import collect_modes, split_by_name
 
 
 class JudgementAt(NamedTuple):
@@ -53,6 +53,7 @@ class FilterColumns(NamedTuple):
         weighed: columns of its `Weighed`; None of a filter that weighs nothing.
         tested: columns of a fusion's squared innovation by what its nodes receive, and of how many numbers these were;
             None for all others.
+        modes: first column of the modes' probabilities, and that after the last; None of a filter that weighs none.
     """
 
     node: str
@@ -60,9 +61,14 @@ class FilterColumns(NamedTuple):
     claim: Claim
     mean: int
     covariance: int
-    judgement: JudgementAt | None
-    weighed: WeighedAt | None
-    tested: TestedAt | None
+    judgement: "JudgementAt | None"
+    weighed: "WeighedAt | None"
+    tested: "TestedAt | None"
+    modes: tuple[int, int] | None = None
+
+    def probabilities(self, outputs: Float[np.ndarray, "... outputs"]) -> Float[np.ndarray, "... M"] | None:
+        """Return the modes' probabilities among outputs; None of a filter that weighs no modes."""
+        return None if self.modes is None else outputs[..., self.modes[0] : self.modes[1]]
 
 
 def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
@@ -71,10 +77,12 @@ def columns_of(network: Network, outputs: Flat) -> tuple[FilterColumns, ...]:
     mean = split_by_name(network, numbered, attrgetter("mean"), -3)
     covariance = split_by_name(network, numbered, attrgetter("covariance"), -4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
+    modes = {name: (int(at[0]), int(at[-1]) + 1) for name, at in collect_modes(network, numbered).items()}
     tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
         FilterColumns(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
-              judged[node].get(name), weighed.get((node, name)), tested.get((node, name)))
+              judged[node].get(name), weighed.get((node, name)), tested.get((node, name)),
+              modes.get((node, name)))
         for node, filters in network.claims().items()
         for name, claim in filters.items()
     )  # fmt: skip

@@ -143,11 +143,11 @@ def sweep_back(static: Static, dt: int | None) -> tuple[Callable[..., PyTree], C
             now, steps, later = carry
             before = into(sweep, history, now)
             passed = _map_filters(lambda step, later: step.back(later), steps, later)
-            ends = _map_filters(lambda step: step.after, before)
+            ends = _map_filters(lambda step: step.end, before)
             later = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), ends, passed)
             return earlier(history, now), before, later
 
-        begun = last, blank, _map_filters(lambda step: step.after, blank)
+        begun = last, blank, _map_filters(lambda step: step.end, blank)
         _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
         return sweep.outputs(steps, later)
 
@@ -259,7 +259,9 @@ def _only(results: PyTree) -> PyTree:
 
 
 def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
-    return lower_unsound_claim(Estimate(np.asarray(outputs.mean)[where], np.asarray(outputs.covariance)[where], claim))
+    modes = None if outputs.modes is None else np.asarray(outputs.modes)[where]
+    mean, covariance = (np.asarray(part)[where] for part in (outputs.mean, outputs.covariance))
+    return lower_unsound_claim(Estimate(mean, covariance, claim, modes))
 
 
 def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:

@@ -18,6 +18,7 @@ from heliograph.engine.choice import try_native
 from heliograph.engine.limits import BLOCK
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
+from heliograph.random_affine.memory import drop_identities
 from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -272,7 +273,7 @@ def code_of_network(
 ) -> Native:
     """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
     filters = AllFilters(network, smoothing and smoothing.kinds)
-    world = World(network.plant, make_reception(network), filters)
+    world = World(drop_identities(network.plant), make_reception(network), filters)
     return compile_runs(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, precision)
 
 

@@ -1,0 +1,67 @@
+"""Parts of filters of modes: plant, sensor and channel in each mode of their joint chain."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from heliograph.filters.base import make_sizes
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.modes.patterns import SideInformation, describe_by_pattern
+from heliograph.model.channel import Channel, check_link, find_received_angles
+from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, models_of
+from heliograph.model.over_time import OverTime, first, restack, unstack
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.check import fail, instance
+from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.modes import JointModes, joint_modes
+
+
+def describe_modes(
+    plant: AbstractPlant, sensor: AbstractSensor, channel: Channel, nodes: int
+) -> tuple[JointModes, SideInformation | OverTime]:
+    """Return the modes of plant, sensor and links as one chain, and the channel by mode and arrivals, at each step."""
+    steps = [joint_modes(c, nodes, beside=(plant, sensor)) for c in unstack(channel)]
+    no_flags = np.ones((len(steps[0].initial), 1))
+    parts = describe_by_pattern(steps, no_flags)
+    for step in parts if len(no_flags) > 1 else []:
+        _check_random(step)
+    return steps[0], restack(parts, channel)
+
+
+def _check_random(channel: SideInformation) -> None:
+    """Check that z has a density in every combination of mode and pattern, for an x that has one."""
+    for j, a in np.argwhere(np.asarray(channel.chance) > 0):
+        rows, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
+        random = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a])))[np.ix_(rows, rows)]
+        if np.linalg.matrix_rank(random) < len(rows):
+            raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
+
+
+def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...]:
+    """Return which of a plant's or sensor's models each joint mode has."""
+    if isinstance(model, OverTime) and isinstance(first(model), ModalPlant | ModalSensor):
+        raise fail(kind, "one whose models are the same at all steps", "modes in over_time")
+    if not isinstance(model, ModalPlant | ModalSensor):
+        return (0,) * len(by_mode)
+    return tuple(next(i for i, own in enumerate(model.models) if own is one) for one in by_mode)
+
+
+def fields_of_mode_filters(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None, nodes: int
+) -> dict[str, Any]:
+    """Return the fields that all filters of modes share; a gain that drifts has `nodes` modes."""
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
+    for model in models_of(first(sensor)):
+        check_link(model, first(channel), len(start.states))
+    angles = find_received_angles(plant, sensor, channel)
+    joint, described = describe_modes(first(plant), first(sensor), channel, nodes)
+    return {
+        "plant": drop_names(plant), "sensor": drop_names(sensor),
+        "channel": described, "initial": joint.initial, "observed_angles": angles,
+        "transform": Cubature() if transform is None else transform,
+        "plant_modes": find_models("plant", plant, [one for one, _ in joint.beside]),
+        "sensor_modes": find_models("sensor", sensor, [one for _, one in joint.beside]),
+        **make_sizes("nominal", start, first(channel).outputs),
+    }  # fmt: skip

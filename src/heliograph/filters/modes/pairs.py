@@ -1,0 +1,170 @@
+"""Smoothing of filters of modes: by pairs of the mode before a step and that after it.
+
+Of each later mode j the future says the ratio of the smoothed N(s_j, S_j) to what the filter had, N(q_j, Q_j). With
+V' Q V = I, V' S V = diag(e) that is an observation, where e < 1: V'x = (V's - e V'q) / (1 - e) with noise e / (1 - e).
+Each pair (i, j), the Gaussian of mode i moved by mode j, observes it; Rauch's step goes back to mode i, and the pairs'
+probabilities P(i, j | all) ~ m_j mu_i T_ij times the likelihood of the observation merge them over j.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, decorrelate, join_columns, unit_lower
+from heliograph.factors.gaussian import (
+    BackwardGain,
+    Gaussian,
+    condition_on_next_state,
+    from_columns,
+    merge_mixture,
+    moments_of_mixture,
+    rts_step,
+    sum_unexplained,
+)
+from heliograph.filters.gaussian.belief import image_of, process_noise
+from heliograph.filters.gaussian.signal import condition_on_measurement
+from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.modes.mixing import normalise_columns
+from heliograph.filters.smoother_step import EarlierState, SmootherStep
+from heliograph.model.estimate import Estimate
+from heliograph.model.plant import AbstractPlant
+from heliograph.numerics.angle import nearest, wrap_angles
+from heliograph.numerics.check import fail
+from heliograph.numerics.lapack import eigh
+from heliograph.numerics.types import Float
+
+NOTHING = 1e-9  # of the information of what the filter had: less is rounding
+SINGULAR = 1e-12  # of a variance, given the components before it: it is known
+
+
+class ModalLaw(NamedTuple):
+    """A Gaussian for each mode, and the probabilities of the modes.
+
+    Shapes: gaussian (M, n), law (M,).
+    """
+
+    gaussian: Gaussian
+    law: Float[jax.Array, "*time M"]
+
+
+class Moved(NamedTuple):
+    """Gaussians of the mode before, moved by the mode after: (M, M, n) of each pair, and the ways back."""
+
+    gaussian: Gaussian
+    back: BackwardGain
+
+
+def move_pairs(
+    plants: tuple[AbstractPlant, ...],
+    plant_of: np.ndarray,
+    transform: AbstractTransform,
+    parts: Gaussian,
+    u: jax.Array,
+    start: jax.Array,
+) -> Moved:
+    """Move each of M Gaussians by the plant of each of M modes."""
+
+    def move(plant: AbstractPlant, x: Gaussian) -> Moved:
+        image = image_of(plant, transform, x, u)
+        rest = sum_unexplained(image, process_noise(plant, u, start))
+        mean = image.mean + plant.noise_mean()
+        ahead = from_columns(mean, join_columns(image.explained, rest))
+        return Moved(ahead, condition_on_next_state(x, image.slopes, mean, rest))
+
+    by_plant = [jax.vmap(lambda x, plant=plant: move(plant, x))(parts) for plant in plants]
+    pairs: Moved = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, plant_of], *by_plant)
+    return pairs
+
+
+class Observation(NamedTuple):
+    """What the future says of a mode's state: h x + noise = value, NaN where it says nothing.
+
+    Shapes: rows h (n, n), value and noise (n,).
+    """
+
+    rows: jax.Array
+    value: jax.Array
+    noise: jax.Array
+
+
+def ratio_of(later: Gaussian, known: Gaussian) -> Observation:
+    """Return the ratio of two Gaussians, N(later) / N(known), as an observation of a state that has `known`.
+
+    Rows are scaled by sqrt(1 - e), so that no noise is infinite.
+    """
+    whole = jnp.sum(known.root**2 * known.variances, axis=1)
+    free = known.variances > SINGULAR * whole
+    scale = jnp.where(free, 1 / jnp.sqrt(jnp.where(free, known.variances, 1.0)), 0.0)
+    n, lower = len(known.mean), unit_lower(known.lower)
+    white = scale[:, None] * decorrelate(lower, jnp.eye(n))
+    root = white @ later.root
+    size = (root * later.variances) @ root.T + jnp.diag(jnp.where(free, 0.0, 1.0))
+    e, turn = eigh(size)
+    gained = 1 - jnp.maximum(e, 0.0)
+    tells = gained > NOTHING
+    share = jnp.sqrt(jnp.where(tells, gained, 1.0))
+    axes = turn.T @ white
+    rows = share[:, None] * axes
+    value = rows @ known.mean + axes @ (later.mean - known.mean) / share
+    return Observation(rows, jnp.where(tells, value, jnp.nan), jnp.where(tells, jnp.maximum(e, 0.0), 1.0))
+
+
+class ModalSmootherStep(SmootherStep):
+    """Smoother step of a filter of modes: what the pass back needs of each pair of modes, and the moments of all.
+
+    law: after the step, mode by mode. known: what the ratio of a later law is to, (M, n). pairs: (M, M, n), of mode
+    before and after, with their weights (M, M), and the ways back to the former. The pass back keeps modes; a fixed
+    point and draws of paths are of the moments of the whole mixture, where all modes have one law of motion.
+    """
+
+    law: ModalLaw = eqx.field(kw_only=True)
+    known: Gaussian = eqx.field(kw_only=True)
+    pairs: Gaussian = eqx.field(kw_only=True)
+    weights: Float[jax.Array, "*time M M"] = eqx.field(kw_only=True)
+    ways: BackwardGain = eqx.field(kw_only=True)
+
+    @property
+    def end(self) -> ModalLaw:
+        """The law after the step, from which a pass back starts."""
+        return self.law
+
+    def back(self, later: ModalLaw) -> ModalLaw:  # type: ignore[override]
+        """Smooth the modes before the step from those after it, both given the same later data."""
+        near = nearest(later.gaussian.mean, self.known.mean, self.angles)
+        said = jax.vmap(ratio_of)(later.gaussian._replace(mean=near), self.known)
+
+        def observe(x: Gaussian, seen: Observation) -> tuple[Gaussian, jax.Array]:
+            noise, expected = Columns(jnp.eye(len(x.mean)), seen.noise), seen.rows @ x.mean
+            after, innovation = condition_on_measurement(x, seen.rows @ x.root, noise, seen.value, expected)
+            return after, jnp.asarray(innovation.log_likelihood)
+
+        after, score = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, said)
+        # P(i, j | all): of each later mode, the share of each mode before.
+        possible = self.weights > 0
+        logs = jnp.where(possible, jnp.log(jnp.where(possible, self.weights, 1.0)) + score, -jnp.inf)
+        most = jnp.max(logs, axis=0)
+        shares = jnp.where(possible, jnp.exp(logs - jnp.where(jnp.isfinite(most), most, 0.0)), 0.0)
+        total = jnp.sum(shares, axis=0)
+        joint = later.law * shares / jnp.where(total > 0, total, 1.0)
+        before = jax.vmap(jax.vmap(rts_step))(self.ways, after)
+        merged = jax.vmap(merge_mixture)(before, normalise_columns(joint.T).T)
+        law = jnp.sum(joint, axis=1)
+        return ModalLaw(merged, law / jnp.sum(law))
+
+    def estimate_from(self, law: "ModalLaw | Gaussian") -> Estimate:
+        """Return the estimate of the plant's state, with the modes' probabilities where these are smoothed."""
+        if isinstance(law, Gaussian):
+            return super().estimate_from(law)
+        parts = law.gaussian
+        mean = nearest(parts.mean, parts.mean[jnp.argmax(law.law)], self.angles)
+        mean, covariance = moments_of_mixture(mean, jax.vmap(lambda x: x.covariance)(parts), law.law)
+        return Estimate(wrap_angles(mean, self.angles), covariance, self.claim, law.law)
+
+    def start(self) -> EarlierState:
+        """Return the state after this step as an earlier state that is yet to be carried ahead."""
+        if self.before is None:
+            raise fail("smoothing of plants with modes", "FixedInterval or FixedLag", "a fixed point")
+        return super().start()

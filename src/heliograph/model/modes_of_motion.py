@@ -1,0 +1,294 @@
+"""Plants of several laws of motion, and sensors that work or fail: models of which a Markov chain has one at each step.
+
+The mode of a step moves the plant and measures in it: r_1 ~ pi_0, x_1 = f_(r_1)(x_0, u) + w, z_1 = h_(r_1)(x_1) + v;
+then r_2 ~ T[r_1, .].
+"""
+
+from collections.abc import Sequence
+from typing import Any, NoReturn, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.over_time import OverTime
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.check import fail, items, show_value
+from heliograph.numerics.module import Module, same
+from heliograph.numerics.types import ArrayLike
+from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.memory import AbstractWithMemory, memories, select_alike
+from heliograph.random_affine.noise import AbstractNoise, Square, Vector
+
+TAKEN_BY = "hg.filters.imm_filter, gpb1_filter and gpb2_filter take several"
+
+
+class ModalPlant(AbstractPlant, AbstractWithMemory):
+    """A plant that has one of several laws of motion at each step, by the mode of a chain; built by `markov_plant`.
+
+    Args:
+        memory: the chain.
+        models: the plant of each mode.
+    """
+
+    memory: MarkovChain
+    models: tuple[AbstractPlant, ...]
+    initial_mean: Vector
+    initial_covariance: Square
+    deviation: AbstractNoise | None
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant]):
+        self.memory, self.models = memory, tuple(models)
+        start = self.models[0]
+        self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
+        self.deviation, self.states, self.inputs, self.circular = (
+            start.deviation, start.states, start.inputs, start.circular,
+        )  # fmt: skip
+
+    @property  # type: ignore[misc]
+    def noise(self) -> Any:  # type: ignore[override]
+        """Refused: the noise is that of a mode."""
+        return self._refuse()
+
+    def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """Refused: the law of motion is that of a mode."""
+        return self._refuse()
+
+    def noise_covariance(self, u: jax.Array) -> jax.Array:
+        """Refused: the noise is that of a mode."""
+        return self._refuse()
+
+    def noise_mean(self) -> jax.Array:
+        """Refused: the noise is that of a mode."""
+        return self._refuse()
+
+    def sample_noise(self, key: jax.Array, u: jax.Array) -> jax.Array:
+        """Refused: the noise is that of a mode."""
+        return self._refuse()
+
+    def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractPlant:
+        """Return the plant of this mode; for a traced mode, one with its numbers, or a choice among the plants."""
+        if isinstance(state, int | np.integer):
+            return self.models[state]
+        same_numbers = select_alike(self.models, jnp.asarray(state))
+        return _ChosenPlant(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
+
+    def _refuse(self) -> NoReturn:
+        raise fail("plant", f"one law of motion here ({TAKEN_BY})", f"a markov_plant of {len(self.models)} modes")
+
+
+class _ChosenPlant(AbstractPlant):
+    """One of several plants, by a traced index."""
+
+    models: tuple[AbstractPlant, ...]
+    index: jax.Array
+    noise: Any
+    initial_mean: Vector
+    initial_covariance: Square
+    deviation: AbstractNoise | None
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, models: tuple[AbstractPlant, ...], index: jax.Array):
+        self.models, self.index, self.noise = models, index, None
+        start = models[0]
+        self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
+        self.deviation, self.states, self.inputs, self.circular = (
+            start.deviation, start.states, start.inputs, start.circular,
+        )  # fmt: skip
+
+    def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        return jnp.stack([model.transition(x, u) for model in self.models])[self.index]
+
+    def sample_noise(self, key: jax.Array, u: jax.Array) -> jax.Array:
+        return jnp.stack([model.sample_noise(key, u) for model in self.models])[self.index]
+
+
+class ModalSensor(AbstractSensor, AbstractWithMemory):
+    """A sensor that is one of several at each step, by the mode of a chain; built by `markov_sensor`.
+
+    Args:
+        memory: the chain.
+        models: the sensor of each mode.
+    """
+
+    memory: MarkovChain
+    models: tuple[AbstractSensor, ...]
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, memory: MarkovChain, models: Sequence[AbstractSensor]):
+        self.memory, self.models = memory, tuple(models)
+        self.outputs, self.circular = self.models[0].outputs, self.models[0].circular
+
+    @property  # type: ignore[misc]
+    def noise(self) -> Any:  # type: ignore[override]
+        """Refused: the noise is that of a mode."""
+        return self._refuse()
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        """Refused: what is measured is up to the mode."""
+        return self._refuse()
+
+    def check_states(self, states: int) -> None:
+        """Raise ValueError unless each mode measures a state of this length."""
+        for model in self.models:
+            model.check_states(states)
+
+    def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractSensor:
+        """Return the sensor of this mode; for a traced mode, one with its numbers, or a choice among the sensors."""
+        if isinstance(state, int | np.integer):
+            return self.models[state]
+        same_numbers = select_alike(self.models, jnp.asarray(state))
+        return _ChosenSensor(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
+
+    def _refuse(self) -> NoReturn:
+        raise fail("sensor", f"one law of what is measured here ({TAKEN_BY})",
+                   f"a markov_sensor of {len(self.models)} modes")  # fmt: skip
+
+
+class _ChosenNoise(Module):
+    """The noise of one of several sensors, by a traced index: it can be drawn."""
+
+    noises: tuple[AbstractNoise, ...]
+    index: jax.Array
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        return jnp.stack([noise.sample(key) for noise in self.noises])[self.index]
+
+
+class _ChosenSensor(AbstractSensor):
+    """One of several sensors, by a traced index."""
+
+    models: tuple[AbstractSensor, ...]
+    index: jax.Array
+    noise: Any
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, models: tuple[AbstractSensor, ...], index: jax.Array):
+        self.models, self.index = models, index
+        self.noise = _ChosenNoise(tuple(model.noise for model in models), index)
+        self.outputs, self.circular = models[0].outputs, models[0].circular
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        return jnp.stack([model.measure(x) for model in self.models])[self.index]
+
+
+def markov_plant(
+    models: Sequence[AbstractPlant],
+    transition: "MarkovChain | ArrayLike | None" = None,
+    initial: "ArrayLike | None" = None,
+    name: str | None = None,
+    modes: "AbstractWithMemory | None" = None,
+) -> ModalPlant:
+    """Return a plant whose law of motion is that of the mode of a Markov chain: straight or turning, intact or worn.
+
+    x_k = f_r(x_(k-1), u_k) + w_r with r the mode of step k, r_1 ~ `initial`, r_(k+1) ~ transition[r_k, .]. The mode of
+    a step moves the plant and, of a `markov_sensor` or a link of the same chain, measures in it. Switches fall on steps
+    only: a row that is inserted between two others is a step more.
+
+    Args:
+        models: one plant for each mode, of the same states, inputs, angles and law of x_0.
+        transition: P(next mode j | present mode i) (modes, modes), or a chain.
+        initial: law (modes,) of the mode at the first step; the stationary law by default.
+        name: links, sensors and plants of one name share the chain; by default it is the plant's own.
+        modes: a sensor, plant or link whose chain it is, in place of `transition`; none by default.
+
+    Raises:
+        ValueError: fewer than two models, models of other states, inputs, angles or laws of x_0 than the first,
+            probabilities that are none.
+    """
+    plants = _check_models("models of a plant", models, AbstractPlant)
+    for i, plant in enumerate(plants[1:], start=1):
+        for what in ("states", "inputs", "circular"):
+            if getattr(plant, what) != getattr(plants[0], what):
+                remedy = " (a model without one of them has it all the same, such as a turn rate that stays 0)"
+                raise fail(f"{what} of model {i}", f"{list(getattr(plants[0], what))}, as those of model 0{remedy}",
+                           list(getattr(plant, what)))  # fmt: skip
+        for what in ("initial_mean", "initial_covariance", "deviation"):
+            if not same(getattr(plant, what), getattr(plants[0], what)):
+                raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
+                           f"another {what.replace('_', ' ')}")  # fmt: skip
+    return ModalPlant(_chain_of(transition, initial, name, modes, len(plants)), plants)
+
+
+def markov_sensor(
+    models: Sequence[AbstractSensor],
+    transition: "MarkovChain | ArrayLike | None" = None,
+    initial: "ArrayLike | None" = None,
+    name: str | None = None,
+    modes: "AbstractWithMemory | None" = None,
+) -> ModalSensor:
+    """Return a sensor that is another one in each mode of a Markov chain: it works, is stuck, has a bias.
+
+    z_k = h_r(x_k) + v_r with r the mode of step k. A sensor that is stuck at a value measures 0 x (a matrix of zeros,
+    and a noise with that mean). One that *freezes* repeats its last value, which is a state of the plant then: y = s,
+    and s+ = h(x+) while it works, s+ = s while it is frozen, in a `markov_plant` of the same chain.
+
+    Args:
+        models: one sensor for each mode, of the same outputs and angles.
+        transition: P(next mode j | present mode i) (modes, modes), or a chain.
+        initial: law (modes,) of the mode at the first step; the stationary law by default.
+        name: links, sensors and plants of one name share the chain; by default it is the sensor's own.
+        modes: a plant, sensor or link whose chain it is, in place of `transition`; none by default.
+
+    Raises:
+        ValueError: fewer than two models, models of other outputs or angles than the first, probabilities that are
+            none.
+    """
+    sensors = _check_models("models of a sensor", models, AbstractSensor)
+    for i, sensor in enumerate(sensors[1:], start=1):
+        for what in ("outputs", "circular"):
+            if getattr(sensor, what) != getattr(sensors[0], what):
+                raise fail(f"{what} of model {i}", f"{list(getattr(sensors[0], what))}, as those of model 0",
+                           list(getattr(sensor, what)))  # fmt: skip
+    return ModalSensor(_chain_of(transition, initial, name, modes, len(sensors)), sensors)
+
+
+def models_of(model: Any) -> tuple[Any, ...]:
+    """Return the models of a plant's or sensor's modes, itself alone where it has none."""
+    return model.models if isinstance(model, ModalPlant | ModalSensor) else (model,)
+
+
+def _check_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
+    """Return the models of a chain's modes, each of one law at each step."""
+    checked = tuple(items(name, models, "one model for each mode"))
+    if len(checked) < 2:
+        raise fail(name, "at least two, one for each mode", len(checked))
+    for model in checked:
+        if isinstance(model, OverTime | ModalPlant | ModalSensor) or not isinstance(model, kind):
+            got = "one that varies over time" if isinstance(model, OverTime) else show_value(model)
+            raise fail(name, "models of one law each, for all steps", got)
+    return checked
+
+
+def _chain_of(
+    transition: "MarkovChain | ArrayLike | None",
+    initial: ArrayLike | None,
+    name: str | None,
+    modes: object,
+    count: int,
+) -> MarkovChain:
+    """Return the chain that was given: by its transition, as one, or as that of another model."""
+    if (transition is None) == (modes is None):
+        raise fail("chain of the modes", "transition=, or modes= of a model that has them",
+                   "none" if modes is None else "both")  # fmt: skip
+    if modes is not None:
+        held = list(memories(modes).values())
+        if len(held) != 1 or not isinstance(held[0], MarkovChain):
+            raise fail("modes", "a plant, sensor or link that has one chain", show_value(modes))
+        transition = held[0]
+    if isinstance(transition, MarkovChain):
+        if initial is not None or name is not None:
+            raise fail("initial and name", "none beside a chain, which has its own", "one")
+        chain = transition
+    else:
+        chain = MarkovChain(cast(ArrayLike, transition), initial, name)
+    if chain.modes != count:
+        raise fail("models", f"{chain.modes}, one for each mode of the chain", count)
+    if chain.is_uncertain:
+        raise fail("chain of a plant's or sensor's modes", "known transitions", "a radius of uncertainty")
+    return chain

@@ -1,0 +1,211 @@
+"""Filters of modes of plant and sensor: FilterPy's, all mode paths, the world they are judged in, refusals."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from filterpy.kalman import IMMEstimator, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+import heliograph as hg
+
+G = np.array([0.5, 1.0])
+MATRICES = np.array([[[1.0, 1.0], [0.0, 0.95]], [[1.0, 1.0], [0.0, 0.5]]])
+NOISES = [0.01 * np.outer(G, G), 4.0 * np.outer(G, G)]
+ROWS, START = np.array([[0.97, 0.03], [0.15, 0.85]]), np.array([0.5, 0.5])
+SENSOR, LINK = hg.LinearSensor([[1.0, 0.0]], 1.0), hg.perfect(1)
+FILTERS = {"gpb1": hg.filters.gpb1_filter, "imm": hg.filters.imm_filter, "gpb2": hg.filters.gpb2_filter}
+
+
+def models():
+    return [hg.LinearPlant(f, q, [0.0, 0.0], np.eye(2)) for f, q in zip(MATRICES, NOISES, strict=True)]
+
+
+def motion(initial=START, name=None):
+    return hg.markov_plant(models(), ROWS, initial, name)
+
+
+DATA = np.cumsum(np.random.default_rng(0).normal(size=(8, 1)), axis=0)
+
+
+def by_all_paths(data, sensors=None):
+    """Means, covariances, the last mode's probabilities and the log-likelihood, filtered, of each path of modes."""
+    sensors = [(SENSOR.matrix, 1.0)] * 2 if sensors is None else sensors
+    total, paths = [], list(itertools.product(range(2), repeat=len(data)))
+    for path in paths:
+        weight = np.log(START[path[0]]) + sum(np.log(ROWS[a, b]) for a, b in itertools.pairwise(path))
+        m, p = np.zeros(2), np.eye(2)
+        for j, z in zip(path, data[:, 0], strict=True):
+            (h, r), m, p = sensors[j], MATRICES[j] @ m, MATRICES[j] @ p @ MATRICES[j].T + NOISES[j]
+            s, e = float(h[0] @ p @ h[0]) + r, z - float(h[0] @ m)
+            weight -= (np.log(2 * np.pi * s) + e * e / s) / 2
+            m, p = m + p @ h[0] * e / s, p - np.outer(p @ h[0], h[0] @ p) / s
+        total.append((weight, m, p, path[-1]))
+    logs = np.array([row[0] for row in total])
+    w = np.exp(logs - logs.max())
+    mean = sum(a * row[1] for a, row in zip(w, total, strict=True)) / w.sum()
+    law = [sum(a for a, row in zip(w, total, strict=True) if row[3] == j) / w.sum() for j in (0, 1)]
+    return mean, np.array(law), float(logs.max() + np.log(w.sum()))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_the_first_step_is_that_of_all_paths(name):
+    filtered = FILTERS[name](motion(), SENSOR, LINK).run(DATA[:1])
+    mean, law, likelihood = by_all_paths(DATA[:1])
+    np.testing.assert_allclose(filtered.means[-1], mean, atol=1e-13)  # exact up to rounding
+    np.testing.assert_allclose(filtered.modes[-1], law, atol=1e-13)
+    np.testing.assert_allclose(filtered.log_likelihood, likelihood, atol=1e-13)
+
+
+def test_two_steps_of_gpb2_are_those_of_all_paths_with_a_sensor_that_fails_in_the_same_chain():
+    plant = motion()
+    stuck = hg.LinearSensor([[0.0, 0.0]], 0.5)
+    sensor = hg.markov_sensor([SENSOR, stuck], modes=plant)
+    filtered = hg.filters.gpb2_filter(plant, sensor, LINK).run(DATA[:2])
+    mean, law, likelihood = by_all_paths(DATA[:2], [(SENSOR.matrix, 1.0), (stuck.matrix, 0.5)])
+    np.testing.assert_allclose(filtered.means[-1], mean, atol=1e-13)
+    np.testing.assert_allclose(filtered.modes[-1], law, atol=1e-13)
+    np.testing.assert_allclose(filtered.log_likelihood, likelihood, atol=1e-13)
+
+
+def test_imm_is_filterpys_to_rounding():
+    kalman = []
+    for f, q in zip(MATRICES, NOISES, strict=True):
+        one = KalmanFilter(2, 1)
+        one.F, one.Q, one.H, one.R, one.x, one.P = f, q, SENSOR.matrix, np.eye(1), np.zeros((2, 1)), np.eye(2)
+        kalman.append(one)
+    theirs = IMMEstimator(kalman, START.copy(), ROWS)
+    ours = hg.filters.imm_filter(motion(START @ ROWS), SENSOR, LINK).run(DATA)  # their first predict mixes too
+    for k, z in enumerate(DATA):
+        theirs.predict()
+        theirs.update(z[:, None])
+        np.testing.assert_allclose(ours.means[k], theirs.x.ravel(), atol=1e-10)
+        np.testing.assert_allclose(ours.covariances[k], theirs.P, atol=1e-10)
+        np.testing.assert_allclose(ours.modes[k], theirs.mu, atol=1e-10)
+
+
+def test_unscented_imm_of_turns_is_filterpys_to_rounding():
+    q, r, start, spread = np.diag([0.01, 0.01, 0.001, 0.01]), 0.1 * np.eye(2), [0.0, 0.0, 0.1, 1.0], 0.1 * np.eye(4)
+
+    def move(x, turn, xp):
+        return xp.stack([x[0] + xp.cos(x[2]) * x[3], x[1] + xp.sin(x[2]) * x[3], x[2] + turn, x[3]])
+
+    def see(x, xp):
+        return xp.stack([xp.hypot(x[0], x[1] + 5), x[1]])
+
+    theirs = []
+    for turn in (0.0, 0.2):
+        points = MerweScaledSigmaPoints(4, 1.0, 0.0, -1.0)
+        one = UnscentedKalmanFilter(4, 2, 1.0, lambda x: see(x, np), lambda x, dt, turn=turn: move(x, turn, np), points)
+        one.x, one.P, one.Q, one.R = np.array(start), spread.copy(), q, r
+        theirs.append(one)
+    estimator = IMMEstimator(theirs, START.copy(), ROWS)
+    plants = [hg.Plant(lambda x, u, turn=turn: move(x, turn, jnp), q, start, spread) for turn in (0.0, 0.2)]
+    plant = hg.markov_plant(plants, ROWS, START @ ROWS)
+    sensor, transform = hg.Sensor(lambda x: see(x, jnp), r), hg.filters.Unscented(1.0, 0.0, -1.0)
+    data = np.random.default_rng(1).normal([5.0, 1.0], size=(6, 2))
+    ours = hg.filters.imm_filter(plant, sensor, hg.perfect(2), transform).run(data)
+    for k, z in enumerate(data):
+        estimator.predict()
+        estimator.update(z)
+        np.testing.assert_allclose(ours.means[k], estimator.x, atol=1e-10)
+        np.testing.assert_allclose(ours.covariances[k], estimator.P, atol=1e-10)
+        np.testing.assert_allclose(ours.modes[k], estimator.mu, atol=1e-10)
+
+
+def world(smoothed=False):
+    plant = motion()
+    others = {"one": hg.kalman_filter(models()[0], SENSOR), "two": hg.kalman_filter(models()[1], SENSOR)}
+    filters = {name: make(plant, SENSOR, LINK) for name, make in FILTERS.items()}
+    return hg.Network(plant, {"node": hg.Node(SENSOR, LINK, filters if smoothed else filters | others)})
+
+
+def test_a_kalman_filter_of_one_law_claims_nothing_exact_in_a_world_of_two():
+    assert set(world().claims()["node"].values()) == {"nominal"}
+
+
+@pytest.mark.slow
+def test_errors_are_those_of_the_published_setting():
+    """After 60 steps of 20,000 runs; three standard errors of 20,000 runs are 3 to 4 percent."""
+    results = hg.monte_carlo(world(), 60, 20_000, 0, keep=hg.Statistics())["node"]
+    expected = {"one": (2.500, 1.046), "two": (0.786, 1.075), "gpb1": (0.670, 0.726), "imm": (0.560, 0.634),
+                "gpb2": (0.537, 0.626)}  # fmt: skip
+    for name, squares in expected.items():
+        got = (results[name].pairs.sum(0)[-1] / results[name].count.sum())[[0, 2]]
+        np.testing.assert_allclose(got, squares, rtol=0.04)
+
+
+@pytest.mark.slow
+def test_smoothing_by_pairs_is_better_than_that_of_the_mixture():
+    """At k = 30 of 60: .2215 and .216 by pairs, where moments of the whole mixture have .277 and .257."""
+    record = hg.monte_carlo(world(smoothed=True), 60, 8_000, 0, smooth=hg.smoothing.FixedInterval())
+    assert record.smoothed is not None
+    estimate = record.smoothed.estimates["node"]["imm"]
+    errors = record.truth[:, 29] - estimate.mean[:, 29]
+    np.testing.assert_allclose(np.mean(errors**2, axis=0), [0.2215, 0.216], rtol=0.05)  # three errors of 1.6 percent
+    size = np.einsum("ri,rij,rj->r", errors, np.linalg.inv(estimate.covariance[:, 29]), errors).mean() / 2
+    assert 0.92 < size < 1.04
+    np.testing.assert_allclose(estimate.modes.sum(axis=-1), 1.0, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILTERS)
+def test_modes_that_are_alike_are_smoothed_as_one_model(name):
+    """Rauch's estimates, to rounding, of a plant whose two modes have one law."""
+    plant = hg.markov_plant([models()[0], models()[0]], ROWS, START)
+    ours = hg.rts_smoother(FILTERS[name](plant, SENSOR, LINK), DATA)
+    theirs = hg.rts_smoother(hg.kalman_filter(models()[0], SENSOR), DATA)
+    np.testing.assert_allclose(ours.means, theirs.means, atol=1e-9)
+    np.testing.assert_allclose(ours.covariances, theirs.covariances, atol=1e-9)
+
+
+def test_plant_sensor_and_link_of_one_name_share_a_chain_and_others_multiply():
+    plant, link = motion(name="weather"), hg.gilbert_elliott(hg.perfect(1), hg.hop(1.0, 4.0), 0.1, 0.2)
+    shared = hg.markov_fading([hg.perfect(1), hg.hop(1.0, 4.0)], hg.random_affine.MarkovChain(ROWS, START, "weather"))
+    sensor = hg.markov_sensor([SENSOR, hg.LinearSensor([[0.0, 0.0]], 1.0)], ROWS)
+    assert hg.filters.imm_filter(plant, SENSOR, shared).run(DATA).modes.shape == (8, 2)
+    assert hg.filters.imm_filter(plant, sensor, link).run(DATA).modes.shape == (8, 8)
+
+
+def test_a_mode_of_its_own_step_moves_the_plant_and_measures_in_it():
+    """The plant goes to its mode's number, and the sensor of the same chain says it: y is x at each step."""
+    plant = hg.markov_plant(
+        [hg.Plant(lambda x, u, at=at: jnp.full(1, at), 1e-12, [0.0], 1.0) for at in (0.0, 1.0)], ROWS
+    )
+    tells = [hg.Sensor(lambda x, at=at: jnp.full(1, at), 1e-12) for at in (0.0, 1.0)]
+    nodes = {
+        name: hg.Node(hg.markov_sensor(tells, modes=plant), LINK, {"f": hg.filters.open_loop_filter(
+            hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0))}) for name in ("a", "b")
+    }  # fmt: skip
+    record = hg.simulate(hg.Network(plant, nodes), 200, 3)
+    assert 0.05 < record.truth.mean() < 0.5
+    for name in nodes:
+        np.testing.assert_allclose(record.measurements[name], record.truth, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_estimates_of_modes_stand_in_tables_and_go_both_ways():
+    record = hg.run(world(smoothed=True), {"node": DATA})
+    for back in (hg.Record.from_pandas(record.to_pandas()), hg.Record.from_xarray(record.to_xarray())):
+        np.testing.assert_array_equal(back.estimates["node"]["imm"].modes, record.estimates["node"]["imm"].modes)
+
+
+@pytest.mark.parametrize(
+    ("build", "said"),
+    [
+        (lambda a, b: hg.markov_plant([a], ROWS), "models of a plant: expected at least two"),
+        (lambda a, b: hg.markov_plant([a, hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0)], ROWS), "states of model 1"),
+        (lambda a, b: hg.markov_plant([a, hg.LinearPlant(MATRICES[1], 1.0, [0.0, 0.0], 2 * np.eye(2))], ROWS),
+         "law of x_0 of model 1"),
+        (lambda a, b: hg.markov_plant([a, b], [[0.9, 0.2], [0.1, 0.9]]), "transition from mode 0"),
+        (lambda a, b: hg.markov_plant([a, b, a], ROWS), "models: expected 2, one for each mode"),
+        (lambda a, b: hg.markov_plant([a, b]), "chain of the modes: expected transition="),
+        (lambda a, b: hg.cubature_filter(motion(), SENSOR, LINK), "imm_filter, gpb1_filter and gpb2_filter"),
+        (lambda a, b: hg.filters.particle_filter(motion(), SENSOR, LINK), "imm_filter and gpb2_filter"),
+        (lambda a, b: hg.linear_filter(motion(), SENSOR, LINK), "LinearPlant"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_in_one_line(build, said):
+    with pytest.raises(ValueError, match=said) as error:
+        build(*models())
+    assert "\n" not in str(error.value)
