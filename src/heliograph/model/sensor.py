@@ -28,6 +28,7 @@ from heliograph.numerics.check import (
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Float, Names
+from heliograph.random_affine.memory import AbstractWithMemory
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
 from heliograph.random_affine.rounded import round_without_dither
 
@@ -260,7 +261,9 @@ def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
     """Raise ValueError unless both are linear and nothing in them is an angle."""
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
-        raise fail(name, "a LinearPlant and a LinearSensor", got)
+        modal = any(isinstance(first(model), AbstractWithMemory) for model in (plant, sensor))
+        instead = " of one law (imm_filter, gpb1_filter and gpb2_filter take several)" if modal else ""
+        raise fail(name, f"a LinearPlant and a LinearSensor{instead}", got)
     refuse_angles(name, plant, sensor)
 
 

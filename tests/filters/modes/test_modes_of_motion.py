@@ -202,7 +202,7 @@ def test_estimates_of_modes_stand_in_tables_and_go_both_ways():
         (lambda a, b: hg.markov_plant([a, b]), "chain of the modes: expected transition="),
         (lambda a, b: hg.cubature_filter(motion(), SENSOR, LINK), "imm_filter, gpb1_filter and gpb2_filter"),
         (lambda a, b: hg.filters.particle_filter(motion(), SENSOR, LINK), "imm_filter and gpb2_filter"),
-        (lambda a, b: hg.linear_filter(motion(), SENSOR, LINK), "LinearPlant"),
+        (lambda a, b: hg.linear_filter(motion(), SENSOR, LINK), "of one law .imm_filter"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_one_line(build, said):
