@@ -159,6 +159,9 @@ class _ChosenNoise(Module):
     def sample(self, key: jax.Array) -> jax.Array:
         return jnp.stack([noise.sample(key) for noise in self.noises])[self.index]
 
+    def report(self, value: jax.Array) -> jax.Array:
+        return jnp.stack([noise.report(value) for noise in self.noises])[self.index]
+
 
 class _ChosenSensor(AbstractSensor):
     """One of several sensors, by a traced index."""
