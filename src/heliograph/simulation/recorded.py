@@ -11,7 +11,6 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import Recursion, scan_in_chunks
-from heliograph.model.estimate import Estimate
 from heliograph.model.origin import Origin, last_input, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.unequal_steps import common_dates, warn_of_unequal_steps
