@@ -131,7 +131,6 @@ class Record(Saved):
         """
         if self.runs is None or check_count("run", run, 0) >= self.runs:
             raise fail("run", "one of a Monte Carlo simulation" if self.runs is None else f"one of {self.runs}", run)
-        # All arrays but the times have an axis of runs first.
         measurements, estimates, reports = jax.tree.map(
             lambda leaf: np.asarray(leaf)[run], (self.measurements, self.estimates, self.reports)
         )
