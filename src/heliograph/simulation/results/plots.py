@@ -1,7 +1,7 @@
 """Parts of plots on axes of matplotlib, given or new, one for each state: what is drawn, colours, units, legend."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -64,15 +64,17 @@ def check_run(run: int, runs: int | None) -> None:
         raise fail("run", f"one of {runs}, counted from 0", run)
 
 
-def draw_band(
-    panel: "Axes", time: np.ndarray, mean: np.ndarray, squares: np.ndarray | None, drawn_as: tuple[str, str]
+def draw_state(
+    panel: "Axes", time: np.ndarray, estimates: Mapping[str, Estimate], which: tuple[Any, int], sigmas: float
 ) -> None:
-    """Draw a mean over time in a colour, by a name, with a band of squared half-widths; None for no band."""
-    colour, name = drawn_as
-    panel.plot(time, mean, color=colour, label=quote_for_figure(name))
-    if squares is not None:
-        band = np.sqrt(np.where(squares >= 0, squares, np.nan))
-        panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+    """Draw one state of several estimates, of a run, with bands of +-`sigmas` claimed deviations."""
+    run, i = which
+    for number, (name, estimate) in enumerate(estimates.items()):
+        mean, variance = np.asarray(estimate.mean)[run][..., i], np.asarray(estimate.covariance)[run][..., i, i]
+        panel.plot(time, mean, color=colour_of(number), label=quote_for_figure(name))
+        if estimate.claim != "none":
+            band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
+            panel.fill_between(time, mean - band, mean + band, color=colour_of(number), alpha=0.2, linewidth=0)
 
 
 def draw_modes(

@@ -39,9 +39,8 @@ from heliograph.simulation.results.labelled import (
 from heliograph.simulation.results.plots import (
     check_run,
     choose_filters,
-    colour_of,
-    draw_band,
     draw_modes,
+    draw_state,
     legend_outside,
     make_panels,
     state_places,
@@ -317,12 +316,9 @@ class Record(Saved):
         check_run(run, self.runs)
         which: Any = ... if self.runs is None else run
         drawn = make_panels(axes, len(places), self.time, self.units)
+        shown = {name: self.estimates[node][name] for name in filters}
         for panel, i in zip(drawn, places, strict=True):
-            for number, name in enumerate(filters):
-                estimate = self.estimates[node][name]
-                mean, variance = np.asarray(estimate.mean)[which][..., i], np.asarray(estimate.covariance)[which]
-                claimed = None if estimate.claim == "none" else sigmas**2 * variance[..., i, i]
-                draw_band(panel, self.time, mean, claimed, (colour_of(number), name))
+            draw_state(panel, self.time, shown, (which, i), sigmas)
             if self.truth is not None:
                 panel.plot(self.time, self.truth[which][..., i], color="0.25", linestyle=":", label="truth")
             panel.set_ylabel(label_with_unit(self.states[i], self.units))
