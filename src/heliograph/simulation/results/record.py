@@ -55,7 +55,6 @@ if TYPE_CHECKING:  # extras
 
 RECORD = "heliograph record"  # the title of a dataset that holds one
 
-
 Array = TypeAliasType("Array", np.ndarray)
 Units = TypeAliasType("Units", dict[str, str])  # by name
 ByNode = TypeAliasType("ByNode", dict[str, np.ndarray])
@@ -251,8 +250,8 @@ class Record(Saved):
         estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in there}
         fields = ("mean", "covariance", *(["modes"] if "modes" in dataset else []))
         for node, name, claim, values in each_filter(dataset, fields, lead):
-            modes = without_padding(values.get("modes"))
-            estimates[node][name] = Estimate(values["mean"], values["covariance"], claim, modes)
+            moments = values["mean"], values["covariance"]
+            estimates[node][name] = Estimate(*moments, claim, without_padding(values.get("modes")))
         return cls(
             time=np.asarray(dataset[TIME].values),
             states=tuple(names_of(dataset, "state")),
@@ -316,9 +315,8 @@ class Record(Saved):
         check_run(run, self.runs)
         which: Any = ... if self.runs is None else run
         drawn = make_panels(axes, len(places), self.time, self.units)
-        shown = {name: self.estimates[node][name] for name in filters}
         for panel, i in zip(drawn, places, strict=True):
-            draw_state(panel, self.time, shown, (which, i), sigmas)
+            draw_state(panel, self.time, {name: self.estimates[node][name] for name in filters}, (which, i), sigmas)
             if self.truth is not None:
                 panel.plot(self.time, self.truth[which][..., i], color="0.25", linestyle=":", label="truth")
             panel.set_ylabel(label_with_unit(self.states[i], self.units))
