@@ -220,3 +220,24 @@ def test_a_header_is_no_formula_in_a_spreadsheet_and_is_read_as_it_was(tmp_path)
     write_table({"=cmd|'!A0": np.ones(1), "-x": np.ones(1)}, tmp_path / "t.csv")
     assert (tmp_path / "t.csv").read_text().startswith("'=cmd|'!A0,'-x")
     assert list(read_table(tmp_path / "t.csv")) == ["=cmd|'!A0", "-x"]
+
+
+def test_a_table_of_numbers_alone_reads_as_row_by_row(tmp_path):
+    """A column of "nan" beside it makes a table one that is read cell by cell."""
+    rng = np.random.default_rng(2)
+    cells = ["1", "-2.5", "", "1e3", "3E-2", "0.1", "-0", ".5", "007", "1e-400", "9007199254740993"]
+    for _ in range(60):
+        drawn = [",".join(rng.choice(cells[: rng.integers(6, 12)], size=2)) for _ in range(4)]
+        lines, end = [line for line in ["1,2", *drawn] if line != ","], rng.choice(["", "\n", "\r\n"])
+        plain = text_file(tmp_path, "a,b\r\n" + "\r\n".join(lines) + end, "plain.csv")
+        beside = text_file(tmp_path, "a,b,c\n" + "".join(f"{line},nan\n" for line in lines), "beside.csv")
+        one, other = read_table(plain), read_table(beside)
+        for name in ("a", "b"):
+            assert one[name].dtype == other[name].dtype
+            assert one[name].tobytes() == other[name].tobytes()
+
+
+@pytest.mark.parametrize("row", ["1", "1,2,3", "1,x", "1,1-2", '1,"2', "# 1,2"])
+def test_a_row_of_a_table_of_numbers_that_is_none_is_named(tmp_path, row):
+    with pytest.raises(ValueError, match="row 2"):
+        read_table(text_file(tmp_path, f"a,b\n1,2\n{row}\n3,4\n"))

@@ -14,6 +14,7 @@ from heliograph.disk.quoting import quote_for_cell, unquote_cell
 from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
 from heliograph.files.text.csv_text import CsvRow, csv_rows, parse_cell
 from heliograph.files.text.dialects import NO_VALUE, check_distinct
+from heliograph.files.text.plain_numbers import read_plain_numbers
 from heliograph.files.text.text_file import kind_of, until_cut_off
 from heliograph.numerics.check import InputError, fail, file_path, show_value, table
 from heliograph.numerics.masked import fill_masked, is_absent
@@ -283,6 +284,11 @@ class CsvColumns:
 
 
 def _read_csv(path: Path, only: Container[str] | None, strict: bool) -> "Rows":
+    plain = read_plain_numbers(path)
+    if plain is not None and np.nanmax(np.abs(plain[1]), initial=0.0) < EXACT:
+        header, numbers = plain
+        named = {name: numbers[:, i].copy() for i, name in enumerate(header) if only is None or name in only}
+        return Rows(named, np.arange(1, len(numbers) + 1), [])
     columns = CsvColumns(str(path), path, only, strict)
     rows = csv_rows(path, marked=False)
     return columns.read(rows if strict else until_cut_off(rows))

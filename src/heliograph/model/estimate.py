@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_value, standard_deviations
+from heliograph.numerics.linalg import find_lost
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.outliers import has_bounded_noise
@@ -120,16 +121,29 @@ def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
 
 def is_sound(estimate: Estimate) -> np.ndarray:
     """Mask of the means that are finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
-    finite: np.ndarray = np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
+    finite = ~find_lost(np.asarray(estimate.mean), 1)
     if estimate.claim == "none":
         return finite
     bound = np.asarray(estimate.covariance)
-    finite = finite & np.isfinite(bound).all(axis=(-1, -2))
+    finite &= ~find_lost(bound, 2)
+    if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):
+        return finite
     safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
     unit = standard_deviations(safe)
     correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])
     sound: np.ndarray = finite & _is_semidefinite(correlations)
     return sound
+
+
+def _are_definite(covariances: np.ndarray) -> bool:
+    """Return whether P + tol diag(P) has a Cholesky factor for all: then correlations have no eigenvalue below -tol."""
+    places = np.arange(covariances.shape[-1])
+    covariances[..., places, places] *= 1 + DEFINITENESS_TOLERANCE
+    try:
+        np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _is_semidefinite(correlations: np.ndarray) -> np.ndarray:
