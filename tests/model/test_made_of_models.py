@@ -199,6 +199,13 @@ def biases():
                     yield made, as_driven, 2
 
 
+def joined():
+    other = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, [[0.0]], {"offset": "rad"}, INPUTS, ["offset"])
+    for plant in (LINEAR, VARYING, CURVED):
+        made = hg.models.join([plant, other])
+        yield from ((made, plant, 0), (made, other, 2)) if plant is LINEAR else ((made, plant, 0),)
+
+
 def past():
     late = hg.hop(1.0, np.eye(2), delay=hg.Discrete([0.0, 1.0], [0.5, 0.5]))
     made, sent, _ = hg.model.with_past(LINE, ON_LINE, late)
@@ -294,7 +301,7 @@ def clocked():
 FLAGGED = hg.markov_fading([NOISY, hg.hop(1.0, np.eye(2))], [[0.9, 0.1], [0.2, 0.8]])
 HELPERS = {
     "hg.model.joint_sensor": joint, "hg.model.with_clocks": clocks, "hg.model.with_bias": biases,
-    "hg.model.with_past": past, "hg.model.over_time": at_steps, "hg.model.OverTime": at_steps,
+    "hg.model.with_past": past, "hg.models.join": joined, "hg.model.over_time": at_steps, "hg.model.OverTime": at_steps,
     # Channels of channels.
     "hg.amplify_and_forward": one(lambda c: hg.amplify_and_forward([CLEAN, c])),
     "hg.dropout": lambda: [],  # its zero is no angle, and is refused

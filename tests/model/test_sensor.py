@@ -38,8 +38,8 @@ def test_a_function_must_measure_what_its_noise_disturbs(measure, message):
     (lambda: hg.LinearSensor(lambda u: [[u[0]]], 0.1), "sensor matrix", "a function"),
     (lambda: hg.LinearSensor([[1.0]], lambda u: [[u[0]]]), "sensor noise", "a function"),
 ])  # fmt: skip
-def test_a_sensor_does_not_depend_on_inputs_and_says_so_when_it_is_made(make, thing, got):
-    with pytest.raises(ValueError, match=f"^{thing}: expected .*, as sensors do not depend on inputs, got {got}$"):
+def test_a_sensor_of_inputs_needs_their_names_and_says_so_when_it_is_made(make, thing, got):
+    with pytest.raises(ValueError, match=rf"^{thing}: expected .*, or inputs=\[\.\.\.\], the names of .*, got {got}$"):
         make()
 
 

@@ -74,6 +74,36 @@ def test_components_of_a_forecast():
     assert ahead.mean.shape == (3, 2) and (np.diff(ahead.of("trend")[1]) > 0).all()
 
 
+def test_a_regression_is_least_squares():
+    """Constant coefficients and an intercept from a variance of 1e8: least squares to 1e-6 of their size."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(60, 2))
+    y = 3 + u @ [2.0, -1.0] + rng.normal(size=60)
+    model = m.structural([m.level(0.0), m.regression(["rain", "price"])], 1.0)
+    assert model.plant.inputs == ("rain", "price")
+    found = hg.kalman_filter(model.plant, model.sensor).run(y, u)
+    right = np.linalg.lstsq(np.column_stack([np.ones(60), u]), y, rcond=None)[0]
+    np.testing.assert_allclose(found.means[-1], right, atol=1e-6)
+    parts = m.components(found, model.weights(u))
+    np.testing.assert_allclose(parts.of("regression")[0], np.sum(u * found.means[:, 1:], axis=1), atol=1e-12)
+    assert parts.names == ("level", "regression")
+    with pytest.raises(hg.InputError, match=r"expected model.weights\(inputs\)"):
+        _ = model.components
+
+
+def test_a_regression_that_wanders_is_one_over_time():
+    """The same sensor with the inputs of each row put in, to rounding."""
+    rng = np.random.default_rng(1)
+    u, y = rng.normal(size=(50, 1)), rng.normal(size=50)
+    y[7:12] = np.nan
+    model = m.structural([m.level(0.1), m.regression(["rain"], 0.05, 10.0)], 0.5)
+    sensor = hg.model.over_time([hg.LinearSensor([[1.0, r]], 0.5) for r in u[:, 0]])
+    found = hg.kalman_filter(model.plant, model.sensor).run(y, u)
+    right = hg.kalman_filter(model.plant, sensor).run(y, u)
+    assert found.claim == "exact" and abs(found.log_likelihood - right.log_likelihood) < 1e-10
+    np.testing.assert_allclose(found.means, right.means, atol=1e-9)
+
+
 def test_a_season_of_dummies_sums_to_noise():
     part = m.seasonal(4, 0.0, initial_variance=1.0)
     assert part.plant.states == ("season", "season_1_ago", "season_2_ago")

@@ -69,14 +69,15 @@ class Outlook(Module):
         """Return the moments of the states as they are now, as NumPy arrays."""
         return _now(self, state)
 
-    def measured(self, prior: PyTree, states: Moments, k: jax.Array) -> Moments | None:
-        """Return the moments of what the sensor would measure, part by part; where modes change it, in each mode."""
+    def measured(self, prior: PyTree, states: Moments, u: jax.Array, k: jax.Array) -> Moments | None:
+        """Return the moments of what the sensor would measure under u, part by part; where modes change it, in each."""
         if self.sensor is None or self.plant is None:
             return None
         if isinstance(self.filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
             signal, weights = self.filter.prior_signals(prior, k)
             return Moments(weights, signal.mean, jax.vmap(lambda each: each.covariance)(signal))
-        plant, sensor, start = at(self.plant, k), at(self.sensor, k), second_moments_at_start(self.plant)
+        plant, start = at(self.plant, k), second_moments_at_start(self.plant)
+        sensor = at(self.sensor, k).under(plant.inputs, u)
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start)
@@ -96,7 +97,7 @@ class Outlook(Module):
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
         prior = self.filter.predict(state, u, k)
         states = self.mixture(prior)
-        return prior, (states, self.measured(prior, states, k), self.received(prior, k))
+        return prior, (states, self.measured(prior, states, u, k), self.received(prior, k))
 
 
 def outlook_of(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:

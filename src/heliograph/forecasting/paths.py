@@ -113,7 +113,7 @@ def _draw_from_starts(
             x = wrap_angles(now.transition(x, u_k) + now.sample_noise(moving, u_k), now.angles)
             if sensor is None:
                 return x, (x, jnp.zeros(0))
-            eye = at(sensor, k)
+            eye = at(sensor, k).under(now.inputs, u_k)
             return x, (x, wrap_angles(eye.measure(x) + eye.noise.sample(measuring), eye.angles))
 
         path: tuple[jax.Array, jax.Array] = jax.lax.scan(

@@ -228,7 +228,13 @@ def describe_routes(solution: "Solution") -> list[str]:
     """Sentences on the identified mean gain, gain variance and noise of each output, the sensor's noise included."""
     description = solution.surface.objective.description
     _, sensor, channel = join_world(description.start)
-    if isinstance(channel, OverTime) or isinstance(sensor, OverTime) or channel.remembers or channel.past:
+    if (
+        isinstance(channel, OverTime)
+        or isinstance(sensor, OverTime)
+        or first(sensor).inputs
+        or channel.remembers
+        or channel.past
+    ):
         return []
 
     # mean gain, gain variance, and M R M' + spread of the constant part, of each output

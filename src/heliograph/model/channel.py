@@ -324,6 +324,7 @@ def check_link(
     `late`: delays are known here; `moments`: the noise's covariance is needed, and must exist.
     """
     check_sensor(sensor, states)
+    sensor.refuse_inputs("such a filter or channel")
     if moments and not late:
         _ = sensor.noise.covariance
     check_maps("channel", [channel])
@@ -343,7 +344,8 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
 
 def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
-    start, senses = first(plant), first(sensor)
+    start = first(plant)
+    senses = first(sensor).under(start.inputs, np.ones(len(start.inputs)))
     for model in models_of(senses):
         check_turns("sensor of a plant", model.measure, start.initial_mean, start.angles, senses.angles)
     steps = unstack(channel) if senses.circular else [first(channel)]

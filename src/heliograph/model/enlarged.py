@@ -13,10 +13,11 @@ from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link, parallel
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, Plant
-from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, check_linear, check_sensor
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sensor, check_linear, check_sensor
+from heliograph.model.sensor_inputs import NoiseOfInputs
 from heliograph.numerics.check import array, fail, function, instance, names, scalar, table
-from heliograph.numerics.module import readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.traced import block_diagonal, library
 from heliograph.numerics.types import ArrayLike, Float, rename
 from heliograph.random_affine.delay import place_on_delay_line
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Shaped
@@ -149,6 +150,7 @@ def with_clocks(
         raise fail("clocks", f"those of some of the nodes {list(sensors)}", list(clocks))
     for name, sensor in sensors.items():
         check_sensor(instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary"), n)
+        sensor.refuse_inputs("a node with a clock")
     moving = function("motion", motion, "x") if callable(motion) else array("motion", motion, (n, n))
     places = {name: n + 2 * i for i, name in enumerate(clocks)}
     larger = driven_by(plant, _make_clocks(clocks, step), np.zeros((n, 2 * len(clocks))))
@@ -228,7 +230,7 @@ class JointSensor(AbstractSensor):
         return jnp.concatenate([sensor.measure(x) for sensor in self.parts])
 
 
-def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | JointSensor:
+def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor | JointSensor:
     """Stack the sensors of nodes, in their order, as one; with `parallel` of their channels it serves a fusion centre.
 
     Of linear sensors it is a linear one. Angles stay angles, and outputs keep their units.
@@ -248,6 +250,8 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | JointS
     outputs = list(names("outputs of all nodes", outputs, len(outputs), "y"))
     circular = tuple(f"{name}_{output}" for name, sensor in by_node.items() for output in sensor.circular)
     parts = tuple(by_node.values())
+    if any(sensor.inputs for sensor in parts):
+        return _join_sensors_of_inputs(parts, outputs, circular)
     noise = Independent([sensor.noise for sensor in parts])
     linear = [sensor.matrix for sensor in parts if isinstance(sensor, LinearSensor)]
     if len(linear) < len(parts):
@@ -256,6 +260,64 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | JointS
     if len(states) > 1:
         raise fail("sensors", "those of one state", f"matrices of {sorted(states)} columns")
     return LinearSensor(library(linear).concatenate(linear), noise, outputs, circular)
+
+
+class SensorsUnderInputs(Module):
+    """Sensors of which some depend on inputs.
+
+    Args:
+        parts: the sensors.
+        places: places of each one's inputs among all.
+    """
+
+    parts: tuple[AbstractSensor, ...]
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def given(self, u: jax.Array) -> list[Any]:
+        """Return the sensors of known inputs."""
+        return [p.given(jnp.asarray(u)[np.array(at, int)]) for p, at in zip(self.parts, self.places, strict=True)]
+
+
+class JointMatrix(SensorsUnderInputs):
+    """Matrices of linear sensors, one above the other."""
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return C (m, n)."""
+        return jnp.concatenate([jnp.asarray(sensor.matrix) for sensor in self.given(u)])
+
+
+class JointMeasure(SensorsUnderInputs):
+    """Measurements of sensors, one above the other."""
+
+    def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """Return h(x, u)."""
+        return jnp.concatenate([sensor.measure(x) for sensor in self.given(u)])
+
+
+class JointNoiseOfSensors(SensorsUnderInputs):
+    """Covariance of independent noises of sensors."""
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Return the covariance (m, m)."""
+        return jnp.asarray(block_diagonal([jnp.asarray(sensor.noise.covariance) for sensor in self.given(u)]))
+
+
+def _join_sensors_of_inputs(
+    parts: tuple[AbstractSensor, ...], outputs: Sequence[str], circular: Sequence[str]
+) -> LinearSensor | Sensor:
+    """Return sensors of which some depend on inputs as one that depends on all of these."""
+    inputs = list(dict.fromkeys(name for sensor in parts for name in sensor.inputs))
+    every = parts, tuple(tuple(inputs.index(name) for name in sensor.inputs) for sensor in parts)
+    noises = [sensor.noise for sensor in parts]
+    noise: Any = JointNoiseOfSensors(*every)
+    if all(isinstance(law, AbstractNoise) for law in noises):
+        noise = Independent(noises)
+    elif not all(isinstance(law, Gaussian | NoiseOfInputs) for law in noises):
+        raise fail("noises of joined sensors", "Gaussian ones beside one that depends on inputs", "another law")
+    linear = all(isinstance(sensor, LinearSensor) for sensor in parts)
+    if linear:
+        return LinearSensor(JointMatrix(*every), noise, outputs, circular, inputs=inputs)
+    return Sensor(JointMeasure(*every), noise, outputs, circular, inputs=inputs)
 
 
 def join_links(sensors: Mapping[str, AnySensor], channels: Sequence[Channel]) -> tuple[AnySensor, Channel]:

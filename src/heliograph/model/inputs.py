@@ -9,6 +9,8 @@ import numpy as np
 
 from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, OfInputs, matrix_of
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
+from heliograph.model.sensor_inputs import NoiseOfInputs
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import rounding
@@ -22,7 +24,7 @@ ROWS = 4096  # of inputs for which functions are computed at once
 MOST_SHOWN = 100  # characters of a matrix
 LOOSE = 100.0  # times the tolerances of eigenvalues: elimination rounds by more than they do
 
-MatrixOfInputs = Callable[[AbstractPlant, jax.Array], jax.Array]
+MatrixOfInputs = Callable[[Any, jax.Array], jax.Array]  # of a plant or a sensor, and its inputs
 
 
 class Fault(NamedTuple):
@@ -87,6 +89,18 @@ def check_inputs(names: Sequence[str], u: Float[Array, "steps inputs"], models: 
         if id(plant) not in known and first(plant).inputs == tuple(names):
             _check_functions(plant, u, step)
         known.add(id(plant))
+    for sensor, places in _sensors_of_inputs(models, names):
+        if id(sensor) not in known:
+            _check_functions(sensor, u[:, places], step)
+        known.add(id(sensor))
+
+
+def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[AnySensor, list[int]]]:
+    """Yield the sensors that depend on some of these inputs, and the places of those."""
+    for sensor in parts_in(models, AbstractSensor):
+        own = first(sensor).inputs
+        if own and set(own) <= set(names):
+            yield sensor, [list(names).index(name) for name in own]
 
 
 def plants_in(models: PyTree) -> Iterator[AnyPlant]:
@@ -103,20 +117,36 @@ def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
     yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
 
 
-def _list_functions(plant: AbstractPlant) -> dict[str, MatrixOfInputs]:
+def _list_functions(model: AbstractPlant | AbstractSensor) -> dict[str, MatrixOfInputs]:
     """Return the functions of the inputs alone, by name: matrices, and the covariance of the noise."""
     every: dict[str, MatrixOfInputs] = {}
-    if isinstance(plant, LinearPlant):
-        if isinstance(plant.matrix, OfInputs):
+    if isinstance(model, AbstractSensor):
+        if isinstance(model, LinearSensor) and isinstance(model.matrix, OfInputs):
+            every["sensor matrix(u)"] = _sensor_matrix
+        if isinstance(model.noise, NoiseOfInputs):
+            every[SENSOR_NOISE] = _sensor_noise
+        return every
+    if isinstance(model, LinearPlant):
+        if isinstance(model.matrix, OfInputs):
             every["plant matrix(u)"] = LinearPlant.transition_matrix
-        if isinstance(plant.input_matrix, OfInputs):
+        if isinstance(model.input_matrix, OfInputs):
             every["input matrix(u)"] = _input_matrix
-    if not isinstance(plant.noise, AbstractNoise):
+    if not isinstance(model.noise, AbstractNoise):
         every[NOISE] = AbstractPlant.noise_covariance
     return every
 
 
-NOISE = "process noise covariance(u)"
+NOISE, SENSOR_NOISE = "process noise covariance(u)", "sensor noise covariance(u)"
+COVARIANCES = NOISE, SENSOR_NOISE
+
+
+def _sensor_matrix(sensor: LinearSensor, u: jax.Array) -> jax.Array:
+    return matrix_of(sensor.matrix, u)
+
+
+def _sensor_noise(sensor: AbstractSensor, u: jax.Array) -> jax.Array:
+    assert isinstance(sensor.noise, NoiseOfInputs)
+    return sensor.noise.given(u)
 
 
 def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
@@ -124,22 +154,22 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
     return matrix_of(plant.input_matrix, u)
 
 
-def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
+def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
     """Raise one line that names the row if a matrix or covariance is no such thing for some inputs u."""
     functions = _list_functions(first(plant))
     parts = list(_evaluate_in_parts(plant, tuple(functions.values()), u, step)) if functions else []
     for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
-        wrong = find_wrong_covariances(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))
+        wrong = find_wrong_covariances(values) if name in COVARIANCES else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
             given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
             where = f"row {row + 1}" if len(u) > 1 else f"step {step}"
             came = f"{_shorten(values[row])} in {where}, for {given}"
-            raise fail(name, "a covariance" if name == NOISE else "finite numbers", came)
+            raise fail(name, "a covariance" if name in COVARIANCES else "finite numbers", came)
 
 
 def _evaluate_in_parts(
-    plant: AnyPlant, functions: tuple[MatrixOfInputs, ...], u: Float[np.ndarray, "steps inputs"], step: int
+    plant: AnyPlant | AnySensor, functions: tuple[MatrixOfInputs, ...], u: Float[np.ndarray, "steps inputs"], step: int
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Yield what functions return, some steps at a time."""
     for start in range(0, len(u), ROWS):
@@ -148,7 +178,7 @@ def _evaluate_in_parts(
 
 
 @compile_in_float64
-def _evaluate(plant: AnyPlant, functions: tuple[MatrixOfInputs, ...], u: Array, steps: Array) -> Any:
+def _evaluate(plant: AnyPlant | AnySensor, functions: tuple[MatrixOfInputs, ...], u: Array, steps: Array) -> Any:
     """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
@@ -194,9 +224,19 @@ def do_inputs_spoil(
         plant = at(varying, k)
         if not names or plant.inputs != tuple(names):
             continue
-        for name, function in _list_functions(plant).items():
-            value = function(plant, u)
-            spoilt |= ~(_is_covariance(value, precision) if name == NOISE else jnp.all(jnp.isfinite(value)))
+        spoilt |= _is_spoilt(plant, u, precision)
+    for sensor, places in _sensors_of_inputs(model, names):
+        spoilt |= _is_spoilt(at(sensor, k), u[np.array(places)], precision)
+    return spoilt
+
+
+def _is_spoilt(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: type | None) -> jax.Array:
+    """Test whether a function of a model's inputs returns what is none."""
+    spoilt = jnp.asarray(False)
+    for name, function in _list_functions(model).items():
+        value = function(model, u)
+        sound = _is_covariance(value, precision) if name in COVARIANCES else jnp.all(jnp.isfinite(value))
+        spoilt |= ~sound
     return spoilt
 
 

@@ -239,10 +239,12 @@ def markov_sensor(
         modes: a plant, sensor or link whose chain it is, in place of `transition`; none by default.
 
     Raises:
-        ValueError: fewer than two models, models of other outputs or angles than the first, probabilities that are
-            none.
+        ValueError: fewer than two models, models of other outputs or angles than the first, or that depend on inputs,
+            probabilities that are none.
     """
     sensors = _check_models("models of a sensor", models, AbstractSensor)
+    for sensor in sensors:
+        sensor.refuse_inputs("a mode")
     for i, sensor in enumerate(sensors[1:], start=1):
         for what in ("outputs", "circular"):
             if getattr(sensor, what) != getattr(sensors[0], what):

@@ -11,7 +11,8 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, NoiseFunction, OfInputs
+from heliograph.model.sensor_inputs import GivenInputs, NoiseOfInputs, count_rows, name_inputs, read_noise_of_inputs
 from heliograph.numerics.angle import Angles, angles_at, angles_named
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (
@@ -25,9 +26,10 @@ from heliograph.numerics.check import (
     show_error,
     show_value,
 )
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import as_real, trace_shape
-from heliograph.numerics.types import ArrayLike, Float, Names
+from heliograph.numerics.types import Array, ArrayLike, Float, Names
 from heliograph.random_affine.memory import AbstractWithMemory
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
 from heliograph.random_affine.rounded import round_without_dither
@@ -44,11 +46,13 @@ class AbstractSensor(Module):
         noise: law of v.
         outputs: names of the components of y.
         circular: names of outputs that are angles in radians: y and y plus a full turn in one of them are the same.
+        inputs: names of the plant's inputs on which it depends; none of most sensors.
     """
 
     noise: eqx.AbstractVar[AbstractNoise]
     outputs: eqx.AbstractVar[tuple[str, ...]]
     circular: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    inputs: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
 
     @property
     def angles(self) -> Angles:
@@ -59,8 +63,34 @@ class AbstractSensor(Module):
         """Return h(x): shapes (n,) -> (len(outputs),)."""
         raise unwritten(self, "measure")
 
+    def given(self, u: jax.Array) -> "AbstractSensor":
+        """Return the sensor as it is under its inputs u (inputs,): one that depends on none."""
+        return self
+
+    def under(self, names: Sequence[str], u: Array) -> "AbstractSensor":
+        """Return the sensor as it is under the inputs u of a plant, whose names these are."""
+        if not self.inputs:
+            return self
+        places = np.array([list(names).index(name) for name in self.inputs])
+        return _give(self, u[places])
+
+    def check_inputs_known(self, names: Sequence[str]) -> None:
+        """Raise ValueError unless the plant has the inputs on which the sensor depends."""
+        lacking = [name for name in self.inputs if name not in names]
+        if lacking:
+            raise fail("inputs of a sensor", f"some of the plant's, {list(names)} (it may have ones that move nothing)",
+                       lacking)  # fmt: skip
+
+    def refuse_inputs(self, name: str) -> None:
+        """Raise ValueError, with the name of what needs a constant sensor, where this one depends on inputs."""
+        if self.inputs:
+            raise fail(f"sensor of {name}", "one that depends on no inputs", f"one of {list(self.inputs)}")
+
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""
+        if self.inputs:
+            _give(self, np.ones(len(self.inputs))).check_states(states)
+            return
         try:
             got = trace_shape("measure(x) of a sensor", self.measure, np.zeros(states))
         except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
@@ -81,34 +111,43 @@ class Sensor(AbstractSensor):
         outputs: names of the outputs, or a mapping of names to units.
         circular: names of outputs that are angles in radians; a channel must leave them unchanged (gain 1), but for
             noise and erasures.
+        inputs: names of inputs of the plant on which the sensor depends: then h is a function of (x, u), and the
+            covariance of v may be one of u. None by default.
         resolution: step to whose multiples y is rounded, of all outputs or for each; None, unless given, of a sensor
             that does not round.
 
     Raises:
         ValueError: names and noise that disagree about the number of outputs, a variance alone of a function that
-            returns more than one, a function of anything but x, circular outputs that are none. A network or filter
-            refuses any other function that returns another number of outputs.
+            returns more than one, a function of anything but x without named inputs, circular outputs that are none. A
+            network or filter refuses any other function that returns another number of outputs.
     """
 
-    function: Callable[[jax.Array], ArrayLike]
+    function: Callable[..., ArrayLike]
     noise: AbstractNoise
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
-        measure: Callable[[jax.Array], ArrayLike],
-        noise: NoiseLike,
-        outputs: Names | None = None,
-        circular: Sequence[str] = (),
-        resolution: ArrayLike | None = None,
+        measure: Callable[..., ArrayLike],
+        noise: "NoiseLike | NoiseFunction",
+        outputs: "Names | None" = None,
+        circular: "Sequence[str]" = (),
+        resolution: "ArrayLike | None" = None,
+        inputs: "Names" = (),
     ):
-        self.function = _take_state_alone(measure)
-        _refuse_function("sensor noise", noise)
-        dimension = (count_components(noise) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
-        self.noise = as_noise("sensor noise", noise, dimension)
+        self.inputs = name_inputs(inputs)
+        if self.inputs:
+            self.function = function("measure of a sensor", measure, "(x, u)")
+            self.outputs, self.noise = read_noise_of_inputs(noise, outputs, None, self.inputs)
+            self.circular = _circular(self.outputs, circular)
+            self.noise = _round_to(self.noise, resolution, self.circular)
+            return
+        self.function, law = _take_state_alone(measure), _constant("sensor noise", noise)
+        dimension = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
+        self.noise = as_noise("sensor noise", law, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
         # A variance alone says nothing of the number of outputs, so the function is asked.
-        shape = (1,) if outputs is not None or count_components(noise) is not None else _find_shape(measure)
+        shape = (1,) if outputs is not None or count_components(law) is not None else _find_shape(measure)
         if shape != (1,):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
@@ -116,36 +155,56 @@ class Sensor(AbstractSensor):
         self.noise = _round_to(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """Return h(x)."""
+        """Return h(x); raise ValueError if the sensor depends on inputs."""
+        self.refuse_inputs("what gives no inputs")
         return as_real(self.function(x))
+
+    def given(self, u: jax.Array) -> AbstractSensor:
+        """Return the sensor y = h(x, u) + v of a known u."""
+        if not self.inputs:
+            return self
+        noise = self.noise.given(u) if isinstance(self.noise, NoiseOfInputs) else self.noise
+        return Sensor(GivenInputs(self.function, u), noise, self.outputs, self.circular)
 
 
 class LinearSensor(AbstractSensor):
     """A linear sensor y = C x + v; circular outputs and resolution as for `Sensor`.
 
+    C and the covariance of v may be functions of some of the plant's inputs, `LinearSensor(lambda u: u[None], .1,
+    inputs=["dose"])`: it is linear all the same, and what filters claim stays exact. What is computed before data (a
+    steady state, schedules, designs) needs constants, and refuses.
+
     Shapes: matrix (m, n).
 
     Raises:
         ValueError: wrong shapes, a noise that is no covariance, numbers that are not finite, circular outputs that are
-            none.
+            none, functions of inputs without names.
     """
 
-    matrix: Float[jax.Array | np.ndarray, "m n"]
+    matrix: Float[jax.Array | np.ndarray, "m n"]  # or OfInputs, which refuses to be taken for an array
     noise: AbstractNoise
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
-        matrix: ArrayLike,
-        noise: NoiseLike,
-        outputs: Names | None = None,
-        circular: Sequence[str] = (),
-        resolution: ArrayLike | None = None,
+        matrix: "ArrayLike | MatrixFunction",
+        noise: "NoiseLike | NoiseFunction",
+        outputs: "Names | None" = None,
+        circular: "Sequence[str]" = (),
+        resolution: "ArrayLike | None" = None,
+        inputs: "Names" = (),
     ):
-        _refuse_function("sensor matrix", matrix)
-        _refuse_function("sensor noise", noise)
-        self.matrix = array("sensor matrix", matrix, ("outputs", "states"))
-        self.noise = as_noise("sensor noise", noise, self.matrix.shape[-2])
+        self.inputs = name_inputs(inputs)
+        if self.inputs:
+            rows = count_rows(matrix, self.inputs)
+            self.outputs, self.noise = read_noise_of_inputs(noise, outputs, rows, self.inputs)
+            named: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
+            self.matrix = named if callable(matrix) else array("sensor matrix", named, ("outputs", "states"))
+            self.circular = _circular(self.outputs, circular)
+            self.noise = _round_to(self.noise, resolution, self.circular)
+            return
+        self.matrix = array("sensor matrix", _constant("sensor matrix", matrix), ("outputs", "states"))
+        self.noise = as_noise("sensor noise", _constant("sensor noise", noise), self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = _circular(self.outputs, circular)
         self.noise = _round_to(self.noise, resolution, self.circular)
@@ -154,9 +213,19 @@ class LinearSensor(AbstractSensor):
         """Return C x."""
         return jnp.asarray(self.matrix) @ x
 
+    def given(self, u: jax.Array) -> AbstractSensor:
+        """Return the sensor of a known u: its matrix and noise are constants."""
+        if not self.inputs:
+            return self
+        matrix: Any = self.matrix
+        noise = self.noise.given(u) if isinstance(self.noise, NoiseOfInputs) else self.noise
+        return LinearSensor(matrix(u) if isinstance(matrix, OfInputs) else matrix, noise, self.outputs, self.circular)
+
     def check_states(self, states: int) -> None:
         """The same of the matrix, without a trace, of which each of many nodes would need its own."""
-        if self.matrix.shape[-1] != states:
+        if self.inputs:
+            super().check_states(states)
+        elif self.matrix.shape[-1] != states:
             raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
 
 
@@ -164,6 +233,10 @@ def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequ
     """Return the noise of a sensor that rounds to multiples of its resolution; the noise itself without one."""
     if resolution is None:
         return noise
+    if isinstance(noise, NoiseOfInputs):
+        raise fail(
+            "resolution of a sensor", "a noise that depends on no inputs beside it", f"one of {list(noise.inputs)}"
+        )
     if circular:
         raise fail("resolution of a sensor", "outputs that are no angles", list(circular))
     m = noise.dimension
@@ -171,6 +244,11 @@ def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequ
     if not np.all(np.asarray(step) > 0):
         raise fail("resolution of a sensor", "a positive step", show_value(np.asarray(step).tolist()))
     return round_without_dither(noise, np.array(np.broadcast_to(step, (m,))))
+
+
+@in_float64
+def _give(sensor: AbstractSensor, u: Array) -> AbstractSensor:
+    return sensor.given(jnp.asarray(u))
 
 
 def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
@@ -183,15 +261,18 @@ def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
     try:
         signature.bind(None)
     except TypeError:
-        expected = "a function of x alone, as sensors do not depend on inputs"
+        expected = "a function of x alone, or inputs=[...], the names of those that a function of (x, u) takes"
         raise fail("measure of a sensor", expected, f"one of {signature}") from None
     return checked
 
 
-def _refuse_function(name: str, value: object) -> None:
-    """Raise ValueError where a plant's matrix may be a function of inputs, and a sensor's may not."""
+def _constant(name: str, value: object) -> Any:
+    """Return a constant; raise ValueError where it is a function of inputs that have no names."""
     if callable(value):
-        raise fail(name, "a constant, as sensors do not depend on inputs", "a function")
+        raise fail(
+            name, "a constant, or inputs=[...], the names of those of the plant that a function takes", "a function"
+        )
+    return value
 
 
 def _find_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:

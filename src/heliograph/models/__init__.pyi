@@ -25,6 +25,7 @@ from .series import (
     arma as arma,
     cycle as cycle,
     level as level,
+    regression as regression,
     seasonal as seasonal,
     stationary as stationary,
     trend as trend,

@@ -1,15 +1,17 @@
 """Components of a time series: level, trend, season, cycle and ARMA, each a plant and what of it is seen."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from heliograph.model.plant import LinearPlant
 from heliograph.models.motion import WIDE
-from heliograph.numerics.check import array, check_count, fail, instance, scalar, text
+from heliograph.numerics.check import array, check_count, fail, instance, items, name_list, scalar, text
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import block_diagonal, is_traced, library
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.types import Array, ArrayLike, Float, Names
 
 STATIONARY = 1 - 1e-9  # largest modulus of a root that still counts as stationary
 
@@ -22,19 +24,26 @@ class Component(Module):
         name: of the part.
         plant: how its states move.
         loading: weights of the states (n,).
+        inputs: of a regression, the input of the plant by which the weight of each state is multiplied, n names; none
+            by default.
 
     Raises:
-        ValueError: no name, no linear plant, another number of weights.
+        ValueError: no name, no linear plant, another number of weights, an input that the plant does not have.
     """
 
     name: str
     plant: LinearPlant
     loading: Array
+    inputs: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, name: str, plant: LinearPlant, loading: "Float[ArrayLike, ' n']"):
+    def __init__(self, name: str, plant: LinearPlant, loading: "Float[ArrayLike, ' n']", inputs: Sequence[str] = ()):
         self.name = text("name of a component", name)
         self.plant = instance("plant of a component", plant, LinearPlant, "a LinearPlant")
         self.loading = array("loading of a component", loading, (len(plant.states),))
+        self.inputs = tuple(str(given) for given in items("inputs of a component", inputs, "names"))
+        if self.inputs and (len(self.inputs) != len(self.loading) or set(self.inputs) - set(plant.inputs)):
+            expected = f"one of {list(plant.inputs)} for each of {len(self.loading)} states"
+            raise fail("inputs of a component", expected, list(self.inputs))
 
 
 def level(
@@ -242,6 +251,37 @@ def arma(
     states = [named, *(f"{named}_{i}_ahead" for i in range(1, size))]
     plant = LinearPlant(matrix, noise, np.zeros(size), stationary_covariance(matrix, noise), states=states)
     return Component(named, plant, np.eye(size)[0])
+
+
+def regression(
+    regressors: Names,
+    variance: "Float[ArrayLike, '']" = 0.0,
+    initial_variance: "Float[ArrayLike, '']" = WIDE,
+    name: str = "regression",
+) -> Component:
+    """Return a regression on inputs: y = sum of coefficient times input, and the coefficients may wander.
+
+    The inputs are those of the model; states are "INPUT_coefficient". For an intercept add a `level` of variance 0.
+
+    Args:
+        regressors: names of the inputs.
+        variance: of each coefficient's step; 0 by default: constants.
+        initial_variance: of each coefficient before the first step; 1e8 by default.
+        name: of the component; "regression" by default.
+
+    Raises:
+        ValueError: no regressors, a negative variance.
+
+    Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 7.7.
+    """
+    inputs = name_list("regressors", regressors)
+    if not inputs:
+        raise fail("regressors", "at least one name", "none")
+    n = len(inputs)
+    q, start = scalar("variance of the coefficients", variance, 0.0), scalar("initial variance", initial_variance, 0.0)
+    states = [f"{regressor}_coefficient" for regressor in inputs]
+    plant = LinearPlant(np.eye(n), q, np.zeros(n), start, np.zeros((n, n)), states, inputs)
+    return Component(name, plant, np.ones(n), inputs)
 
 
 def stationary(x: "Float[ArrayLike, ' p']") -> Any:

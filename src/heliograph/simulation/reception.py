@@ -70,6 +70,7 @@ class NodeGroup(Module):
     """
 
     sensor: AnySensor
+    inputs: tuple[str, ...] = eqx.field(static=True)
     channel: Channel
     checksums: jax.Array | np.ndarray
     memories: jax.Array | np.ndarray
@@ -123,7 +124,7 @@ class SeparateChannels(AbstractMedium):
 
         def receive_one(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
             """Measure x at one node, let its trigger decide, and deliver through its channel."""
-            sensor = condition_on_memories(at(group.sensor, k), reach.modes)
+            sensor = condition_on_memories(at(group.sensor, k), reach.modes).under(group.inputs, u)
             modes = move_modes(group.sensor, reach.modes, key, k, group.modes)
             y = measure(sensor, x, draw_key(key, k, group.checksums, SENSOR))
             if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
@@ -365,7 +366,17 @@ def make_reception(network: Network) -> AbstractMedium:
         encoder, reader = (None, None) if encoders[0] is None else (stack(encoders), reader_of(nodes[names[0]].channel))
         groups.append(
             NodeGroup(
-                *stacked, checksums, memory_rows, of_sensor, reference_filter, trigger, encoder, informed_at, reader
+                stacked[0],
+                network.inputs,
+                stacked[1],
+                checksums,
+                memory_rows,
+                of_sensor,
+                reference_filter,
+                trigger,
+                encoder,
+                informed_at,
+                reader,
             )
         )
     return SeparateChannels(tuple(groups))

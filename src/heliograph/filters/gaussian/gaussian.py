@@ -23,6 +23,7 @@ from heliograph.filters.gaussian.signal import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain, perfect
 from heliograph.model.estimate import Innovation, lower_by_noise
@@ -185,6 +186,7 @@ def _make_gaussian_filter(
     return believing(filter, premise)
 
 
+@takes_sensor_inputs
 @takes_told
 def gaussian_filter(
     plant: AnyPlant,
@@ -223,6 +225,7 @@ def gaussian_filter(
     )
 
 
+@takes_sensor_inputs
 @takes_told
 def cubature_filter(
     plant: AnyPlant,
@@ -254,6 +257,7 @@ def cubature_filter(
     return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
 
 
+@takes_sensor_inputs
 @takes_told
 def extended_filter(
     plant: AnyPlant,
@@ -332,6 +336,7 @@ def gaussian_filter_of(
 MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"
 
 
+@takes_sensor_inputs
 def kalman_filter(
     plant: AnyPlant,
     sensor: AnySensor,

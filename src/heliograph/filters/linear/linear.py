@@ -21,6 +21,7 @@ from heliograph.filters.modes.uncertain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.words.linear import build_behind_words
 from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
+from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
@@ -134,6 +135,7 @@ def correct_linear(
 
 
 @believes
+@takes_sensor_inputs
 @takes_told
 def linear_filter(
     plant: AnyPlant,
@@ -215,6 +217,7 @@ def _make_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) ->
 
 
 @believes
+@takes_sensor_inputs
 @takes_told
 def memoryless_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None

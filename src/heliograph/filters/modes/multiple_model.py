@@ -48,6 +48,7 @@ from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.pairs import ModalLaw, ModalSmootherStep, move_pairs
 from heliograph.filters.modes.patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
@@ -267,6 +268,7 @@ def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> ja
 
 
 @believes
+@takes_sensor_inputs
 @takes_told
 def imm_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
@@ -298,6 +300,7 @@ def imm_filter(
 
 
 @believes
+@takes_sensor_inputs
 @takes_told
 def gpb1_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
@@ -325,6 +328,7 @@ def gpb1_filter(
 
 
 @believes
+@takes_sensor_inputs
 @takes_told
 def gpb2_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES

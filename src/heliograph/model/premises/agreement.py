@@ -6,6 +6,7 @@ them, so that of such filters only these are compared: E[G], E[n] and Cov(z | y)
 
 from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 
 from heliograph.model.channel import Channel
@@ -154,6 +155,8 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
     """Tell whether two sensors measure the same, and with noise of the same moments up to `order`."""
     if same(a, b):
         return True
+    if a.inputs or b.inputs:
+        return _same_sensor_of_inputs(a, b, order)
     if a.angles != b.angles or len(a.outputs) != len(b.outputs) or not _same_noise(a.noise, b.noise, order):
         return False
     if isinstance(a, JointSensor) and isinstance(b, JointSensor) and len(a.parts) == len(b.parts):
@@ -162,6 +165,29 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
     if matrices[0] is not None and matrices[1] is not None:
         return equal_to_rounding(*matrices)
     return any(same_function(a.measure, b.measure, (n,)) for n in _states_of(a, b))
+
+
+def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
+    """Tell whether two sensors that depend on inputs are the same programs of state and inputs."""
+    if a.inputs != b.inputs or a.angles != b.angles or len(a.outputs) != len(b.outputs):
+        return False
+    u = (len(a.inputs),)
+    if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
+        if not _same_noise(a.noise, b.noise, order):
+            return False
+    elif not same_function(_noise_given(a), _noise_given(b), u):
+        return False
+    return any(same_function(_measure_given(a), _measure_given(b), (n,), u) for n in _states_of(a, b))
+
+
+def _noise_given(sensor: AbstractSensor) -> Callable[[jax.Array], object]:
+    """Return the covariance of a sensor's noise as a function of its inputs."""
+    return lambda u: sensor.given(u).noise.covariance
+
+
+def _measure_given(sensor: AbstractSensor) -> Callable[[jax.Array, jax.Array], object]:
+    """Return what a sensor measures as a function of state and inputs."""
+    return lambda x, u: sensor.given(u).measure(x)
 
 
 def _states_of(*sensors: AbstractSensor) -> list[int]:
@@ -180,7 +206,7 @@ def _takes(sensor: AbstractSensor, states: int) -> bool:
 def matrix_of(sensor: AbstractSensor) -> np.ndarray | None:
     """Return the matrix of a linear sensor, or of linear ones one above the other; None of any other."""
     if isinstance(sensor, LinearSensor):
-        return None if is_traced(sensor.matrix) else np.asarray(sensor.matrix)
+        return None if sensor.inputs or is_traced(sensor.matrix) else np.asarray(sensor.matrix)
     parts = [matrix_of(part) for part in sensor.parts] if isinstance(sensor, JointSensor) else [None]
     return None if any(part is None for part in parts) else np.concatenate([p for p in parts if p is not None])
 

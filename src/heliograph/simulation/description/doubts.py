@@ -135,7 +135,7 @@ def observability(plant: AbstractPlant, sensors: list[AbstractSensor]) -> Float[
         results = []
         for _ in range(n):
             x = plant.transition(x, u)
-            results += [sensor.measure(x) for sensor in sensors]
+            results += [sensor.under(plant.inputs, u).measure(x) for sensor in sensors]
         return jnp.concatenate(results)
 
     with jax.enable_x64(True):

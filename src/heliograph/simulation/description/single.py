@@ -35,7 +35,9 @@ def _yield_models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]
     for name, node in network.nodes.items():
         if isinstance(node, Node):
             measured: list[Traced] = (
-                [] if isinstance(node.sensor, LinearSensor) else [(first(node.sensor).measure, (x,))]
+                []
+                if isinstance(node.sensor, LinearSensor)
+                else [(first(node.sensor).under(network.inputs, np.ones(len(network.inputs))).measure, (x,))]
             )
             yield f"sensor of {name}", node.sensor, measured
             yield f"channel of {name}", node.channel, []

@@ -1,0 +1,160 @@
+"""Filters of sensors that depend on inputs: at each step the filter of the sensor that the inputs give."""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import NamedTuple, ParamSpec, TypeVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    make_sizes,
+    predicts,
+)
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import at, at_each_step, first
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.premises.premise import believing
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine
+
+F = TypeVar("F", bound=AbstractFilter)
+P = ParamSpec("P")
+
+
+class StateUnderInputs(NamedTuple):
+    """State of the filter within, and the inputs of the step that led to it (inputs,)."""
+
+    base: PyTree
+    u: jax.Array | np.ndarray
+
+
+class FilterOfInputs(AbstractSizedFilter):
+    """A filter whose sensor is at each step the one that the inputs give.
+
+    Given the inputs the sensor varies in a known way, as one over time does: the claim is that of the filter within.
+
+    Args:
+        base: the filter of the sensor under inputs of 1, which predicts; with another sensor in its place it corrects.
+        plant: the plant, whose functions are judged.
+        sensor: its sensor.
+    """
+
+    base: AbstractFilter
+    plant: AnyPlant
+    sensor: AnySensor
+
+    @in_float64
+    def init(self) -> StateUnderInputs:
+        """Return the state before the first step."""
+        return StateUnderInputs(self.base.init(), jnp.zeros(len(self.inputs)))
+
+    @predicts
+    def predict(self, state: StateUnderInputs, u: ArrayLike = (), k: Step = 0) -> StateUnderInputs:
+        """Predict as any filter of the plant, and keep the inputs for the measurement that follows."""
+        given = jnp.asarray(u)
+        return StateUnderInputs(self.base.predict(state.base, given, k), given)
+
+    @corrects
+    def correct(self, state: StateUnderInputs, z: ArrayLike, k: Step = 0) -> tuple[StateUnderInputs, Innovation]:
+        """Correct by the filter of the sensor under the inputs of this step."""
+        after, innovation = self._filter_under(state.u, k).correct(state.base, jnp.asarray(z), k)
+        return state._replace(base=after), innovation
+
+    @estimates
+    def estimate(self, state: StateUnderInputs) -> Estimate:
+        """Return the mean and covariance of the estimate."""
+        return self.base.estimate(state.base)
+
+    def after_step(self, state: StateUnderInputs, k: Step) -> Estimate:
+        """Return the mean and covariance after step k."""
+        return self.base.after_step(state.base, k)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the smoother step of the filter of the sensor under the inputs of this step."""
+        filter = self._filter_under(jnp.asarray(step.u), step.k)
+        return filter.smoother_step(step.map_states(lambda state: state.base))
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return the angles of the filter within."""
+        return self.base.angles_used()
+
+    @property
+    def of_atoms(self) -> bool:
+        """As the filter within."""
+        return self.base.of_atoms
+
+    @property
+    def silence_tells(self) -> bool:
+        """As the filter within."""
+        return self.base.silence_tells
+
+    def _filter_under(self, u: Array, k: Step) -> AbstractFilter:
+        now = at(self.sensor, k).under(self.inputs, u)
+        filter: AbstractFilter = eqx.tree_at(lambda filter: filter.sensor, self.base, now)
+        return filter
+
+
+def takes_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
+    """Let a function that makes a filter take sensors that depend on inputs, by a `FilterOfInputs` of what it makes.
+
+    Args:
+        make: a function of a plant, a sensor, mostly a channel, and more.
+    """
+    parameters = inspect.signature(make)
+
+    @wraps(make)
+    def build(*args: P.args, **kwargs: P.kwargs) -> F:
+        given = parameters.bind(*args, **kwargs).arguments
+        sensor = first(given.get("sensor"))
+        if not isinstance(sensor, AbstractSensor) or not sensor.inputs:
+            return make(*args, **kwargs)
+        plant, sensor = given.pop("plant"), given.pop("sensor")
+
+        whole: Callable[..., AbstractFilter] = make
+
+        def make_for(typical: AnySensor) -> AbstractFilter:
+            return whole(plant=plant, sensor=typical, **given)
+
+        return cast(F, _build(plant, sensor, given.get("channel"), make_for))
+
+    return build
+
+
+def _build(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel | None, make: Callable[[AnySensor], AbstractFilter]
+) -> FilterOfInputs:
+    """Build the filter of a plant, of a sensor that depends on its inputs, and of a channel.
+
+    Raises:
+        ValueError: inputs that the plant does not have; a link that is late, behind which a measurement is one of
+            another step; a filter that keeps more of the sensor than itself.
+    """
+    start = first(plant)
+    if isinstance(start, AbstractPlant):  # else it is refused as such
+        first(sensor).check_inputs_known(start.inputs)
+    link = first(channel)
+    if isinstance(link, AbstractRandomAffine) and link.past:
+        first(sensor).refuse_inputs("a filter behind a late link")
+    ones = np.ones(len(first(sensor).inputs))
+    with jax.enable_x64(True):
+        typical = at_each_step(lambda single: single.given(ones), sensor)
+    base = make(typical)
+    if not hasattr(base, "sensor"):
+        first(sensor).refuse_inputs(f"a {type(base).__name__}")
+    filter = FilterOfInputs(base=base, plant=plant, sensor=sensor, **make_sizes(base.claim, base, base.received))
+    premise = base.premise
+    return believing(filter, premise and premise.replaced(sensor=sensor))

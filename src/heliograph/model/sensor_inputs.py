@@ -1,0 +1,85 @@
+"""What of a sensor depends on inputs: its function, matrix and noise, each a function of them."""
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.plant import NoiseFunction, check_shape
+from heliograph.numerics.check import array, fail, name_list, names, show_error
+from heliograph.numerics.module import Module
+from heliograph.numerics.traced import as_real, trace_shape
+from heliograph.numerics.types import ArrayLike, Names
+from heliograph.random_affine.noise import as_noise, count_components
+
+
+class GivenInputs(Module):
+    """x -> h(x, u) of a known u."""
+
+    function: Callable[..., ArrayLike]
+    u: jax.Array
+
+    def __call__(self, x: jax.Array) -> ArrayLike:
+        """Return h(x, u)."""
+        return self.function(x, self.u)
+
+
+class NoiseOfInputs(Module):
+    """Covariance of a sensor's noise as a function of inputs; whatever takes it for a law is refused in one line.
+
+    Args:
+        function: Cov v of u.
+        inputs: names of the inputs.
+        outputs: number of outputs.
+    """
+
+    function: NoiseFunction
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: int = eqx.field(static=True)
+
+    def given(self, u: jax.Array) -> jax.Array:
+        """Return the covariance (outputs, outputs) under u; a number stands for that variance of each."""
+        value = as_real(self.function(u))
+        return value * jnp.eye(self.outputs) if value.ndim == 0 else value
+
+    def _refuse(self) -> Any:
+        raise fail(
+            "sensor noise", "a constant one, as what is computed before data needs", f"one of {list(self.inputs)}"
+        )
+
+    covariance = mean = columns = dimension = property(_refuse)
+
+
+def name_inputs(inputs: Names) -> tuple[str, ...]:
+    """Return names of inputs, each once."""
+    return names("inputs of a sensor", inputs, len(name_list("inputs of a sensor", inputs)), "u")
+
+
+def count_rows(matrix: object, inputs: tuple[str, ...]) -> int:
+    """Return the number of rows of a matrix, or of what a function of the inputs returns."""
+    if not callable(matrix):
+        return int(array("sensor matrix", cast(ArrayLike, matrix), ("outputs", "states")).shape[-2])
+    try:
+        shape = trace_shape("sensor matrix(u)", matrix, np.ones(len(inputs)))
+    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise fail("sensor matrix(u)", "a function in operations of jax.numpy", show_error(error)) from error
+    if len(shape) != 2:
+        raise fail("sensor matrix(u)", "shape (outputs, states)", f"shape {shape}")
+    return shape[0]
+
+
+def read_noise_of_inputs(
+    noise: Any, outputs: Names | None, rows: int | None, inputs: tuple[str, ...]
+) -> tuple[tuple[str, ...], Any]:
+    """Return the names of the outputs, and the noise: a law, or a covariance that depends on inputs."""
+    known = None if callable(noise) else count_components(noise)
+    count = rows or (known or 1 if outputs is None else len(name_list("sensor outputs", outputs)))
+    named = names("sensor outputs", outputs, count, "y")
+    if not callable(noise):
+        return named, as_noise("sensor noise", noise, count)
+    law = NoiseOfInputs(noise, inputs, count)
+    check_shape("sensor noise covariance(u)", law.given, (np.ones(len(inputs)),), (count, count))
+    return named, law
