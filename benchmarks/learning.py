@@ -72,7 +72,7 @@ def ours(z: np.ndarray) -> dict[str, Any]:
         alone.append(time.process_time() - began)
         rows = fitted.rows()
         whole.append(time.process_time() - began)
-    top, at_point = fitted.log_likelihood["linear"], float(hg.log_likelihood(item, z))
+    top, at_point = fitted.log_likelihoods["linear"], float(hg.log_likelihood(item, z))
     estimates = [row.estimate for row in rows]
     return {
         "at_point": at_point,

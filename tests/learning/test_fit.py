@@ -62,7 +62,7 @@ def test_the_likelihood_is_that_of_the_recursion(result, recording, form):
     values = result.description.parameters.known(solution.x)
     assert set(values) == {"plant noise", "mean gain", "gain variance", "hop noise"}
     expected = oracle(values, recording.measurements["node"][0], form)
-    assert result.log_likelihood[form] == pytest.approx(expected, rel=1e-12)
+    assert result.log_likelihoods[form] == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.slow
@@ -215,4 +215,4 @@ def test_a_value_of_a_noise_with_two_values_is_learned():
     assert row.low <= 2.0 <= row.high and row.high - row.low < 0.5
     node = fitted.network.nodes["a"]
     by_filter = hg.log_likelihood(hg.linear_filter(fitted.network.plant, node.sensor, node.channel), z)
-    np.testing.assert_allclose(fitted.log_likelihood["linear"], by_filter, rtol=1e-10)  # 400 terms of order 1
+    np.testing.assert_allclose(fitted.log_likelihoods["linear"], by_filter, rtol=1e-10)  # 400 terms of order 1

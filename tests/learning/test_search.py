@@ -123,6 +123,7 @@ def test_a_variance_of_measuring_at_zero_has_an_end_above():
     found = hg.fit(network, walk[:, None], starts=1)
     row = found.rows()[2]
     assert found.converged and row.boundary and row.estimate == 0 and 0 < row.high < 0.2
+    assert "at the end of its domain" not in str(found)  # intervals that were asked for
     assert str(found).count("below") == 2 and np.isfinite(found.covariance[:2, :2]).all()
     assert "\n" not in repr(found.best) and "log-likelihood" in repr(found.best)
 

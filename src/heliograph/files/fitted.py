@@ -55,7 +55,7 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
         "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in fitted.table],
         "delays": {node: _delays(delays) for node, delays in fitted.delays.items()},
         "sentences": list(fitted.sentences),
-        "log_likelihood": dict(fitted.log_likelihood),
+        "log_likelihood": dict(fitted.log_likelihoods),
         "ends": [_plain(float(end)) for end in fitted.ends],
         "converged": fitted.converged,
         "stopped": fitted.stopped,

@@ -28,6 +28,9 @@ from .losses.fates import (
     fates_of_measurements as fates_of_measurements,
     fates_of_sequence as fates_of_sequence,
 )
+from .inference import (
+    FitTest as FitTest,
+)
 from .fitting import (
     Fit as Fit,
 )

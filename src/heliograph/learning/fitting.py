@@ -9,6 +9,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identify_by_recording
+from heliograph.learning.inference import FitTest, Values, compare_likelihoods, criteria, wald_test
 from heliograph.learning.intervals import LEVEL, METHODS, Method
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.multistart import AWAY, SPREAD, Search
@@ -18,12 +19,13 @@ from heliograph.learning.likelihood.trust_region import Maximum
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.sender_fit import SenderFit, fit_sender, has_deciding_sender
 from heliograph.learning.solution import Row, Solution
-from heliograph.numerics.check import check_count, check_progress, check_seed, fail, scalar, show_value
+from heliograph.numerics.check import check_count, check_progress, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 
 ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
+IN_HASTE = "Errors by the expected information; `rows()` has intervals by the scores, and at the ends of domains."
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
 Progress = TypeAliasType("Progress", Callable[[str], None])
@@ -72,9 +74,76 @@ class Fit:
         return all(solution.converged for solution in self.solutions)
 
     @property
-    def log_likelihood(self) -> dict[str, float]:
+    def log_likelihood(self) -> float:
+        """Log-likelihood at the maximum of the form that counts, in nats."""
+        return self.best.total
+
+    @property
+    def log_likelihoods(self) -> dict[str, float]:
         """Log-likelihood at the maximum, by form, in nats."""
         return {solution.form: solution.total for solution in self.solutions}
+
+    @property
+    def observations(self) -> int:
+        """Number of values that arrived, or of true states that are known where those are learned from."""
+        data = self.best.surface.data
+        counted = data.measurements if data.truth is None else data.truth
+        return int(np.sum(~np.isnan(counted)))
+
+    @property
+    def free_numbers(self) -> int:
+        """Number of free numbers: directions that no data identify are none."""
+        return self.description.parameters.size - self.best.ridges
+
+    @property
+    def aic(self) -> float:
+        """Akaike's information criterion, 2 k - 2 l; the smaller the better."""
+        return criteria(self.log_likelihood, self.free_numbers, self.observations)[0]
+
+    @property
+    def aicc(self) -> float:
+        """Akaike's criterion for few data: + 2 k (k + 1) / (n - k - 1)."""
+        return criteria(self.log_likelihood, self.free_numbers, self.observations)[1]
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, k log n - 2 l."""
+        return criteria(self.log_likelihood, self.free_numbers, self.observations)[2]
+
+    def likelihood_ratio(self, smaller: "Fit") -> FitTest:
+        """Test a model with some of the free numbers fixed, fitted to the same data: 2 (l - l_0) is chi-square.
+
+        Where what is fixed is the end of a domain (a variance of 0) the p-value is too large, by two for one number.
+
+        Args:
+            smaller: the fit of that model.
+
+        Raises:
+            ValueError: a fit of other data or of another form, no fewer free numbers, a larger likelihood.
+
+        Source: Wilks (1938); Self and Liang (1987) for ends of domains.
+        """
+        other = instance("smaller model", smaller, Fit, "what hg.fit returns")
+        if (other.best.form, other.observations) != (self.best.form, self.observations):
+            expected = f"a fit of the same {self.observations} values in the {self.best.form} form"
+            raise fail("smaller model", expected, f"{other.observations} in the {other.best.form} form")
+        return compare_likelihoods(self.log_likelihood, other.log_likelihood, self.free_numbers - other.free_numbers)
+
+    def wald(self, values: Values) -> FitTest:
+        """Test that some numbers have given values, by the covariance of the estimates: d' C^-1 d is chi-square.
+
+        Args:
+            values: by the names of the table.
+
+        Raises:
+            ValueError: no values, an unknown name, a number that is at a boundary or not identified.
+
+        Source: Wald (1943).
+        """
+        entries = self.description.parameters.entries
+        at = self.description.parameters.entries_at(self.best.x)
+        names = [entry.name for entry in entries]
+        return wald_test(dict(zip(names, at.tolist(), strict=True)), self.covariance, values)
 
     @property
     def table(self) -> tuple[Row, ...]:
@@ -130,11 +199,17 @@ class Fit:
         )
 
     def __str__(self) -> str:
-        """Return the table and sentences as text."""
+        """Return the estimates at once: intervals of `rows` where they were asked for, else errors in haste."""
+        late = [f"{node}: {delays}" for node, delays in self.delays.items()]
+        if not self.best.has_rows:
+            return "\n".join([*self.best.describe_in_haste(), *late, *self._sentences_at_once(), IN_HASTE])
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})  ({row.form})" for row in self.table]
-        late = [f"{node}: {delays}" for node, delays in self.delays.items()]
         return "\n".join([*lines, *late, *self.sentences])
+
+    def _sentences_at_once(self) -> tuple[str, ...]:
+        """Return the sentences that need no interval."""
+        return (*_describe_climb(self), *self.identified.sentences)
 
 
 def fit(

@@ -63,7 +63,12 @@ class SenderFit:
         return self.description.parameters.known(self.x)
 
     @property
-    def log_likelihood(self) -> dict[str, float]:
+    def log_likelihood(self) -> float:
+        """Log-likelihood at the maximum, in nats."""
+        return self.total
+
+    @property
+    def log_likelihoods(self) -> dict[str, float]:
         """Log-likelihood at the maximum, in nats, by its form."""
         return {"conditional": self.total}
 

@@ -204,6 +204,37 @@ class Solution:
             self._tables[key] = self._make_rows(method, level)
         return self._tables[key]
 
+    @property
+    def has_rows(self) -> bool:
+        """True if the default table was computed."""
+        return ("cosines", LEVEL) in self._tables
+
+    def describe_in_haste(self) -> list[str]:
+        """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
+        active, values = self.active, self.parameters.entries_at(self.x)
+        information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]
+        inverse = np.linalg.pinv(information, hermitian=True)
+        slopes = self.parameters.slopes(self.top.x)[:, active]
+        errors = np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", slopes, inverse, slopes), 0.0))
+        width = max(len(entry.name) for entry in self.parameters.entries)
+        return [
+            f"{entry.name:{width}}  {self._describe_entry(entry, float(value), slope, float(error))}  ({self.form})"
+            for entry, value, slope, error in zip(self.parameters.entries, values, slopes, errors, strict=True)
+        ]
+
+    def _describe_entry(self, entry: Entry, value: float, slope: np.ndarray, error: float) -> str:
+        """Return an estimate and its interval by a standard error on the scale where the domain is symmetric."""
+        if entry.coordinate is not None and not self.active[entry.coordinate]:
+            return f"{value:>10.4g}  (at the end of its domain)"
+        if not self.identifies(slope):
+            return f"{value:>10.4g}  (not identified)"
+        with np.errstate(divide="ignore"):
+            center = link(entry.domain, value)
+        half = quantile(np.inf) * error
+        low, high = sorted(float(unlink(entry.domain, center + side * half)) for side in (-1.0, 1.0))
+        row = Row(entry.name, value, low, high, error, self.form, False, True)
+        return f"{row.value:>10}  (about {row.interval})"
+
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
         """Return one row for each entry: at a boundary, not identified, or with an interval by this method."""
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
