@@ -345,7 +345,7 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
 def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
     start = first(plant)
-    senses = first(sensor).under(start.inputs, np.ones(len(start.inputs)))
+    senses = first(sensor).typical(start.inputs)
     for model in models_of(senses):
         check_turns("sensor of a plant", model.measure, start.initial_mean, start.angles, senses.angles)
     steps = unstack(channel) if senses.circular else [first(channel)]

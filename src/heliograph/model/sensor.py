@@ -74,12 +74,13 @@ class AbstractSensor(Module):
         places = np.array([list(names).index(name) for name in self.inputs])
         return _give(self, u[places])
 
-    def check_inputs_known(self, names: Sequence[str]) -> None:
-        """Raise ValueError unless the plant has the inputs on which the sensor depends."""
+    def typical(self, names: Sequence[str]) -> "AbstractSensor":
+        """Return the sensor under inputs of 1; raise ValueError unless the plant has the inputs that it needs."""
         lacking = [name for name in self.inputs if name not in names]
         if lacking:
-            raise fail("inputs of a sensor", f"some of the plant's, {list(names)} (it may have ones that move nothing)",
-                       lacking)  # fmt: skip
+            expected = f"some of the plant's, {list(names)} (it may have ones that move nothing)"
+            raise fail("inputs of a sensor", expected, lacking)
+        return self.under(names, np.ones(len(names)))
 
     def refuse_inputs(self, name: str) -> None:
         """Raise ValueError, with the name of what needs a constant sensor, where this one depends on inputs."""

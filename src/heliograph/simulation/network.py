@@ -8,7 +8,6 @@ from typing import ClassVar
 from zlib import crc32
 
 import equinox as eqx
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
@@ -168,9 +167,7 @@ class Network(Module):
         for names in self.groups:
             node = self.nodes[names[0]]
             if isinstance(node, Node):
-                first(node.sensor).check_inputs_known(self.inputs)
-                sensor = first(node.sensor).under(self.inputs, np.ones(len(self.inputs)))
-                check_link(sensor, first(node.channel), len(self.states), late=True)
+                check_link(first(node.sensor).typical(self.inputs), first(node.channel), len(self.states), late=True)
                 find_received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:

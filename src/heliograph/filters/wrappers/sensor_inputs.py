@@ -144,14 +144,11 @@ def _build(
             another step; a filter that keeps more of the sensor than itself.
     """
     start = first(plant)
-    if isinstance(start, AbstractPlant):  # else it is refused as such
-        first(sensor).check_inputs_known(start.inputs)
+    names = start.inputs if isinstance(start, AbstractPlant) else first(sensor).inputs  # else it is refused as such
+    typical = at_each_step(lambda single: single.typical(names), sensor)
     link = first(channel)
     if isinstance(link, AbstractRandomAffine) and link.past:
         first(sensor).refuse_inputs("a filter behind a late link")
-    ones = np.ones(len(first(sensor).inputs))
-    with jax.enable_x64(True):
-        typical = at_each_step(lambda single: single.given(ones), sensor)
     base = make(typical)
     if not hasattr(base, "sensor"):
         first(sensor).refuse_inputs(f"a {type(base).__name__}")

@@ -37,7 +37,7 @@ def _yield_models(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]
             measured: list[Traced] = (
                 []
                 if isinstance(node.sensor, LinearSensor)
-                else [(first(node.sensor).under(network.inputs, np.ones(len(network.inputs))).measure, (x,))]
+                else [(first(node.sensor).typical(network.inputs).measure, (x,))]
             )
             yield f"sensor of {name}", node.sensor, measured
             yield f"channel of {name}", node.channel, []
