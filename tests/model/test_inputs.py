@@ -94,18 +94,23 @@ def test_a_stream_names_the_function_of_a_live_input():
 
 @pytest.mark.parametrize("door", ["step", "predict", "step_with_smoother"])
 def test_a_step_of_a_filter_alone_judges_what_the_functions_return(door):
-    """Also after others that are right, of whichever step; what is right, and what is traced, passes."""
+    """Also after others that are right, of whichever step; what is right passes."""
     filter = network_of(lambda u: u[0] * jnp.eye(2), lambda u: jnp.eye(2) / u[0], "s").nodes["a"].filters["k"]
     state, data = filter.init(), () if door == "predict" else ([1.0],)
     getattr(filter, door)(state, *data, [0.5], 3)
     for s, said in ((-1.0, "process noise covariance.* step 3, for s = -1"), (0.0, "plant matrix.* step 3, for s = 0")):
         with pytest.raises(ValueError, match=said):
             getattr(filter, door)(state, *data, [s], 3)
+
+
+def test_a_step_of_a_filter_takes_what_is_traced():
+    filter = network_of(lambda u: u[0] * jnp.eye(2), lambda u: jnp.eye(2) / u[0], "s").nodes["a"].filters["k"]
+    state = filter.init()
     with jax.enable_x64(True):
         slope = jax.grad(
             lambda s: filter.predict(state, s[None]).mean.sum() + filter.step(state, [1.0], s[None])[1].mean[0]
         )
-        assert np.isfinite(slope(2.0))
+        assert np.isfinite(jax.jit(slope)(2.0))
 
 
 def test_a_timeline_uses_no_event_to_whose_time_there_is_no_prediction():

@@ -1,6 +1,7 @@
 """Nodes of one structure stand in one group."""
 
 import numpy as np
+import pytest
 
 import heliograph as hg
 
@@ -23,6 +24,7 @@ def test_names_of_outputs_do_not_part_filters_of_one_structure():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_heartbeats_and_periods_do_not_part_nodes():
     """They are numbers: a filter has room for the longest of its network, and is the same with it."""
     plant, sensor = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)

@@ -120,6 +120,7 @@ def test_another_node_and_links_change_nothing_else(record):
         np.testing.assert_allclose(other.estimates[name]["linear"].mean, record.estimates[name]["linear"].mean)
 
 
+@pytest.mark.slow
 def test_a_recording_is_run_step_by_step_and_through_the_same_links(record):
     measurements = {name: z[3].copy() for name, z in record.measurements.items()}
     through = hg.run(NETWORK, measurements, INPUTS)

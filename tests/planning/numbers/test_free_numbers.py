@@ -154,6 +154,7 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     assert result.error <= np.trace(filters.covariances[-1]) * 1.05
 
 
+@pytest.mark.slow
 def test_a_relay_is_placed_where_the_closed_form_puts_it():
     """One state, two hops, loss d^-3: above rho = 4 the best site leaves the middle, x (1 - x) = 1 / rho."""
     rho = 8.0

@@ -5,6 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import heliograph as hg
 from heliograph.simulation.description.doubts import doubts_before_data
@@ -101,9 +102,10 @@ def test_a_mesh_of_many_neighbours_is_named():
     assert list_fallbacks(hg.Network(PLANT, nodes, {"mesh": replace(mesh, neighbours=few)})) == []
 
 
+@pytest.mark.slow
 def test_states_of_more_rows_than_are_written_out_run_natively():
-    """Loops over 30 states of the factors, with what they divide by."""
-    n = 30
+    """Loops over 25 states of the factors, one more than is written out, with what they divide by."""
+    n = 25
     plant = hg.LinearPlant(0.9 * np.eye(n) + 0.05 * np.eye(n, k=1), np.eye(n), np.zeros(n), np.eye(n))
     sensor = hg.LinearSensor(np.eye(1, n), 0.1)
     filter = hg.kalman_filter(plant, sensor)

@@ -88,9 +88,9 @@ def test_what_is_known_well_enough_is_not():
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             hg.run(network, {"n": np.ones((3, 1))})
-    sensor, said = hg.LinearSensor(np.eye(16)[:1], 0.01, circular=["y0"]), []
-    for many in (hg.Plant(lambda x, u: x, 0.01, np.zeros(16), 0.9**2, circular=["x0"]),
-                 hg.LinearPlant(np.eye(16), 0.01, np.zeros(16), 0.9**2, circular=["x0"])):  # fmt: skip
+    sensor, said = hg.LinearSensor(np.eye(13)[:1], 0.01, circular=["y0"]), []
+    for many in (hg.Plant(lambda x, u: x, 0.01, np.zeros(13), 0.9**2, circular=["x0"]),
+                 hg.LinearPlant(np.eye(13), 0.01, np.zeros(13), 0.9**2, circular=["x0"])):  # fmt: skip
         node = hg.Node(sensor, hg.perfect(), {"f": hg.cubature_filter(many, sensor)})
         said.append(len(said_before_data(hg.Network(many, {"n": node}))))
     assert said == [1, 0]  # what is linear needs no points

@@ -10,6 +10,7 @@ import numpy as np
 from straightline.c_source import CSource, c_type
 from straightline.folding import DTYPES
 from straightline.lowering import scalars
+from straightline.nodes import Unsupported
 from tests.straightline.conformance.case import Case
 from tests.straightline.conformance.engines import program_of
 
@@ -36,6 +37,15 @@ def by_c(cases: Sequence[Case], folder: Path, compiler: str, quiet: bool = False
     done = subprocess.run([folder / "cases"], input=b"".join(data), capture_output=True, check=False)
     assert not done.returncode and not done.stderr, (done.returncode, done.stderr.decode()[:2000])
     return _read(done.stdout, kinds)
+
+
+def is_written(case: Case) -> bool:
+    """Test whether C takes the operations of a case, without compiling it."""
+    try:
+        _function(case, "case")
+    except Unsupported:
+        return False
+    return True
 
 
 def _function(case: Case, name: str) -> tuple[str, str, list[tuple[str, tuple[int, ...]]]]:

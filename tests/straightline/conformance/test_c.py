@@ -3,26 +3,12 @@
 import numpy as np
 import pytest
 
-from straightline.nodes import Unsupported
-from tests.straightline.conformance.c import COMPILERS, by_c
-from tests.straightline.conformance.case import Case
+from tests.straightline.conformance.c import COMPILERS, by_c, is_written
 from tests.straightline.conformance.engines import by_xla
 from tests.straightline.conformance.test_native import CASES, ONE_AT_A_TIME, compare, singles, some, thinned
 
 LEFT_OUT = {*ONE_AT_A_TIME, "lgamma"}  # the sign that lgamma returns beside is a variable of the C library
 MOST = 8  # runs of a case
-
-
-def written(cases: list[Case], folder) -> list[Case]:
-    """The cases that C takes."""
-    kept = []
-    for case in cases:
-        try:
-            by_c([thinned(case, 1)], folder, COMPILERS[0])
-        except Unsupported:
-            continue
-        kept.append(case)
-    return kept
 
 
 @pytest.mark.slow
@@ -32,7 +18,7 @@ def test_a_rule_computes_in_c_what_xla_computes(name, tmp_path):
     if name in LEFT_OUT:
         pytest.skip("a loop, or a function of the C library's own")
     cases = [c._replace(units=c.units and max(c.units, 8.0)) for c in some(CASES[name], 6)]
-    cases = written([thinned(case, MOST) for case in cases], tmp_path)
+    cases = [case for case in (thinned(case, MOST) for case in cases) if is_written(case)]
     expected = by_xla(cases)
     for compiler in COMPILERS:
         results = by_c(cases, tmp_path, compiler)
