@@ -41,3 +41,28 @@ def test_events_of_a_sender_that_is_silent_are_refused():
     """A silent step says no numbers, and the chance of silence needs them."""
     with pytest.raises(ValueError, match="expected a filter that takes what a message tells"):
         hg.event_filter(PLANT, SENSOR, LINK, hg.SendOnDelta(0.5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, hg.model.Pilot(0.04)])
+def test_a_lagged_estimate_is_smoothed_by_what_was_told(known):
+    """As `run` smooths the rows in order, with a value, a gain and whole rows missing, and messages that overtake."""
+    link = hg.hop(hg.Rayleigh(0.8), 0.1, known=known)
+    nodes = {
+        "a": NETWORK.nodes["a"],
+        "b": hg.Node(SENSOR, link, {"f": hg.linear_filter(PLANT, SENSOR, link)}),
+    }
+    network, z = hg.Network(PLANT, nodes), {"a": rows(), "b": rows()[::-1].copy()}
+    z["a"][4], z["b"][2, 1], z["b"][7, 0] = np.nan, np.nan, np.nan
+    timeline = hg.Timeline(network, 20.0)
+    for k in LATE:
+        for node in nodes:
+            if not np.isnan(z[node][k]).all():
+                timeline.push(node, k, float(k), z[node][k])
+    for lag in (0, 3, 9):
+        smoothed = hg.run(network, z, smooth=hg.smoothing.FixedInterval()).smoothed
+        for node, filters in timeline.lagged(lag).items():
+            expected = smoothed.estimates[node]["f"]
+            np.testing.assert_allclose(filters["f"].mean, expected.mean[11 - lag], rtol=1e-11, atol=1e-13)
+            np.testing.assert_allclose(filters["f"].covariance, expected.covariance[11 - lag], rtol=1e-11, atol=1e-13)
+            assert filters["f"].claim == expected.claim

@@ -3,9 +3,10 @@
 import json
 
 import numpy as np
+import pytest
 
 import heliograph as hg
-from heliograph import serving
+from heliograph import cli, serving
 from heliograph.model import told
 
 PLANT = hg.LinearPlant([[0.95, 0.1], [0.0, 0.9]], 0.1 * np.eye(2), [0.5, 0.0], np.eye(2))
@@ -60,3 +61,39 @@ def test_a_message_that_tells_no_law_is_refused_alone(tmp_path):
     given = np.full((3, 2), np.nan)
     given[0], given[2] = z[0], z[2]
     np.testing.assert_allclose(after[2.0], hg.run(NETWORK, {"a": given}).estimates["a"]["f"].mean[-1], rtol=1e-12)
+
+
+NETWORK_FILE = """
+import numpy as np
+import pytest
+import heliograph as hg
+plant = hg.LinearPlant([[0.95, 0.1], [0.0, 0.9]], 0.1 * np.eye(2), [0.5, 0.0], np.eye(2))
+sensor = hg.LinearSensor([[1.0, 0.3]], 0.05, outputs=["y"])
+link = hg.model.told(lambda a: hg.hop(1.0, a[0]), ["variance"], typical=[0.1])
+network = hg.Network(plant, {"a": hg.Node(sensor, link, {"f": hg.linear_filter(plant, sensor, link)})})
+"""
+
+
+@pytest.mark.slow
+def test_a_replayed_table_says_what_was_told(tmp_path, monkeypatch, capsys):
+    """Columns of the values and of what was told with them: the messages of a replay, a service, and `run` agree."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.py").write_text(NETWORK_FILE)
+    z = rows()
+    lines = [f"{k}," + ",".join("" if np.isnan(v) else repr(float(v)) for v in row) for k, row in enumerate(z)]
+    (tmp_path / "data.csv").write_text("time,y,variance\n" + "\n".join(lines) + "\n")
+    assert cli.main(["replay", "data.csv", "--network", "net.py", "--plant", "p"]) == 0
+    messages = capsys.readouterr().out.splitlines()
+    assert len(messages) == STEPS - 1  # nothing came in one row
+    assert json.loads(messages[0])["values"] == z[0].tolist()
+    service, published = start(tmp_path / "store.db"), {}
+    for message in messages:
+        published |= estimates(service.take([message.encode()]))
+    expected = hg.run(NETWORK, {"a": z}).estimates["a"]["f"].mean
+    np.testing.assert_allclose(published[float(STEPS - 1)], expected[-1], rtol=1e-12)
+    assert cli.main(["run", "net.py", "--measurements", "data.csv", "--out", "run.csv", "--smooth", "all"]) == 0
+    table = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True, deletechars="")
+    names = [name for name in table.dtype.names if name.endswith("x0") and "cov" not in name]
+    smoothed = hg.run(NETWORK, {"a": z}, smooth=hg.smoothing.FixedInterval()).smoothed.estimates["a"]["f"]
+    np.testing.assert_allclose(table[names[0]], expected[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(table[names[1]], smoothed.mean[:, 0], rtol=1e-12)
