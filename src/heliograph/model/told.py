@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar, cast
 
+import equinox as eqx
 import jax
 import numpy as np
 from typing_extensions import TypeAliasType
@@ -34,15 +35,20 @@ class Pilot(Module):
 
     Args:
         noise: variance of e, positive.
+        fresh: whether what the reading leaves open of the gain is drawn anew with each message, whatever is lost.
+            False (of a gain that drifts, or of packets that are lost since their gain is small) makes claims
+            nominal. True unless given.
 
     Raises:
         ValueError: a variance that is not positive (`known=True` is a gain that is told exactly).
     """
 
     noise: Float[jax.Array | np.ndarray, ""]
+    fresh: bool = eqx.field(static=True)
 
-    def __init__(self, noise: "Float[ArrayLike, '']"):
+    def __init__(self, noise: "Float[ArrayLike, '']", fresh: bool = True):
         self.noise = scalar("noise of a pilot", noise, np.finfo(float).tiny)
+        self.fresh = flag("fresh", fresh)
 
 
 def told(
@@ -51,6 +57,7 @@ def told(
     law: LawOfNumbers | None = None,
     typical: "Float[ArrayLike, ' told'] | None" = None,
     exogenous: bool = True,
+    fresh: bool = True,
 ) -> Stack:
     """Return a link whose law is a function of numbers that come with each message: z = (link's z, numbers).
 
@@ -66,8 +73,11 @@ def told(
         typical: numbers as they may come (count,); the mean of their law unless given.
         exogenous: whether the numbers are independent of the state; False (as of a strength that falls with the
             distance) makes claims nominal. True unless given.
+        fresh: whether what they leave open is drawn anew with each message, whatever is lost; False (of fading that
+            drifts beside them) makes claims nominal. True unless given.
 
-    Claim: what the filter's would be behind a link of known law, given all numbers told; "nominal" if not exogenous.
+    Claim: what the filter's would be behind a link of known law, given all numbers told; "nominal" if they are not
+    exogenous, or what they leave open is not fresh.
 
     Raises:
         ValueError: no function, neither a law nor typical numbers, numbers that are not as many as their names, a link
@@ -82,7 +92,7 @@ def told(
     if memory.announced != len(names):
         raise fail("numbers told", f"{memory.announced} names", list(names))
     example = array("typical numbers", _average_law(law, memory) if typical is None else typical, (len(names),))
-    return deliver_told(Told(memory, link, example, names, flag("exogenous", exogenous)))
+    return deliver_told(Told(memory, link, example, names, flag("exogenous", exogenous), flag("fresh", fresh)))
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
@@ -108,7 +118,7 @@ def tell_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
     if known is False:
         return hop
     if isinstance(known, Pilot):
-        return deliver_told(PilotedHop(FreshReading(hop.law, known.noise), hop.matrix, hop.noise))
+        return deliver_told(PilotedHop(FreshReading(hop.law, known.noise), hop.matrix, hop.noise, known.fresh))
     instance("known", known, bool, "True, False or a Pilot")
     typical = np.asarray([hop.law.moment(1)])
     return deliver_told(Told(FreshNumbers(hop.law, 1), GainTold(hop.matrix, hop.noise), typical, ("gain",)))

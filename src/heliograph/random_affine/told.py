@@ -108,11 +108,22 @@ class AbstractTold(AbstractModal):
     """A map of which the receiver is told numbers with each message: `given` is the world's, `believed` the receiver's.
 
     names: names of the numbers. exogenous: whether they are independent of the state, so that they tell of the link
-    alone.
+    alone. fresh: whether what they leave open is drawn anew with each message, whatever is lost.
     """
 
     names: eqx.AbstractVar[tuple[str, ...]]
     exogenous: eqx.AbstractVar[bool]
+    fresh: eqx.AbstractVar[bool]
+
+    @property
+    def reservation(self) -> str:
+        """Why no claim is made of what is told, as it is said of the numbers; "" where one is."""
+        said = ["depends on the state"] * (not self.exogenous)
+        said += ["leaves open what is not drawn anew with each message"] * (not self.fresh)
+        return " and ".join(said)
+
+    def _say_told(self, what: str) -> str:
+        return f"(told {what}{', not exogenous' * (not self.exogenous)}{', not fresh' * (not self.fresh)})"
 
     @property
     def optional(self) -> bool:
@@ -142,6 +153,7 @@ class Told(AbstractTold):
         typical: numbers as they may come.
         names: names of the numbers.
         exogenous: whether they are independent of the state.
+        fresh: whether what they leave open is drawn anew with each message.
 
     Raises:
         ValueError: a function that returns no map, or one that remembers, is late, or loses what the receiver sees.
@@ -152,6 +164,7 @@ class Told(AbstractTold):
     example: Numbers
     names: tuple[str, ...] = eqx.field(static=True)
     exogenous: bool = eqx.field(static=True)
+    fresh: bool = eqx.field(static=True)
     sizes: tuple[int, int] = eqx.field(static=True)
 
     def __init__(
@@ -161,8 +174,10 @@ class Told(AbstractTold):
         typical: Numbers,
         names: tuple[str, ...],
         exogenous: bool = True,
+        fresh: bool = True,
     ):
-        self.memory, self.make, self.example, self.names, self.exogenous = memory, make, typical, names, exogenous
+        self.memory, self.make, self.example, self.names = memory, make, typical, names
+        self.exogenous, self.fresh = exogenous, fresh
         link = in_float64(make)(typical)
         if not isinstance(link, AbstractRandomAffine):
             raise fail("link of what a message tells", "a function that returns a link", show_value(link))
@@ -210,7 +225,7 @@ class Told(AbstractTold):
 
     def in_words(self) -> str:
         """Return the map of typical numbers in words, and what is told."""
-        return f"{self.believed(self.typical).in_words()} (told {', '.join(self.names)})"
+        return f"{self.believed(self.typical).in_words()} {self._say_told(', '.join(self.names))}"
 
 
 class GainTold(eqx.Module):
@@ -231,6 +246,7 @@ class PilotedHop(AbstractHop, AbstractTold):
         memory: draws gain and reading.
         matrix: A (m, p).
         noise: law of n with m components.
+        fresh: whether what a reading leaves open of the gain is drawn anew with each message.
     """
 
     memory: FreshReading
@@ -238,9 +254,11 @@ class PilotedHop(AbstractHop, AbstractTold):
     noise: AbstractNoise
     names: tuple[str, ...] = eqx.field(static=True)
     exogenous: bool = eqx.field(static=True)
+    fresh: bool = eqx.field(static=True)
 
-    def __init__(self, memory: FreshReading, matrix: Matrix, noise: AbstractNoise):
-        self.memory, self.matrix, self.noise, self.names, self.exogenous = memory, matrix, noise, ("pilot",), True
+    def __init__(self, memory: FreshReading, matrix: Matrix, noise: AbstractNoise, fresh: bool = True):
+        self.memory, self.matrix, self.noise, self.names = memory, matrix, noise, ("pilot",)
+        self.exogenous, self.fresh = True, fresh
 
     @property
     def optional(self) -> bool:
@@ -269,7 +287,7 @@ class PilotedHop(AbstractHop, AbstractTold):
     def in_words(self) -> str:
         """Return the hop in words, and what is told."""
         plain = GainAndNoise(self.memory.law, self.matrix, self.noise)
-        return f"{plain.in_words()} (told a reading of its gain)"
+        return f"{plain.in_words()} {self._say_told('a reading of its gain')}"
 
 
 def told_maps(channel: AbstractRandomAffine) -> list[AbstractTold]:

@@ -247,6 +247,66 @@ def test_claims():
     assert lost.claims() == {"a": {"f": "exact"}}
 
 
+NO_CLAIM = {
+    "depends on the state": told(declared, ["variance"], typical=[0.1], exogenous=False),
+    "leaves open what is not drawn anew with each message": hg.hop(
+        hg.Rayleigh(0.8), 0.1, known=Pilot(0.04, fresh=False)
+    ),
+    "depends on the state and leaves open what is not drawn anew with each message": told(
+        lambda a: hg.hop(hg.Rayleigh(a[0]), 0.1), ["scale"], typical=[0.8], exogenous=False, fresh=False
+    ),
+}
+
+
+@pytest.mark.parametrize("why", NO_CLAIM)
+@pytest.mark.parametrize("arrival", [1.0, 0.8])
+def test_where_no_claim_is_made_the_reason_is_named(why, arrival):
+    """In claims, in the network as it is printed, and by `check`; a centre claims nothing either."""
+    link = NO_CLAIM[why]
+    item, channel = hg.linear_filter(PLANT, SENSOR, link), link if arrival == 1 else hg.erasure(link, arrival)
+    network = hg.Network(PLANT, {"a": hg.Node(SENSOR, channel, {"f": item})})
+    assert network.claims() == {"a": {"f": "nominal"}}
+    short = ", not exogenous" * ("state" in why) + ", not fresh" * ("anew" in why)
+    assert f"{short})" in repr(network) and "f (nominal)" in repr(network)
+    (doubt,) = [d for d in hg.simulation.doubts_before_data(network) if d.words.startswith("told: ")]
+    assert doubt.serious and doubt.words.endswith(f"at 'a' {why}, so that claims are nominal")
+    nodes = {name: hg.Node(SENSOR, link, {}) for name in ("a", "b")}
+    joint = hg.linear_filter(PLANT, hg.model.joint_sensor({"a": SENSOR, "b": SENSOR}), hg.parallel([link, link]))
+    assert hg.Network(PLANT, nodes, {"all": joint}).claims()["fused"] == {"all": "nominal"}
+
+
+def test_a_mode_that_is_told_is_no_memory_that_is_ignored():
+    chain = hg.random_affine.MarkovChain([[0.9, 0.1], [0.1, 0.9]])
+    link = told(lambda a: hg.hop(hg.Rayleigh(0.2 + 0.8 * a[0]), 0.1), ["mode"], law=chain)
+    network = hg.Network(PLANT, {"a": hg.Node(SENSOR, link, {"f": hg.linear_filter(PLANT, SENSOR, link)})})
+    assert network.claims() == {"a": {"f": "exact"}}
+    assert not any("memory" in doubt.words for doubt in hg.simulation.doubts_before_data(network))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lost", "ratio"), [(False, 1.18), (True, 0.91)])
+def test_what_pilots_leave_open_costs_a_claim_where_it_is_not_fresh(lost, ratio):
+    """A Rayleigh gain of scale .8 whose two parts drift by .95 a step, or without which messages are lost below .8.
+
+    E[e^2] over E[P], readings of deviation .4; 1,500 runs tell it to 2 %, half the tolerance.
+    """
+    rng, runs, steps = np.random.default_rng(4), 1500, 40
+    plant, sensor = hg.LinearPlant([[0.95]], 0.1, [0.0], 0.1 / (1 - 0.95**2)), hg.LinearSensor([[1.0]], 0.05)
+    filter = hg.linear_filter(plant, sensor, hg.hop(hg.Rayleigh(0.8), 0.1, known=Pilot(0.16, fresh=False)))
+    x, parts = rng.normal(0, plant.initial_covariance[0, 0] ** 0.5, runs), 0.8 * rng.normal(size=(2, runs))
+    kept, path, z = 0.0 if lost else 0.95, np.empty((steps, runs)), np.empty((steps, runs, 2))
+    for k in range(steps):
+        x = path[k] = 0.95 * x + rng.normal(0, 0.1**0.5, runs)
+        parts = kept * parts + 0.8 * (1 - kept**2) ** 0.5 * rng.normal(size=(2, runs))
+        g, y = np.hypot(*parts), x + rng.normal(0, 0.05**0.5, runs)
+        z[k] = np.column_stack([g * y + rng.normal(0, 0.1**0.5, runs), g + 0.4 * rng.normal(size=runs)])
+        z[k, lost & (g < 0.8)] = np.nan
+    found = [filter.run(z[:, run]) for run in range(runs)]
+    squared = [np.mean((run.means[20:, 0] - path[20:, i]) ** 2) for i, run in enumerate(found)]
+    claimed = np.mean([run.covariances[20:, 0, 0] for run in found])
+    assert np.mean(squared) / claimed == pytest.approx(ratio, rel=0.04)
+
+
 def test_noise_declared_by_messages_of_two_kinds():
     law = FiniteSupport([[0.02], [1.5]], [0.5, 0.5])
     link = told(declared, ["variance"], law=law)

@@ -22,7 +22,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation, weakest
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believing
@@ -205,12 +205,14 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
         channel: a channel that delivers numbers after z; it may vary over time.
         make: builds a filter of plant, sensor and a link.
 
-    Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state.
+    Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state, or leave open
+    what is not drawn anew with each message.
     """
     link = at_each_step(lambda channel: made_certain(take_apart(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
-    exogenous = all(affine.exogenous for affine in told_maps(first(link)))
-    claim: Claim = base.claim if exogenous or base.claim == "none" else "nominal"
+    claim = base.claim
+    if any(affine.reservation for affine in told_maps(first(link))):
+        claim = weakest([claim, "nominal"])
     _, values, numbers = take_apart(first(channel))
     filter = ToldFilter(
         base=base,

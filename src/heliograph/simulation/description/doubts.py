@@ -12,18 +12,21 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.words.linear import SEEN, LinearWordsFilter
-from heliograph.filters.wrappers.told import ToldFilter
+from heliograph.filters.wrappers.told import ToldFilter, believe_typical
 from heliograph.model.fading import memory_matters
-from heliograph.model.over_time import first
+from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.premises.agreement import CHANNEL, matrix_of
 from heliograph.model.sensor import AbstractSensor
+from heliograph.model.told import take_apart
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import DOUBLE
 from heliograph.numerics.types import Float
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.told import told_maps
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, list_other_beliefs
 from heliograph.simulation.declared.refit import list_declaring
@@ -69,7 +72,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
     lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
-    lines += [*_find_declared_noise(network), *_find_overloads(network)]
+    lines += [*_find_declared_noise(network), *_find_reservations(network), *_find_overloads(network)]
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
@@ -202,6 +205,17 @@ def _find_declared_noise(network: Network) -> Iterator[Doubt]:
         )
 
 
+def _find_reservations(network: Network) -> Iterator[Doubt]:
+    """Yield the nodes of whose told numbers no claim is made, with the reason that the model gives."""
+    for name, node in network.nodes.items():
+        if not isinstance(node, Node) or not node.filters:
+            continue
+        for affine in told_maps(first(node.channel)):
+            if why := affine.reservation:
+                what = join_names([repr(number) for number in affine.names])
+                yield Doubt(True, f"told: {what} at {name!r} {why}, so that claims are nominal")
+
+
 def _find_other_beliefs(network: Network) -> Iterator[Doubt]:
     """Yield the filters that believe another world than that in which they stand, so that they claim nothing of it."""
     alike: dict[tuple[bool, str, tuple[str, ...]], list[Belief]] = {}
@@ -224,6 +238,12 @@ def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
         )
 
 
+def _leave_out_told(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return a channel as it is once its receiver is told: what is told is no memory that it has to have."""
+    link, _, numbers = take_apart(channel)
+    return believe_typical(link) if numbers else channel
+
+
 def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
     """Return the nodes of each filter that ignores the memory of their links."""
     nodes: dict[str, list[str]] = {}
@@ -231,7 +251,7 @@ def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
         if not isinstance(node, Node):
             continue
         try:
-            remembers = memory_matters(node.channel)
+            remembers = memory_matters(at_each_step(_leave_out_told, node.channel))
         except InputError:  # a memory that nothing is known of
             continue
         for label, filter_ in node.filters.items() if remembers else ():
