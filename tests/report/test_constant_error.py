@@ -57,3 +57,29 @@ def test_of_two_equal_sensors_both_are_named():
     z["a"] += 1.0
     (line,) = examine(network, hg.run(network, z), np.zeros((ROWS, 0))).warnings()
     assert "constant error of a: y or b: y" in line or "constant error of b: y or a: y" in line
+
+
+def doubts_of_local_nodes(error, seed, noise=0.1, link=None):
+    """Doubts about five nodes that only filter by themselves, of which c is off by a constant."""
+    link = hg.perfect() if link is None else link
+    sensor = hg.LinearSensor([[1.0, 0.0]], noise, outputs=["y"])
+    make = hg.kalman_filter if link == hg.perfect() else hg.linear_filter
+    arguments = (PLANT, sensor) if link == hg.perfect() else (PLANT, sensor, link)
+    network = hg.Network(PLANT, {name: hg.Node(sensor, link, {"k": make(*arguments)}) for name in "abcde"})
+    record = hg.monte_carlo(network, ROWS, 1, key=seed)
+    z = {name: np.array(record.measurements[name][0]) for name in "abcde"}
+    z["c"] += error
+    return examine(network, hg.run(network, z), np.zeros((ROWS, 0))).warnings()
+
+
+@pytest.mark.parametrize("error", [0.16, -1.0])
+def test_of_nodes_that_filter_by_themselves_the_one_that_is_off_is_named(error):
+    """An error of half a deviation, which no node can see in its own innovations."""
+    (line,) = doubts_of_local_nodes(error, 3)
+    assert line.startswith("nodes disagree: a constant error of c: y, of ")
+    value, half = (float(number) for number in line.split("of c: y, of ")[1].split(",")[0].split(" ± "))
+    assert abs(value - error) < 2 * half < 0.5 * abs(error)
+
+
+def test_equal_nodes_that_filter_by_themselves_are_not_doubted():
+    assert [line for seed in range(4, 8) for line in doubts_of_local_nodes(0.0, seed)] == []

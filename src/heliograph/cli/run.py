@@ -61,6 +61,8 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
+    from dataclasses import replace
+
     from heliograph.numerics.check import fail
     from heliograph.numerics.times.dates import horizons_in
     from heliograph.report.progress import progress
@@ -86,6 +88,8 @@ def run(
         for data in measured:
             advance(f"filtering {len(data.recording.time)} rows")
             record, doubts = _filter_rows(loaded, data.recording, later)
+            if data.events is not None and data.events.dated and record.origin is not None:
+                record = replace(record, units={"time": "s"} | record.units).with_origin(record.origin)
             place = out and _place(out, data.plant, len(measured) > 1)
             written = _select_rows(record, data.rows)
             lines = [*_describe_doubted(loaded, record), *data.summary]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import Float
 from heliograph.report.outputs import round_to
 
@@ -25,6 +26,8 @@ class ConstantError(NamedTuple):
         explained: share of what squared innovations are too large by that goes with it.
         squares: squares over their variances of the innovations without what it does to them (time, m).
         white: these innovations in units of the filter's claim (time, m).
+        size: the error's absolute value, in deviations of the output's innovations.
+        significance: mean of what the rows say for the error, over its standard error by their own spread and memory.
         nothing_else: whether these are as the filter claims.
     """
 
@@ -34,6 +37,8 @@ class ConstantError(NamedTuple):
     explained: float
     squares: np.ndarray
     white: np.ndarray
+    size: float
+    significance: float
     nothing_else: bool = False
 
     def __str__(self) -> str:
@@ -76,8 +81,11 @@ def find_constant_error(
         of_white = np.einsum("tij,tj->ti", whiten, response)
         weight, agreement = float(np.sum(of_white**2)), float(np.sum(of_white * white))
         if weight > 0 and np.isfinite(agreement):
+            error, agreements = agreement / weight, np.sum(of_white * white, axis=1)
+            mean, spread = average_correlated(np.where(there.any(axis=1), agreements, np.nan))
+            size, significance = abs(error) / deviations[j], abs(mean) / spread if spread > 0 else 0.0
             tried.append(
-                _Tried(agreement**2 / weight, names[int(j)], agreement / weight, weight**-0.5, response, of_white)
+                _Tried(agreement * error, names[int(j)], error, weight**-0.5, response, of_white, size, significance)
             )
     if not tried:
         return None
@@ -92,6 +100,8 @@ def find_constant_error(
         best.gain / too_large if too_large > 0 else 0.0,
         left**2 / np.where(variance > 0, variance, np.nan),
         np.where(there, white - best.error * best.white, np.nan),
+        float(best.size),
+        float(best.significance),
     )
 
 
@@ -104,6 +114,8 @@ class _Tried(NamedTuple):
     standard_error: float
     response: np.ndarray
     white: np.ndarray
+    size: float
+    significance: float
 
 
 def _find_response(

@@ -14,6 +14,7 @@ from heliograph.numerics.check import InputError, array, fail, instance
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, rows_are_messages
+from heliograph.report.compared_nodes import compare_nodes
 from heliograph.report.constant_error import ConstantError, find_constant_error
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
@@ -73,6 +74,7 @@ class Health:
     beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
     forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
     off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
+    apart: ConstantError | None = None  # of one node against the others, which filter by themselves
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
@@ -87,6 +89,7 @@ class Health:
                 )
             elif link.contradicts(FALSE / len(self.links)):
                 lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
+        lines += [] if self.apart is None else [_say_apart(self.apart)]
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
     def held(self) -> dict[tuple[str, str], str]:
@@ -239,6 +242,14 @@ def _say_off(name: str, off: ConstantError) -> str:
     )
 
 
+def _say_apart(off: ConstantError) -> str:
+    """The sentence on the output that differs from what the other nodes say by a constant."""
+    return (
+        f"nodes disagree: a constant error of {off}, explains it. By itself a node takes it for the state; "
+        "hg.model.with_bias makes it a state of its own"
+    )
+
+
 def _say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
     """The sentence on a NIS below its interval, which a filter that follows a slow error of its sensor has, too."""
     of, times = _name_outputs(outputs, sizes)
@@ -292,7 +303,8 @@ def examine(
         record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
     )
     off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
-    return replace(health, off={place: error for place, error in off.items() if error is not None})
+    apart = None if health.held() else compare_nodes(network, record, u, FALSE)
+    return replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
 
 
 def _find_off(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> ConstantError | None:

@@ -175,7 +175,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     arrived = f"{np.mean(shares):.1%}" if shares else "–"
     # Three numbers to remember.
     keys = [
-        KeyFigure("rows", f"{len(record.time):,}", _describe_span(record.time), BLUE),
+        KeyFigure("rows", f"{len(record.time):,}", _describe_span(record), BLUE),
         KeyFigure(
             "arrived", arrived, f"of what {_count_in_words(len(record.measurements), 'node')} should receive", GREEN
         ),
@@ -185,7 +185,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     return Page(
         kicker=f"Heliograph run: {visible(network)}",
         title=_find_headline(health),
-        lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_describe_span(record.time)}. "
+        lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_describe_span(record)}. "
         + _describe_agreement(health, doubts),
         sections=[
             Section(
@@ -289,11 +289,12 @@ def _count_in_words(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def _describe_span(time: np.ndarray) -> str:
+def _describe_span(record: Record) -> str:
     """Return the time that the recording covers, in words."""
+    time, unit = record.time, record.units.get("time", "")
     if time.dtype.kind == "M":
         return f"{str(time[0])[:19]} to {str(time[-1])[:19]} UTC"
-    return f"from {time[0]:g} to {time[-1]:g}"
+    return f"from {time[0]:g} to {time[-1]:g} {unit}".rstrip()
 
 
 def _list_doubts(doubts: list[str]) -> list[Points | Text]:

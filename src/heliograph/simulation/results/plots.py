@@ -71,10 +71,11 @@ def draw_state(
     run, i = which
     for number, (name, estimate) in enumerate(estimates.items()):
         mean, variance = np.asarray(estimate.mean)[run][..., i], np.asarray(estimate.covariance)[run][..., i, i]
-        panel.plot(time, mean, color=colour_of(number), label=quote_for_figure(name))
+        deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
+        shown, mean, band = part_at_wraps(np.asarray(time), mean, sigmas * deviation)
+        panel.plot(shown, mean, color=colour_of(number), label=quote_for_figure(name))
         if estimate.claim != "none":
-            band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
-            panel.fill_between(time, mean - band, mean + band, color=colour_of(number), alpha=0.2, linewidth=0)
+            panel.fill_between(shown, mean - band, mean + band, color=colour_of(number), alpha=0.2, linewidth=0)
 
 
 def draw_modes(
@@ -108,3 +109,19 @@ def legend_outside(axes: "Axes", title: str | None = None) -> None:
 def colour_of(number: int) -> str:
     """Return the colour of the pages for a filter, by its number."""
     return COLOURS[number % len(COLOURS)]
+
+
+def part_at_wraps(time: np.ndarray, mean: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return what is drawn over time with a gap where an angle goes around: from near pi to near -pi, or back.
+
+    Values that never leave +-pi, and of which two in a row are further apart than pi, are such an angle's.
+
+    Args:
+        time: times (time,).
+        mean: values (time,).
+        others: what has a gap in the same places, each (time,).
+    """
+    jumps = np.flatnonzero(np.abs(np.diff(mean)) > np.pi) + 1
+    if not jumps.size or np.nanmax(np.abs(mean)) > np.pi + 1e-9:
+        return time, mean, *others
+    return np.insert(time, jumps, time[jumps]), *(np.insert(part, jumps, np.nan) for part in (mean, *others))

@@ -1,0 +1,65 @@
+"""Nodes compared with one another: a constant error of one among those that only filter by themselves."""
+
+import numpy as np
+from scipy.special import ndtri
+
+import heliograph
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.enlarged import join_links
+from heliograph.model.over_time import OverTime
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.model.trigger import Periodic
+from heliograph.numerics.check import InputError
+from heliograph.report.constant_error import MOST, ConstantError, find_constant_error
+from heliograph.report.outputs import weighs
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.results.record import Record
+
+LEAST = 0.2  # of an innovation's deviation: an error of less is not worth a warning
+
+
+def compare_nodes(network: Network, record: Record, inputs: np.ndarray, level: float) -> ConstantError | None:
+    """Find the one output whose constant error explains what nodes say otherwise than the others; None of none.
+
+    A node that filters by itself takes its sensor's constant error for the state, and its innovations show nothing. So
+    a filter of all nodes' measurements is made, and its innovations judged as those of a centre are. The error has
+    to be sure by what noises are stated to be, and by the spread of what rows say for it, which holds whether these are
+    stated right, whatever they remember.
+
+    Args:
+        network: the network.
+        record: what was run through it.
+        inputs: of the plant (time, inputs).
+        level: probability with which a network without such an error may be doubted.
+    """
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node) and _can_be_joined(node)}
+    names = [f"{name}: {output}" for name, node in nodes.items() for output in node.received_names]
+    if (
+        len(nodes) < 2
+        or len(names) > MOST
+        or any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values())
+    ):
+        return None
+    links = [x.channel.condition_on_arrival() for x in nodes.values() if not isinstance(x.channel, OverTime)]
+    sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
+    linear = isinstance(network.plant, LinearPlant) and isinstance(sensor, LinearSensor)
+    try:
+        joint = (heliograph.linear_filter if linear else heliograph.cubature_filter)(network.plant, sensor, channel)
+    except InputError:  # a link that no such filter is made for
+        return None
+    z = np.concatenate([record.measurements[name] for name in nodes], axis=1)
+    off = find_constant_error(names, joint, z, inputs)
+    if off is None or off.size < LEAST:
+        return None
+    surely = min(off.significance, abs(off.error) / off.standard_error)
+    return off if surely > -ndtri(level / (2 * len(names))) else None
+
+
+def _can_be_joined(node: Node) -> bool:
+    """Return whether a node filters by itself what it receives whenever it is sent, and claims how far that is off."""
+    fixed = not isinstance(node.sensor, OverTime) and not isinstance(node.channel, OverTime)
+    sent = node.trigger is None or isinstance(node.trigger, Periodic)
+    claims = [f for f in node.filters.values() if f.received and f.claim != "none"]
+    return fixed and sent and node.encoder is None and bool(claims) and not any(map(weighs, claims))
