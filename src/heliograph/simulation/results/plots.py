@@ -9,6 +9,7 @@ from heliograph.disk.palette import COLOURS
 from heliograph.disk.quoting import label_with_unit, quote_for_figure
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.types import ArrayLike
 
 FAR = 10.0  # times the best filter's error: from there an axis is logarithmic
 
@@ -72,10 +73,15 @@ def draw_state(
     for number, (name, estimate) in enumerate(estimates.items()):
         mean, variance = np.asarray(estimate.mean)[run][..., i], np.asarray(estimate.covariance)[run][..., i, i]
         deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
-        shown, mean, band = part_at_wraps(np.asarray(time), mean, sigmas * deviation)
+        shown, mean, band = part_at_wraps(time, mean, sigmas * deviation)
         panel.plot(shown, mean, color=colour_of(number), label=quote_for_figure(name))
         if estimate.claim != "none":
             panel.fill_between(shown, mean - band, mean + band, color=colour_of(number), alpha=0.2, linewidth=0)
+
+
+def draw_truth(panel: "Axes", time: ArrayLike, truth: ArrayLike) -> None:
+    """Draw one true state over time."""
+    panel.plot(*part_at_wraps(time, truth), color="0.25", linestyle=":", label="truth")
 
 
 def draw_modes(
@@ -111,7 +117,7 @@ def colour_of(number: int) -> str:
     return COLOURS[number % len(COLOURS)]
 
 
-def part_at_wraps(time: np.ndarray, mean: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
+def part_at_wraps(time: ArrayLike, mean: ArrayLike, *others: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return what is drawn over time with a gap where an angle goes around: from near pi to near -pi, or back.
 
     Values that never leave +-pi, and of which two in a row are further apart than pi, are such an angle's.
@@ -121,6 +127,7 @@ def part_at_wraps(time: np.ndarray, mean: np.ndarray, *others: np.ndarray) -> tu
         mean: values (time,).
         others: what has a gap in the same places, each (time,).
     """
+    time, mean = np.asarray(time), np.asarray(mean)
     jumps = np.flatnonzero(np.abs(np.diff(mean)) > np.pi) + 1
     if not jumps.size or np.nanmax(np.abs(mean)) > np.pi + 1e-9:
         return time, mean, *others

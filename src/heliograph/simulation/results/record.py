@@ -41,9 +41,9 @@ from heliograph.simulation.results.plots import (
     choose_filters,
     draw_modes,
     draw_state,
+    draw_truth,
     legend_outside,
     make_panels,
-    part_at_wraps,
     state_places,
 )
 from heliograph.simulation.results.record_html import draw_record
@@ -299,8 +299,6 @@ class Record(Saved):
     ) -> "list[Axes]":
         """Draw estimates with bands of +-`sigmas` claimed deviations, and the truth where known: one axes a state.
 
-        An angle within +-pi has a gap where it goes around.
-
         Args:
             node: name of the node; the first by default.
             filters: names of its filters; all by default.
@@ -321,8 +319,7 @@ class Record(Saved):
         for panel, i in zip(drawn, places, strict=True):
             draw_state(panel, self.time, {name: self.estimates[node][name] for name in filters}, (which, i), sigmas)
             if self.truth is not None:
-                true = part_at_wraps(np.asarray(self.time), np.asarray(self.truth)[which][..., i])
-                panel.plot(*true, color="0.25", linestyle=":", label="truth")
+                draw_truth(panel, self.time, self.truth[which][..., i])
             panel.set_ylabel(label_with_unit(self.states[i], self.units))
         legend_outside(drawn[0])
         return drawn
