@@ -1,6 +1,6 @@
 """Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.compared_nodes import compare_nodes
 from heliograph.report.constant_error import ConstantError, find_constant_error
+from heliograph.report.doubts import say_apart, say_memory, say_off, say_overconfident, say_underconfident
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
@@ -89,7 +90,7 @@ class Health:
                 )
             elif link.contradicts(FALSE / len(self.links)):
                 lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
-        lines += [] if self.apart is None else [_say_apart(self.apart)]
+        lines += [] if self.apart is None else [say_apart(self.apart)]
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
     def held(self) -> dict[tuple[str, str], str]:
@@ -132,7 +133,7 @@ class Health:
         name = f"{health.node}/{health.filter}"
         off = self.off.get((health.node, health.filter))
         if off is not None:
-            yield _say_off(name, off)
+            yield say_off(name, off)
             if off.nothing_else:
                 return
         said = _say_declared(health)
@@ -141,7 +142,7 @@ class Health:
             return
         yield from self._describe_sizes(health, health.test)
         if self._has_memory(health, health.test):
-            yield _say_memory(name, health.test)
+            yield say_memory(name, health.test)
 
     def _level(self) -> float:
         """Return the level of a test of one filter: all together are seldom wrong (Bonferroni)."""
@@ -159,7 +160,7 @@ class Health:
         if not any(wrong.values()):
             sizes = {"": (test.power, test.power_error, health.numbers)}
             wrong = {"": compare_with_claim(*sizes[""], level)}
-        for sign, say in ((1, _say_overconfident), (-1, _say_underconfident)):
+        for sign, say in ((1, say_overconfident), (-1, say_underconfident)):
             of = [output for output, departure in wrong.items() if departure == sign and not (weighs and sign < 0)]
             # One that is far off pulls the estimates, and so makes others a little larger.
             most = max((sizes[output][0] - 1 for output in of), default=0.0)
@@ -204,60 +205,6 @@ def compare_with_claim(size: float, error: float, numbers: int, level: float) ->
     relative = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
     sure = max(-ndtri(level / 2) * relative, np.log(LEAST_SIZE))
     return int(np.sign(np.log(size))) if abs(np.log(size)) > sure else 0
-
-
-def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
-    """Name the outputs, or none where all are meant, and their sizes."""
-    return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
-
-
-def _say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
-    of, times = _name_outputs(outputs, sizes)
-    return (
-        f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
-        "something out"
-    )
-
-
-def _say_memory(name: str, test: MemoryTest) -> str:
-    """Return the sentence on innovations that are correlated in time."""
-    return (
-        f"{name} could know more: each of its innovations is correlated with the one before "
-        f"({test.correlation[0]:.2f}); "
-        "links, sensors or the plant remember what the model forgets. Until that is a state of the model "
-        "(hg.model.with_bias, hg.model.with_past, a link with memory), the size of innovations cannot tell how "
-        "large the errors are"
-    )
-
-
-def _say_off(name: str, off: ConstantError) -> str:
-    """The sentence on the one output whose constant error leaves nothing else doubtful, or explains most of it."""
-    if not off.nothing_else:
-        share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
-        return f"{name}: a constant error of {off}, would explain {share}, not all"
-    return (
-        f"{name} is off by a constant error of {off}: it pulls the estimates, and makes innovations of the others "
-        "larger too. hg.model.with_bias makes it a state, which the filter then estimates"
-    )
-
-
-def _say_apart(off: ConstantError) -> str:
-    """The sentence on the output that differs from what the other nodes say by a constant."""
-    return (
-        f"nodes disagree: a constant error of {off}, explains it. By itself a node takes it for the state; "
-        "hg.model.with_bias makes it a state of its own"
-    )
-
-
-def _say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """The sentence on a NIS below its interval, which a filter that follows a slow error of its sensor has, too."""
-    of, times = _name_outputs(outputs, sizes)
-    return (
-        f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
-        "Either noises are stated too large, or the sensor's error changes slowly and the filter follows it: then its "
-        "claim is too small. Innovations cannot tell the two apart, a reference can"
-    )
 
 
 def examine(

@@ -1,0 +1,60 @@
+"""Sentences on what a recording contradicts: sizes and memory of innovations, constant errors, and what to do."""
+
+from collections.abc import Sequence
+
+from heliograph.report.constant_error import ConstantError
+from heliograph.simulation.results.whiteness import MemoryTest
+
+
+def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
+    """Name the outputs, or none where all are meant, and their sizes."""
+    return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
+
+
+def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
+    """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
+    of, times = _name_outputs(outputs, sizes)
+    return (
+        f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
+        "something out"
+    )
+
+
+def say_memory(name: str, test: MemoryTest) -> str:
+    """Return the sentence on innovations that are correlated in time."""
+    return (
+        f"{name} could know more: each of its innovations is correlated with the one before "
+        f"({test.correlation[0]:.2f}); "
+        "links, sensors or the plant remember what the model forgets. Until that is a state of the model "
+        "(hg.model.with_bias, hg.model.with_past, a link with memory), the size of innovations cannot tell how "
+        "large the errors are"
+    )
+
+
+def say_off(name: str, off: ConstantError) -> str:
+    """The sentence on the one output whose constant error leaves nothing else doubtful, or explains most of it."""
+    if not off.nothing_else:
+        share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
+        return f"{name}: a constant error of {off}, would explain {share}, not all"
+    return (
+        f"{name} is off by a constant error of {off}: it pulls the estimates, and makes innovations of the others "
+        "larger too. hg.model.with_bias makes it a state, which the filter then estimates"
+    )
+
+
+def say_apart(off: ConstantError) -> str:
+    """The sentence on the output that differs from what the other nodes say by a constant."""
+    return (
+        f"nodes disagree: a constant error of {off}, explains it. By itself a node takes it for the state; "
+        "hg.model.with_bias makes it a state of its own"
+    )
+
+
+def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
+    """The sentence on a NIS below its interval, which a filter that follows a slow error of its sensor has, too."""
+    of, times = _name_outputs(outputs, sizes)
+    return (
+        f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
+        "Either noises are stated too large, or the sensor's error changes slowly and the filter follows it: then its "
+        "claim is too small. Innovations cannot tell the two apart, a reference can"
+    )
