@@ -212,7 +212,8 @@ def test_plots_draw_on_what_they_are_given(runs, result, tmp_path):
     new = recording.plot(states=["velocity"])
     turning = hg.Record(
         np.arange(5.0), ("yaw",), None, {},
-        {"n": {"f": hg.model.Estimate(np.array([[3.0], [3.1], [-3.1], [-3.0], [-2.9]]), np.full((5, 1, 1), 0.01), "exact")}},
+        {"n": {"f": hg.model.Estimate(
+            np.array([[3.0], [3.1], [-3.1], [-3.0], [-2.9]]), np.full((5, 1, 1), 0.01), "exact")}},
     )  # fmt: skip
     (line,) = turning.plot()[0].lines  # no line where the angle goes around
     np.testing.assert_array_equal(line.get_ydata(), [3, 3.1, np.nan, -3.1, -3, -2.9])
