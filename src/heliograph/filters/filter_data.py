@@ -14,7 +14,7 @@ from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import filter_in_chunks
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
-from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_spacing
+from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_months, usual_spacing
 from heliograph.model.unequal_steps import common_dates, judge_dates
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
@@ -130,7 +130,8 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> F
         warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)
     clock = common_dates(_tables(z, u))
     last, spacing = (float(len(rows_z) - 1), np.nan) if clock is None else (clock[-1], usual_spacing(clock))
-    origin = Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), last, spacing)
+    months = 0 if clock is None else usual_months(clock)
+    origin = Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), last, spacing, months=months)
     return Filtered(
         mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
         innovation.weight, origin, modes,

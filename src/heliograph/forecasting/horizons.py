@@ -76,6 +76,9 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
         return np.arange(1.0, _count(horizons) + 1)
     steps = []
     for one in _list_horizons(horizons):
+        if origin.months and isinstance(one, datetime | np.datetime64) and _convert_to_seconds(origin, one):
+            steps.append(_count_months(origin, one))
+            continue
         if (seconds := _convert_to_seconds(origin, one)) is None:
             steps.append(float(_count(one)))
             continue
@@ -88,6 +91,16 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
             )
         steps.append(float(round(count)))
     return np.array(steps)
+
+
+def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
+    """Return how many steps of whole months a date lies ahead."""
+    assert isinstance(origin.time, np.datetime64)  # as the steps are months
+    apart = np.datetime64(date).astype("datetime64[M]") - origin.time.astype("datetime64[M]")
+    steps, left = divmod(int(apart.astype(int)), origin.months)
+    if left or not steps:
+        raise fail("horizons", f"whole steps of {origin.months} months", f"{show_value(date)}, {apart} ahead")
+    return float(steps)
 
 
 def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
@@ -166,6 +179,10 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
     spacing = 1.0 if continuous else origin.spacing
     if not isinstance(origin.time, np.datetime64):
         return np.asarray(origin.time + (1.0 if np.isnan(spacing) else spacing) * distances)
+    if origin.months and not continuous:
+        last = origin.time.astype("datetime64[M]")
+        ahead = (origin.months * distances).astype(int).astype("timedelta64[M]")
+        return np.asarray((last + ahead).astype("datetime64[ns]"))
     if np.isnan(spacing):
         return np.full(len(distances), np.datetime64("NaT", "ns"))
     ahead = np.round(SECOND * spacing * distances).astype(np.int64).astype("timedelta64[ns]")

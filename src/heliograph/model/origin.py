@@ -26,6 +26,7 @@ class Origin:
         time: of the last step, a number or a date.
         spacing: usual time between steps, of dates in seconds; NaN where it is not known.
         estimates: of a network, the last ones by node and filter.
+        months: of the calendar between steps, of dates that are firsts of months; 0 of all others.
     """
 
     model: object
@@ -35,6 +36,7 @@ class Origin:
     time: Moment
     spacing: float = float("nan")
     estimates: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
+    months: int = 0
 
 
 KeptOrigin = TypeAliasType("KeptOrigin", Origin | None)  # None where no state was kept
@@ -56,3 +58,17 @@ def last_input(u: np.ndarray) -> np.ndarray:
 def usual_spacing(time: np.ndarray) -> float:
     """Return the median time between rows, of dates in seconds; NaN of fewer than two."""
     return float(np.median(seconds_between(np.asarray(time))[1:])) if len(time) > 1 else float("nan")
+
+
+def usual_months(time: np.ndarray) -> int:
+    """Return how many months of the calendar lie between rows that are firsts of months; 0 of other times.
+
+    Years, quarters and months have no length in seconds: steps are counted on the calendar.
+    """
+    clock = np.asarray(time)
+    if clock.dtype.kind != "M" or len(clock) < 3:
+        return 0
+    months = clock.astype("datetime64[M]")
+    if (months.astype("datetime64[ns]") != clock.astype("datetime64[ns]")).any():
+        return 0
+    return max(int(np.median(np.diff(months).astype(int))), 0)

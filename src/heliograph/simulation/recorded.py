@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import Recursion, scan_in_chunks
-from heliograph.model.origin import Origin, last_input, usual_spacing
+from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.unequal_steps import common_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, instance, rank, table
@@ -133,7 +133,8 @@ def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray)
     spacing = usual_spacing(record.time)
     if TIME_STEP in network.inputs and len(u) > 1:
         spacing = float(np.median(u[1:, network.inputs.index(TIME_STEP)]))
-    return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last)
+    months = usual_months(record.time)
+    return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last, months)
 
 
 def _find_clock(

@@ -16,6 +16,7 @@ DATE = re.compile(
 BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)[Tt](\d\d)(\d\d)(?:(\d\d)([.,]\d{1,9})?)?(.*)")  # of ISO 8601, without marks
 LEAP_SECOND = re.compile(r"(\d\d:\d\d:)60")
 MONTH = re.compile(r"(?P<year>\d{4})-(?:(?P<month>\d\d)|Q(?P<quarter>[1-4]))|(?P<of>\d{4})Q(?P<quarter_of>[1-4])")
+YEAR = re.compile(r"\d{4}")  # where a date is expected; anywhere else it is a number
 UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MISSING = np.iinfo(np.int64).min  # NumPy's NaT
 YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
@@ -46,14 +47,17 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
 
 
 def moment_of(text: str, name: str) -> tuple[int, bool]:
-    """Return a date as nanoseconds since 1970 in UTC, and whether it has a zone; a month or quarter is its first day.
+    """Return a date as nanoseconds since 1970 in UTC, and whether it has a zone; a month is its first day.
 
-    A leap second (23:59:60 UTC at the end of a month) is the second after it, as clocks of computers have it.
+    So is a year or a quarter. A leap second (23:59:60 UTC at the end of a month) is the second after it, as clocks of
+    computers have it.
 
     Raises:
         ValueError: no date of ISO 8601, or one beyond what nanoseconds can say.
     """
     text = text.strip()
+    if YEAR.fullmatch(text):
+        text = f"{text}-01-01"
     if month := MONTH.fullmatch(text):
         quarter = month["quarter"] or month["quarter_of"]
         text = f"{month['year'] or month['of']}-{month['month'] or f'{3 * int(quarter) - 2:02}'}-01"
