@@ -33,6 +33,7 @@ from heliograph.simulation.plausible_step import (
     step_plausibly,
 )
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
+from heliograph.simulation.shared_dithers import refuse_shared_dithers
 from heliograph.simulation.smoothed import Smoother, add_truth, make_record, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters, initial_states
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
@@ -82,7 +83,8 @@ def run(
 
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, dates
-            of rows that differ between nodes, a filter or fusion that cannot be smoothed.
+            of rows that differ between nodes, two senders of words with the same dithers, a filter or fusion that
+            cannot be smoothed.
     """
     check_process()
     instance("network", network, Network, "a Network")
@@ -100,6 +102,7 @@ def run(
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     clock = _find_clock(measured, {"inputs": inputs, "truth": truth}, time, steps)
     warn_of_unequal_steps(network.inputs, clock)
+    refuse_shared_dithers(network, z)
     for name, node in network.nodes.items():
         z[name] = _drop_beyond_limits(name, node, z[name])
         _warn_of_forbidden(name, node, z[name])

@@ -1,0 +1,33 @@
+"""Recorded dithers of senders of words: no two senders or components may share theirs."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from heliograph.model.word_route import FLAG, find_places
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+FEWEST = 3  # rows in which two dithers are equal by no chance
+
+
+def refuse_shared_dithers(network: Network, z: Mapping[str, Float[np.ndarray, "steps received"]]) -> None:
+    """Raise ValueError where two senders or components of a recording have the same dithers: their errors are common.
+
+    Args:
+        network: the network.
+        z: measurements of each node.
+    """
+    seen = dict[bytes, str]()
+    for name, node in network.nodes.items():
+        if not isinstance(node, Node) or node.encoder is None or not node.encoder.subtracts:
+            continue
+        places = [place for place in find_places(node.channel) if place != FLAG]
+        for component in dict.fromkeys(places):  # copies of a word have one dither
+            drawn = z[name][:, node.received - len(places) + places.index(component)]
+            came, sender = drawn[~np.isnan(drawn)], f"{name}.{node.outputs[component]}"
+            if len(came) >= FEWEST and seen.setdefault(came.tobytes(), sender) != sender:
+                expected = "others than those of " + seen[came.tobytes()] + ", as encoder.dithers(node, numbers) draws"
+                raise fail(f"dithers of {sender}", expected, "the same")
