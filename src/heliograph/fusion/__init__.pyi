@@ -31,6 +31,9 @@ from .quantizer import (
 from .quantizer import (
     EscapeQuantizer as EscapeQuantizer,
 )
+from .zoom import (
+    ZoomQuantizer as ZoomQuantizer,
+)
 from .quantizer import (
     UniformQuantizer as UniformQuantizer,
 )

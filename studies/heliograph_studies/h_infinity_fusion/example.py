@@ -12,7 +12,7 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.wrappers.fed_back import prediction_of
 from heliograph.fusion.quantizer import Quantizer
 from heliograph_studies import sampled
-from heliograph_studies.h_infinity_fusion.setting import NODES, PAPER_FUSED_LEVEL, Hop, Setting, ZoomQuantizer, dynamics
+from heliograph_studies.h_infinity_fusion.setting import NODES, PAPER_FUSED_LEVEL, Hop, Setting, dynamics
 from heliograph_studies.h_infinity_fusion.worst_disturbance import World, Worst, worst_disturbance
 
 RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
@@ -20,9 +20,9 @@ QUANTIZERS = "none", "dynamic", "static"
 MORE_QUANTIZERS = "dynamic_decodable", "static_odd"  # of the paper's filters only
 
 
-def zoom(setting: Setting) -> ZoomQuantizer:
+def zoom(setting: Setting) -> hg.fusion.ZoomQuantizer:
     """The paper's dynamic quantizer."""
-    return ZoomQuantizer(setting.segments, setting.amplitude, setting.decay, setting.zoom)
+    return hg.fusion.ZoomQuantizer(setting.segments, setting.amplitude, setting.decay, setting.zoom)
 
 
 def quantizers(setting: Setting) -> dict[str, Quantizer | None]:

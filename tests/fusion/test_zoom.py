@@ -1,10 +1,10 @@
-"""The paper's dynamic quantizer: what it is meant to do, and where it saturates."""
+"""A quantizer that zooms, as published: what it is meant to do, and where it saturates."""
 
 import numpy as np
 import pytest
 
+from heliograph.fusion import ZoomQuantizer
 from heliograph.testing import check_quantizer
-from heliograph_studies.h_infinity_fusion.setting import ZoomQuantizer
 from tests.fusion.test_quantizer import check_no_number
 
 

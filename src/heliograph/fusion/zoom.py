@@ -1,0 +1,67 @@
+"""A uniform quantizer whose amplitude follows what is sent."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.fusion.quantizer import AbstractQuantizer, Parameter, Quantized, UniformQuantizer
+from heliograph.model.estimate import Claim, weakest
+from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+
+class ZoomQuantizer(AbstractQuantizer):
+    """A uniform quantizer with the amplitude d+ = decay d + growth x^2: a dynamic quantizer, as it is published.
+
+    It is driven by the unquantized x, which a fusion centre does not know, so that nobody there can decode it: for
+    studies. And d saturates for every constant |x| below (1 - decay) / growth, since it tends to growth x^2 /
+    (1 - decay). `EscapeQuantizer` has neither fault.
+
+    Args:
+        levels: number of segments, at least 2.
+        amplitude: d of the first value, positive, a number or (n,).
+        decay: share of the amplitude that is left at the next value, between 0 and 1.
+        growth: of the amplitude with x^2, not negative, per unit of x.
+
+    Raises:
+        ValueError: fewer than two levels, an amplitude that is not positive, decay outside (0, 1), negative growth.
+
+    Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10) to (13).
+    """
+
+    uniform: UniformQuantizer
+    decay: Parameter
+    growth: Parameter
+
+    def __init__(
+        self,
+        levels: int,
+        amplitude: Float[ArrayLike, "*n"],
+        decay: "Float[ArrayLike, '']",
+        growth: "Float[ArrayLike, '']",
+    ):
+        self.uniform = UniformQuantizer(levels, amplitude)
+        self.decay, self.growth = scalar("decay", decay), scalar("growth", growth)
+        if not is_traced(self.decay) and not 0 < self.decay < 1:
+            raise fail("decay", "a number between 0 and 1", decay)
+        if not is_traced(self.growth) and self.growth < 0:
+            raise fail("growth", "no negative number", growth)
+
+    @in_float64
+    def init(self, n: int) -> jax.Array:
+        """Return the first amplitude (n,)."""
+        return jnp.broadcast_to(jnp.asarray(self.uniform.amplitude), (n,))
+
+    @in_float64
+    def step(self, state: Array, value: ArrayLike) -> tuple[jax.Array, Quantized]:
+        """Quantize with the present amplitude; the next one follows x."""
+        x, amplitude = jnp.asarray(value, dtype=float), jnp.asarray(state, dtype=float)
+        following = jnp.where(jnp.isfinite(x), self.decay * amplitude + self.growth * x**2, amplitude)
+        _, sent = eqx.tree_at(lambda q: q.amplitude, self.uniform, amplitude).step((), x)
+        return following, sent
+
+    def claim(self, claim: Claim) -> Claim:
+        """At most "nominal": the amplitude depends on the data, and may be small where errors are large."""
+        return weakest([claim, "nominal"])
