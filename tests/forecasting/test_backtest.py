@@ -82,3 +82,32 @@ def test_standard_errors_know_the_overlap():
 def test_a_backtest_longer_than_the_data_is_refused(horizons, said):
     with pytest.raises(ValueError, match=re.escape(said)):
         hg.backtest(world(), {"a": np.zeros(20)}, horizons)
+
+
+def test_refits_forecast_from_their_row_on():
+    """The same network is no refit; of another one from a row on, each row has the score of its own network."""
+    network, other = world(0.8), world(0.5)
+    noisy = hg.LinearPlant([[0.9]], 2.0, [0.0], 2.0, states=["x"])
+    wrong = hg.kalman_filter(noisy, other.nodes["a"].sensor)
+    other = hg.Network(noisy, {"a": hg.Node(other.nodes["a"].sensor, other.nodes["a"].channel, {"f": wrong})})
+    z, asked = hg.simulate(network, 60, 3).measurements, []
+
+    def same(rows):
+        asked.append(rows)
+        return network
+
+    plain = hg.backtest(network, z, [1], skip=10)
+    assert hg.backtest(network, z, [1], skip=10, refit=same, every=20).of("a", "f", "y", 1) == plain.of(
+        "a", "f", "y", 1
+    )
+    assert asked == [10, 30, 50]
+    changing = hg.backtest(network, z, [1], skip=10, refit=lambda n: network if n < 30 else other, every=20)
+    e = np.concatenate([network.nodes["a"].filters["f"].run(z["a"]).innovations[11:31, 0],
+                        wrong.run(z["a"]).innovations[31:, 0]])  # fmt: skip
+    assert changing.of("a", "f", "y", 1).mse.value == pytest.approx(np.nanmean(e**2), rel=1e-10)
+
+
+@pytest.mark.parametrize("refit", [lambda n: 3, lambda n: hg.Network(world().plant, {"b": world().nodes["a"]})])
+def test_a_refit_that_is_another_network_is_refused(refit):
+    with pytest.raises(hg.InputError, match="refit from 10 rows: expected"):
+        hg.backtest(world(), {"a": np.zeros(40)}, [1], refit=refit)

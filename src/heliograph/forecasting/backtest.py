@@ -1,8 +1,8 @@
 """Backtests: forecasts from each row of a recording, against what came later."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from heliograph.forecasting.outlook import Moments, Outlook
 from heliograph.forecasting.scores import LEVELS, Law, Mean, below, crps, log_score, overlapping_mean
 from heliograph.model.origin import Origin
 from heliograph.numerics.angle import wrap_angles
-from heliograph.numerics.check import check_count, fail, items
+from heliograph.numerics.check import check_count, fail, instance, items
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # an extra
 
 ByNode = TypeAliasType("ByNode", Mapping[str, ArrayLike])
 Rows = TypeAliasType("Rows", Float[ArrayLike, "steps ..."] | None)
+Refit = TypeAliasType("Refit", Callable[[int], Network])  # of the first so many rows
 Coverage = TypeAliasType("Coverage", tuple[Mean, ...])  # of each level
 
 
@@ -131,6 +132,8 @@ def backtest(
     time: Rows = None,
     truth: Rows = None,
     skip: int = 10,
+    refit: Refit | None = None,
+    every: int = 50,
 ) -> Backtest:
     """Return the forecast from each row of a recording, and score what was said against what came: a rolling origin.
 
@@ -145,9 +148,13 @@ def backtest(
         time: (steps,); 0, 1, ... by default.
         truth: true states (steps, n), NaN where they are not known; None by default.
         skip: rows at the start from which nothing is forecast, while filters settle; 10 by default.
+        refit: function of a number of rows that returns the network as it is known from these first rows alone, such as
+            `lambda n: hg.fit(build, {"a": y[:n]}).network`; None by default: `network` throughout.
+        every: rows between refits, the first behind the skipped rows; 50 by default.
 
     Raises:
-        ValueError: what `hg.run` refuses; horizons that reach beyond the data; no filter whose forecasts can be scored.
+        ValueError: what `hg.run` refuses; horizons that reach beyond the data; no filter whose forecasts can be scored;
+            a refit that returns no network, or one of other nodes and filters.
 
     Source: rolling-origin evaluation, Tashman, Out-of-sample tests of forecasting accuracy (2000).
     """
@@ -158,15 +165,40 @@ def backtest(
     if not ahead or ahead[-1] + first >= rows:
         raise fail("backtest", f"horizons that, behind {first} skipped rows, end within the {rows} rows of data", ahead)
     u = inputs_of(network, inputs, rows)
-    origin = record.origin
-    assert isinstance(origin, Origin)  # hg.run sets it
+    # Networks with the row from which each forecasts, and their targets.
+    known = [(0, network)] if refit is None else [
+        (row, _refit(refit, row, network)) for row in range(first, rows, check_count("every", every))
+    ]  # fmt: skip
+    segments = [(row, targets_of(_origin(fitted, record, measurements, inputs, time, truth))) for row, fitted in known]
     scores = list[Score]()
-    for target in targets_of(origin):
-        if (target.node, target.filter) in _with_filter(network):
-            scores += _score_filter(target, record, u, ahead, first)
+    for several in zip(*(targets for _, targets in segments), strict=True):
+        if (several[0].node, several[0].filter) in _with_filter(network):
+            starts = [row for row, _ in segments]
+            scores += _score_filter(list(zip(starts, several, strict=True)), record, u, ahead, first)
     if not scores:
         raise fail("backtest", "a filter that claims a covariance, and data to compare with", "none")
     return Backtest(tuple(ahead), rows, tuple(scores))
+
+
+def _refit(refit: Refit, rows: int, network: Network) -> Network:
+    """Return the network as it is known from the first rows.
+
+    Raises:
+        ValueError: no network, or one of other nodes and filters.
+    """
+    fitted = instance(f"refit from {rows} rows", refit(rows), Network, "a Network")
+    if (fitted.names, set(fitted.places)) != (network.names, set(network.places)):
+        raise fail(f"refit from {rows} rows", f"the nodes and filters of {list(network.names)}", list(fitted.names))
+    return fitted
+
+
+def _origin(network: Network, record: Record, *data: Any) -> Origin:
+    """Return where a network's forecasts start; it is run where the record is not its own."""
+    own = record.origin
+    if not isinstance(own, Origin) or own.model is not network:
+        own = run(network, *data).origin
+    assert isinstance(own, Origin)  # hg.run sets it
+    return own
 
 
 def _with_filter(network: Network) -> set[tuple[str, str]]:
@@ -175,8 +207,14 @@ def _with_filter(network: Network) -> set[tuple[str, str]]:
     return set(network.places) | central
 
 
-def _score_filter(target: Target, record: Record, u: np.ndarray, ahead: list[int], first: int) -> list[Score]:
-    """Score what one filter says ahead of each number that it receives, and of each state whose truth is known."""
+def _score_filter(
+    segments: list[tuple[int, Target]], record: Record, u: np.ndarray, ahead: list[int], first: int
+) -> list[Score]:
+    """Score what one filter says ahead of each number that it receives, and of each state whose truth is known.
+
+    `segments`: the rows from which it is another one, refitted, and itself.
+    """
+    target = segments[0][1]
     filter, node = target.outlook.filter, target.node
     if filter.claim == "none":
         return []
@@ -184,7 +222,13 @@ def _score_filter(target: Target, record: Record, u: np.ndarray, ahead: list[int
     if z is None:  # of a central filter, all nodes' numbers
         z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
     z = z if filter.received else z[:, :0]
-    states, received = roll(target.outlook, z, u, ahead)
+    rolled = [roll(each.outlook, z, u, ahead) for _, each in segments]
+    ends = [*(row for row, _ in segments[1:]), len(z)]
+    starts = [0, *ends[:-1]]
+    states, received = jax.tree.map(
+        lambda *parts: np.concatenate([np.asarray(p)[a:b] for p, a, b in zip(parts, starts, ends, strict=True)]),
+        *rolled,
+    )
     used = filter.angles_used()
     parts = [] if received is None else [("received", target.received, received, z, used.received if used else ())]
     if record.truth is not None:
