@@ -8,8 +8,10 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.learning.description import Build, Description, describe
+from heliograph.learning.fit_sentences import describe_boundaries, describe_forms
 from heliograph.learning.identification import Identifiability, identify_by_recording
 from heliograph.learning.inference import FitTest, Values, compare_likelihoods, criteria, wald_test
+from heliograph.learning.inference_data import make_inference_data
 from heliograph.learning.intervals import LEVEL, METHODS, Method
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.multistart import AWAY, SPREAD, Search
@@ -26,7 +28,6 @@ from heliograph.simulation.network import Network
 
 ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
 IN_HASTE = "Errors by the expected information; `rows()` has intervals by the scores, and at the ends of domains."
-APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
 Progress = TypeAliasType("Progress", Callable[[str], None])
 Rows = TypeAliasType("Rows", ArrayLike | Sequence[ArrayLike])  # of one recording, or a list of one for each
@@ -188,13 +189,33 @@ class Fit:
         rotated[lost] = rotated[:, lost] = np.nan
         return np.asarray(rotated)
 
+    def to_arviz(self, draws: int = 500, seed: int = 0) -> Any:
+        """Return draws of the numbers and the log-likelihood of each row, as ArviZ compares models by them.
+
+        The draws are of the Laplace approximation: the normal law of the curvature of the likelihood at its maximum, on
+        the line on which the numbers are unbounded, with no prior. `log_likelihood` has log p(z_k | z_1 ... z_k-1) of
+        each row in which something arrived, by the form of the likelihood that counts; `sample_stats` has its sum, lp.
+
+        Args:
+            draws: number of draws, 2 at least (default 500).
+            seed: seed of the draws (default 0).
+
+        Returns:
+            An `arviz.InferenceData`, from ArviZ 1.0 on an `xarray.DataTree`, of one chain.
+
+        Raises:
+            ValueError: a number at an end of its domain, or that the data do not identify.
+            ModuleNotFoundError: without ArviZ (extra "arviz").
+        """
+        return make_inference_data(self.best, draws, seed)
+
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences on starts, boundaries, forms that disagree, and what the data cannot identify."""
         return (
             *_describe_climb(self),
-            *_describe_boundaries(self.best),
-            *_describe_forms(self.solutions),
+            *describe_boundaries(self.best),
+            *describe_forms(self.solutions),
             *self.identified.sentences,
         )
 
@@ -374,24 +395,4 @@ def _describe_climb(fitted: Fit) -> list[str]:
     if lower and not fitted.stopped:
         lost = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
         sentences.append(f"Best of {len(below)} starts, of which {lower} ended lower, by {lost:.3g} or more.")
-    return sentences
-
-
-def _describe_boundaries(best: Solution) -> list[str]:
-    """Return the sentences on numbers at the end of their domain."""
-    return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
-
-
-def _describe_forms(solutions: tuple[Solution, ...]) -> list[str]:
-    """Sentences on numbers for which the two forms of the likelihood disagree by more than their errors explain."""
-    if len(solutions) < 2:
-        return []
-    sentences = []
-    for a, b in zip(*(solution.rows() for solution in solutions), strict=True):
-        size = abs(a.estimate - b.estimate) / max(a.standard_error, b.standard_error)
-        if np.isfinite(size) and size > APART:
-            sentences.append(
-                f"{a.name}: the two forms of the likelihood disagree by {size:.1f} standard errors "
-                f"({a.estimate:.4g} and {b.estimate:.4g}), so that the model is in doubt."
-            )
     return sentences

@@ -20,6 +20,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "h5netcdf": "results",
     "h5py": "results",
     "pandas": "results",
+    "arviz": "arviz",
     "zarr": "sweep",
     "bokeh": "explore",
     "dask": "cluster",

@@ -1,0 +1,27 @@
+"""Sentences of a fit: on numbers at the end of their domain, and on forms of the likelihood that disagree."""
+
+import numpy as np
+
+from heliograph.learning.solution import Solution
+
+APART = 3.0  # standard errors between the two forms that suggest an error of the model
+
+
+def describe_boundaries(best: Solution) -> list[str]:
+    """Return the sentences on numbers at the end of their domain."""
+    return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
+
+
+def describe_forms(solutions: tuple[Solution, ...]) -> list[str]:
+    """Sentences on numbers for which the two forms of the likelihood disagree by more than their errors explain."""
+    if len(solutions) < 2:
+        return []
+    sentences = []
+    for a, b in zip(*(solution.rows() for solution in solutions), strict=True):
+        size = abs(a.estimate - b.estimate) / max(a.standard_error, b.standard_error)
+        if np.isfinite(size) and size > APART:
+            sentences.append(
+                f"{a.name}: the two forms of the likelihood disagree by {size:.1f} standard errors "
+                f"({a.estimate:.4g} and {b.estimate:.4g}), so that the model is in doubt."
+            )
+    return sentences
