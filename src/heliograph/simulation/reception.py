@@ -321,65 +321,53 @@ def _receive_sum(
 
 def make_reception(network: Network) -> AbstractMedium:
     """Build the transmission from the plant to the nodes of a network."""
-    # Relays in slots.
     if network.relays is not None:
-        places = network.places
-        listeners = {name: i for i, name in enumerate(network.relays.filters)}
-        return Slots(
-            network.relays,
-            tuple(places[name, LOCAL] for name in network.relays.relays),
-            tuple(tuple(listeners[name] for name in names) for names in network.groups),
-            memory_places({name: hop for name, (_, _, _, hop) in _find_hops_with_memory(network.relays).items()}),
-        )
-    # One channel for all nodes.
+        return _make_slots(network, network.relays)
     if network.common is not None:
         rows = network.rows
         received = tuple(np.array([rows[name] for name in names]) for names in network.groups)
         return CommonChannel(network.common.sensor, network.common.channel, received)
     # A sensor and a channel for each node, stacked by group.
-    groups: list[NodeGroup | Silent] = []
-    places = network.places
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    observed = {name: (node.sensor, node.channel) for name, node in nodes.items()}
-    places_of_memories = memory_places(observed, network.plant)
-    for names in network.groups:
-        if names[0] not in nodes:
-            groups.append(Silent(len(names)))
-            continue
-        # Sensor, channel, and where their draws and memories stand.
-        pairs = [(without_output_names(nodes[name].sensor), _carrying_channel(nodes[name])) for name in names]
-        stacked = stack([_drop_names(pair, places_of_memories[name]) for pair, name in zip(pairs, names, strict=True)])
-        checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
-        rows_of = [_split_places(observed[name], places_of_memories[name]) for name in names]
-        of_sensor, memory_rows = (np.stack(parts) for parts in zip(*rows_of, strict=True))
-        # What a sender that decides knows: its filter, its rule.
-        informed_by = nodes[names[0]].informed_by or nodes[names[0]].predictor
-        reference_filter: PyTree = (
-            None
-            if informed_by is None
-            else stack([without_output_names(nodes[name].filters[informed_by]) for name in names])
-        )
-        informed_at = None if informed_by is None else places[names[0], informed_by][:2]
-        triggers: PyTree = [nodes[name].trigger for name in names]
-        trigger = None if triggers[0] is None else stack(triggers)
-        encoders: PyTree = [nodes[name].encoder for name in names]
-        encoder, reader = (None, None) if encoders[0] is None else (stack(encoders), reader_of(nodes[names[0]].channel))
-        groups.append(
-            NodeGroup(
-                stacked[0],
-                network.inputs,
-                stacked[1],
-                checksums,
-                memory_rows,
-                of_sensor,
-                reference_filter,
-                trigger,
-                encoder,
-                informed_at,
-                reader,
-            )
-        )
-    return SeparateChannels(tuple(groups))
+    memories_of = memory_places({name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant)
+    return SeparateChannels(tuple(
+        _stack_group(network, {name: nodes[name] for name in names}, memories_of) if names[0] in nodes
+        else Silent(len(names)) for names in network.groups
+    ))  # fmt: skip
+
+
+def _make_slots(network: Network, relays: RelayNetwork) -> Slots:
+    """Build the transmission through relays that send in slots."""
+    listeners = {name: i for i, name in enumerate(relays.filters)}
+    return Slots(
+        relays,
+        tuple(network.places[name, LOCAL] for name in relays.relays),
+        tuple(tuple(listeners[name] for name in names) for names in network.groups),
+        memory_places({name: hop for name, (_, _, _, hop) in _find_hops_with_memory(relays).items()}),
+    )
+
+
+def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mapping[str, np.ndarray]) -> NodeGroup:
+    """Stack the nodes of a group; `memories_of` each, the places of what sensor and channel remember."""
+    name, one = next(iter(nodes.items()))
+    # Sensor, channel, and where their draws and memories stand.
+    pairs = [(without_output_names(node.sensor), _carrying_channel(node)) for node in nodes.values()]
+    sensor, channel = stack([_drop_names(pair, memories_of[key]) for pair, key in zip(pairs, nodes, strict=True)])
+    rows_of = [_split_places((node.sensor, node.channel), memories_of[key]) for key, node in nodes.items()]
+    of_sensor, memory_rows = (np.stack(parts) for parts in zip(*rows_of, strict=True))
+    # What a sender that decides knows: its filter, its rule.
+    knows: str | None = one.informed_by or one.predictor
+    reference: PyTree = None
+    if knows is not None:
+        reference = stack([without_output_names(node.filters[knows]) for node in nodes.values()])
+    informed_at = None if knows is None else network.places[name, knows][:2]
+    triggers: PyTree = [node.trigger for node in nodes.values()]
+    trigger = None if triggers[0] is None else stack(triggers)
+    encoders: PyTree = [node.encoder for node in nodes.values()]
+    encoder, reader = (None, None) if encoders[0] is None else (stack(encoders), reader_of(one.channel))
+    checksums = np.array([checksum(key) for key in nodes], dtype=np.uint32)
+    return NodeGroup(sensor, network.inputs, channel, checksums, memory_rows, of_sensor,
+                     reference, trigger, encoder, informed_at, reader)  # fmt: skip
 
 
 def _carrying_channel(node: Node) -> Channel:
