@@ -265,6 +265,7 @@ def test_a_sender_that_is_slower_than_the_rows_loses_nothing():
     assert np.isclose(dated.period, 0.5) and dated.share == 197 / 200
 
 
+@pytest.mark.slow
 def test_another_share_of_losses_than_stated_is_a_doubt():
     """Of 720 rows 75 % where 85 % is said, with a gap of 30; and no doubt where it is as said, in 200 recordings."""
     rng, time = np.random.default_rng(0), np.arange(720.0)
