@@ -30,6 +30,20 @@ class Before(NamedTuple):
     links: dict[str, tuple[Any, ...]]
 
 
+class Brought(NamedTuple):
+    """What a message brings: when it was measured and arrived, this machine's clock, and its events.
+
+    Times are numbers from the plant's `origin`; without one there is no clock to compare with.
+    """
+
+    at: float
+    arrival: float
+    clock: float | None
+    origin: datetime | None
+    event: Known
+    inputs: Known | None
+
+
 class Using:
     """Distribution of messages to their plants; `plants` are those in memory, by name."""
 
@@ -97,46 +111,34 @@ class Using:
     def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
         """Give a message to its plant; the outcome has none if the plant would begin with a refused message."""
         plant = self._find_plant(message, wall)
-        # A new plant begins with a message that is plausible and of a right clock.
-        origin = self._choose_origin(message) if plant is None else plant.origin
-        at = message.time
-        if origin is not None or not isinstance(at, float):
-            at = self._time_as_number(at, origin, message.plant)
-        now = at if plant is None else plant.confirmed
-        arrival = (
-            max(now, at) if message.arrival is None else self._time_as_number(message.arrival, origin, message.plant)
-        )
-        clock = None if origin is None else self._time_as_number(wall, origin, message.plant)
-        event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
-        inputs = None
-        if message.inputs is not None:
-            inputs = self.fleet.known(INPUTS, message.sequence, at, message.inputs, arrival)
+        brought = self._read_events(message, plant, wall)
+        at, arrival, event, inputs = brought.at, brought.arrival, brought.event, brought.inputs
         # Values beyond limits do not count as received; an event of such values only is implausible.
         event, dropped, beyond = self.fleet.within(message.node, event)
         refused, why, spoilt = self._refused, beyond if beyond and np.isnan(event.values).all() else "", None
         if refused:
             why = refused.get((number, event.node_index < 0)) or why
             spoilt = refused.get((number, True)) if inputs is not None else None
-        if plant is None and at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
+        # A new plant begins with a message that is plausible and of a right clock.
+        if plant is None and at > arrival + self.fleet.options.ahead:
             return None, "future", "", ()
         if plant is None and why and (inputs is None or spoilt):
             return None, "implausible", why, ()
         given = message.arrival is not None
         if plant is None:
-            plant = self._begin_plant(
-                message.plant, at, origin, beginning(*((arrival, ARRIVAL) if given else (at, message.node)))
-            )
+            begins = beginning(*((arrival, ARRIVAL) if given else (at, message.node)))
+            plant = self._begin_plant(message.plant, at, brought.origin, begins)
         plant = self._remember(plant, at)
         # Inputs and measurement are used or refused independently.
         notes: list[str] = []
         if inputs is not None and spoilt is None:
-            self._give_to_plant(number, plant, inputs, given, clock, message.node)
+            self._give_to_plant(number, plant, inputs, given, brought.clock, message.node)
         elif spoilt is not None:
             plant.link(INPUTS).implausible += 1
             notes.append(f"inputs {message.inputs}: {spoilt}; the rest is used")
-        verdict: Verdict = (
-            "implausible" if why else self._give_to_plant(number, plant, event, given, clock, message.node)
-        )
+        verdict: Verdict = "implausible"
+        if not why:
+            verdict = self._give_to_plant(number, plant, event, given, brought.clock, message.node)
         link = plant.link(message.node)
         link.count(verdict, message.sequence, at, self.fleet.periods.get(message.node, 0))
         if dropped and verdict in ("used", "implausible"):
@@ -144,6 +146,22 @@ class Using:
         if beyond and verdict == "used":
             notes.append(f"{beyond}; the rest is used")
         return plant, verdict, why, notes
+
+    def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> Brought:
+        """Return the events of a message, its measurement and inputs, with times as numbers of its plant."""
+        origin = self._choose_origin(message) if plant is None else plant.origin
+        at = message.time
+        if origin is not None or not isinstance(at, float):
+            at = self._time_as_number(at, origin, message.plant)
+        # Without a time of arrival it came when its plant had come so far.
+        now = at if plant is None else plant.confirmed
+        came = message.arrival
+        arrival = max(now, at) if came is None else self._time_as_number(came, origin, message.plant)
+        clock = None if origin is None else self._time_as_number(wall, origin, message.plant)
+        event, inputs = self.fleet.known(message.node, message.sequence, at, message.values, arrival), None
+        if message.inputs is not None:
+            inputs = self.fleet.known(INPUTS, message.sequence, at, message.inputs, arrival)
+        return Brought(at, arrival, clock, origin, event, inputs)
 
     def _count_unread(self, message: AnyMessage) -> PlantState | None:
         """Count a message that came and cannot be used as none that was lost; return its plant, if that says so."""
