@@ -144,7 +144,7 @@ def test_every_public_name_stands_in_the_list_of_names():
 def test_a_name_has_one_home_and_the_hall_is_small():
     names = [name for _, name in PUBLIC]
     assert len(set(names)) == len(names)
-    assert len(heliograph.__all__) <= 81, "the first hour needs no more names than these"
+    assert len(heliograph.__all__) <= 83, "the first hour needs no more names than these"
     assert len([p for p in SOURCE.glob("*.py") if p.name != "__init__.py"]) <= 6
 
 

@@ -11,6 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
 from heliograph.model.over_time import OverTime, first
+from heliograph.model.unknown_start import DiffuseStart
 from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continue_angles, nearest, wrap_angles
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, show_error
 from heliograph.numerics.float64 import quickly_compiled
@@ -216,6 +217,8 @@ class Plant(AbstractPlant):
 class LinearPlant(AbstractPlant):
     """A linear plant x+ = A x + B u + w; noise, initial law and circular states are given as for `Plant`.
 
+    `initial_covariance` may be `hg.diffuse` too: nothing is known of the start, of all states or of named ones.
+
     A, B and the covariance of w may be functions of the input u, such as `matrix=lambda u: F(u[0])` with
     `inputs=["dt"]`: the plant is linear all the same, varies with its inputs, and what filters claim stays exact. What
     is computed before data (a steady state, schedules, designs) needs constants, and refuses.
@@ -231,7 +234,7 @@ class LinearPlant(AbstractPlant):
     input_matrix: Matrix  # likewise
     noise: AbstractNoise | NoiseFunction
     initial_mean: Vector
-    initial_covariance: Square
+    initial_covariance: Any  # (n, n), or an unknown start, which refuses to be taken for an array
     deviation: AbstractNoise | None
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -241,15 +244,18 @@ class LinearPlant(AbstractPlant):
         matrix: "ArrayLike | MatrixFunction",
         noise: "NoiseLike | NoiseFunction",
         initial_mean: ArrayLike,
-        initial_covariance: "NoiseLike",
+        initial_covariance: "NoiseLike | DiffuseStart",
         input_matrix: "ArrayLike | MatrixFunction | None" = None,
         states: "Names | None" = None,
         inputs: "Names | None" = None,
         circular: "Sequence[str]" = (),
     ):
-        self.initial_mean, self.initial_covariance, self.deviation = _read_initial(initial_mean, initial_covariance)
+        self.initial_mean, spread, self.deviation = _read_initial(initial_mean, initial_covariance, unknown=True)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
+        self.initial_covariance = spread.of_states(self.states) if isinstance(spread, DiffuseStart) else spread
+        if isinstance(spread, DiffuseStart) and circular:
+            raise fail("initial covariance", "a known one beside states that are angles", "hg.diffuse")
         # Inputs: as many as B has columns, or as have names where something depends on them.
         varies = any(callable(entry) for entry in (matrix, input_matrix, noise))
         if varies and not inputs:
@@ -327,10 +333,17 @@ def _values_at(function: Callable[..., jax.Array], points: jax.Array, rest: tupl
 _values_by_xla = quickly_compiled(_values_at)
 
 
-def _read_initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, AbstractNoise | None]:
+def _read_initial(
+    mean: ArrayLike, spread: NoiseLike | DiffuseStart, unknown: bool = False
+) -> tuple[Vector, Any, AbstractNoise | None]:
     """Return the mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]
+    if isinstance(spread, DiffuseStart):
+        if not unknown:
+            expected = "a covariance or a law, of a plant that is not linear (a large one where little is known)"
+            raise fail("initial covariance", expected, "hg.diffuse")
+        return center, spread, None
     if not isinstance(spread, AbstractNoise):
         return center, covariance("initial covariance", spread, n), None
     law = as_noise("initial deviation", spread, n)

@@ -159,6 +159,21 @@ def test_modes_that_are_alike_are_smoothed_as_one_model(name):
     np.testing.assert_allclose(ours.covariances, theirs.covariances, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_a_transition_is_learned():
+    """Of 800 rows the interval holds the true .97; its width is that of a few dozen switches."""
+    data = hg.simulate(hg.Network(motion(), {"node": hg.Node(SENSOR, LINK, {})}), 800, 0).measurements
+
+    def build():
+        stay = hg.free(0.9, "stay", "probability")
+        plant = hg.markov_plant(models(), jnp.stack([jnp.stack([stay, 1 - stay]), jnp.array(ROWS[1])]), START)
+        return hg.Network(plant, {"node": hg.Node(SENSOR, LINK, {})})
+
+    (found,) = hg.fit(build, data).rows()
+    assert found.low < 0.97 < found.high
+    assert found.high - found.low < 0.1
+
+
 def test_plant_sensor_and_link_of_one_name_share_a_chain_and_others_multiply():
     plant, link = motion(name="weather"), hg.gilbert_elliott(hg.perfect(1), hg.hop(1.0, 4.0), 0.1, 0.2)
     shared = hg.markov_fading([hg.perfect(1), hg.hop(1.0, 4.0)], hg.random_affine.MarkovChain(ROWS, START, "weather"))

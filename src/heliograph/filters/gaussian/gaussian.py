@@ -13,6 +13,7 @@ from heliograph.filters.base import (
     make_sizes,
 )
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, second_moments_at_start
+from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, has_unknown_start
 from heliograph.filters.gaussian.signal import (
     ArrivedInnovation,
     Signal,
@@ -342,7 +343,7 @@ def kalman_filter(
     sensor: AnySensor,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> GaussianFilter | DiffuseFilter:
     """Return the Kalman filter of a linear plant whose linear sensor is received directly.
 
     P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - v), P = P- - K C P-.
@@ -352,6 +353,9 @@ def kalman_filter(
         sensor: a linear sensor, m outputs.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
+
+    From a start that nobody knows (`hg.diffuse` as the plant's initial covariance) it is the limit of ever larger
+    covariances, exactly: infinite variances until enough was measured.
 
     Claim: "exact" from the plant's initial law, whatever the laws' shapes; "nominal" from another, and with angles.
 
@@ -363,6 +367,10 @@ def kalman_filter(
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
+    if has_unknown_start(plant):
+        if initial_mean is not None or initial_covariance is not None:
+            raise fail("initial law", "none beside a plant whose start is unknown", "one")
+        return diffuse_filter(plant, sensor)
     return _make_gaussian_filter(
         plant, sensor, None, Linearization(), Polytope(), initial_mean, initial_covariance, trusted=True
     )

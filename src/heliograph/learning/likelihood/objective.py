@@ -11,14 +11,12 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.gaussian import cubature_filter
-from heliograph.filters.linear.linear import linear_filter
+from heliograph.filters.likelihood_filter import likelihood_filter
 from heliograph.learning.description import Build, Description
 from heliograph.learning.likelihood.data import Data
 from heliograph.model.channel import Channel
 from heliograph.model.enlarged import join_links
 from heliograph.model.estimate import Innovation
-from heliograph.model.fading import without_memory
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, is_linear
@@ -200,9 +198,7 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
     if form == "truth":
         return find_sole_filter(network)
     plant, sensor, channel = join_world(network)
-    if form == "linear":
-        return linear_filter(plant, sensor, channel)
-    return cubature_filter(plant, sensor, without_memory(channel))
+    return likelihood_filter(plant, sensor, channel, form == "linear")
 
 
 def find_sole_filter(network: Network) -> AbstractFilter:

@@ -12,12 +12,14 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.enlarged import JointSensor, join_links, with_past
 from heliograph.model.fading import memory_matters, without_memory
+from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
 from heliograph.model.over_time import at, at_each_step, first, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs
 from heliograph.model.premises.premise import MEAN_AND_COVARIANCE, Premise
 from heliograph.model.premises.same_program import same_function
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
+from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.module import same
 from heliograph.numerics.traced import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -124,6 +126,8 @@ def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
     """Tell whether two plants agree in law, or in mean and covariance where the filter uses no more."""
     if same(a, b):
         return True
+    if any(isinstance(plant.initial_covariance, UnknownStart) or isinstance(plant, ModalPlant) for plant in (a, b)):
+        return False  # of these, only the same is the same
     sizes = [(len(plant.states), len(plant.inputs), plant.angles) for plant in (a, b)]
     if sizes[0] != sizes[1] or not equal_to_rounding(a.initial_mean, b.initial_mean):
         return False
@@ -155,6 +159,8 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
     """Tell whether two sensors measure the same, and with noise of the same moments up to `order`."""
     if same(a, b):
         return True
+    if isinstance(a, ModalSensor) or isinstance(b, ModalSensor):
+        return False
     if a.inputs or b.inputs:
         return _same_sensor_of_inputs(a, b, order)
     if a.angles != b.angles or len(a.outputs) != len(b.outputs) or not _same_noise(a.noise, b.noise, order):

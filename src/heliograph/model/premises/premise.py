@@ -15,6 +15,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
+from heliograph.model.unknown_start import TAKEN_BY, UnknownStart
 from heliograph.model.words import Words
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
@@ -97,6 +98,9 @@ P = ParamSpec("P")
 
 def believing(made: B, premise: Premise | None) -> B:
     """Return the filter, schedule or system with this premise, and the same numbers."""
+    unknown = premise is not None and isinstance(first(premise.plant).initial_covariance, UnknownStart)
+    if unknown and not getattr(made, "takes_unknown_start", False):
+        raise fail("initial covariance", TAKEN_BY, "hg.diffuse")
     twin = copy(made)
     object.__setattr__(twin, "kept", Kept(premise))
     return twin

@@ -1,0 +1,193 @@
+"""Gaussians of which some directions are unknown: the limit of P + kappa P_inf, by factors of two levels.
+
+One unit lower L, whose columns are infinite (d_inf) or finite (d). What else an infinite column has vanishes in the
+limit, so that this is exact. An operation is the one of `gaussian.py` where no column is infinite.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, below_diagonal, decorrelate, reciprocal_or_zero, unit_lower
+from heliograph.factors.gaussian import LOG_TURN, BackwardGain, Gaussian
+from heliograph.factors.repeated import triangularise_noise
+from heliograph.numerics.types import Float
+
+FALLEN = 1e-12  # of what a row had in infinite columns: less is rounding
+DEAF = 1e-9  # of |L_j|'|h|: a measurement that hears less of a direction hears nothing of it
+
+
+class Diffuse(NamedTuple):
+    """Mean m and covariance L (diag(d) + kappa diag(d_inf)) L' in the limit of a large kappa.
+
+    Of each column one of the two is zero. Shapes: mean, variances d, infinite d_inf (n,), lower (n (n - 1) / 2,).
+    """
+
+    mean: Float[jax.Array, "*time n"]
+    lower: Float[jax.Array, "*time entries"]
+    variances: Float[jax.Array, "*time n"]
+    infinite: Float[jax.Array, "*time n"]
+
+    @property
+    def root(self) -> jax.Array:
+        """L, (n, n)."""
+        return jnp.asarray(unit_lower(self.lower))
+
+    @property
+    def unknown(self) -> jax.Array:
+        """Return which components have an infinite variance, (n,)."""
+        return jnp.any((self.root != 0) & (self.infinite > 0), axis=1)
+
+    @property
+    def covariance(self) -> jax.Array:
+        """Covariance (n, n): of what is unknown infinite on the diagonal and 0 beside it."""
+        root, unknown = self.root, self.unknown
+        finite = (root * self.variances) @ root.T
+        return jnp.where(unknown[:, None] | unknown, jnp.diag(jnp.where(unknown, jnp.inf, 0.0)), finite)
+
+
+class Levels(NamedTuple):
+    """Weights of columns (c,): finite ones, and infinite ones."""
+
+    finite: jax.Array
+    infinite: jax.Array
+
+
+def triangularise_levels(
+    rows: jax.Array, weights: Levels, count: int, whole: jax.Array | None = None
+) -> tuple[jax.Array, Levels, jax.Array]:
+    """Make the first `count` rows (c columns) orthogonal in the weights, from the first down.
+
+    Row j has s = sum of w a^2 over infinite columns: where more than rounding is left of it, L_ij by them alone and
+    d_inf,j = s; else that part is put to 0, and the finite ones count. All rows below lose L_ij row j.
+
+    Args:
+        rows: (rows, c).
+        weights: of the columns (c,).
+        count: how many rows are made orthogonal.
+        whole: what the rows had in infinite columns, of which the rest may be rounding (rows,); all by default.
+
+    Returns:
+        L (rows, count), the weights (count,) of its columns, and what is left of the rows.
+    """
+    whole = rows**2 @ weights.infinite if whole is None else whole
+    columns, finite, infinite = [], [], []
+    for j in range(count):
+        far = rows[j] ** 2 @ weights.infinite
+        is_far = far > FALLEN * whole[j]
+        row = jnp.where((weights.infinite > 0) & ~is_far, 0.0, rows[j])
+        near = row**2 @ weights.finite
+        weighted = jnp.where(is_far, weights.infinite, weights.finite) * row
+        share = rows @ weighted * reciprocal_or_zero(jnp.where(is_far, far, near))
+        share = jnp.where(np.arange(len(rows)) == j, 1.0, jnp.where(np.arange(len(rows)) > j, share, 0.0))
+        columns.append(share)
+        finite.append(jnp.where(is_far, 0.0, near))
+        infinite.append(jnp.where(is_far, far, 0.0))
+        rows = jnp.where((np.arange(len(rows)) > j)[:, None], rows - share[:, None] * row, rows)
+    return jnp.stack(columns, axis=1), Levels(jnp.stack(finite), jnp.stack(infinite)), rows
+
+
+def start_diffuse(mean: jax.Array, known: Columns, unknown: np.ndarray) -> Diffuse:
+    """Return the law of a state of which some components (n,) are unknown, the others known by columns."""
+    n = len(mean)
+    rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
+    weights = Levels(
+        jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)]),
+        jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])]),
+    )
+    lower, levels, _ = triangularise_levels(rows, weights, n)
+    return Diffuse(jnp.asarray(mean), below_diagonal(lower), *levels)
+
+
+def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: Columns) -> Diffuse:
+    """Predict x over x+ = F x + b + w."""
+    rows, weights = _moved(matrix @ x.root, x, noise)
+    lower, levels, _ = triangularise_levels(rows, weights, len(x.mean))
+    return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
+
+
+def _moved(slopes: jax.Array, x: Diffuse, noise: Columns) -> tuple[jax.Array, Levels]:
+    """Rows [slopes | N] of x+, with the weights of their columns."""
+    rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
+    own = jnp.asarray(noise.weights)
+    return rows, Levels(jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))]))
+
+
+class Heard(NamedTuple):
+    """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
+
+    log_likelihood: jax.Array
+    unknown: jax.Array
+
+
+def observe_diffuse(x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: Columns) -> tuple[Diffuse, Heard]:
+    """Condition x on z = H x + v, given z - H m - E v; NaN where a component did not arrive.
+
+    A component that hears an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
+    is the log of the integral of p(z | delta) over the unknown delta.
+    """
+    present = ~jnp.isnan(innovation)
+    fresh = triangularise_noise(Columns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    rows = jnp.concatenate([matrix, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
+    rows = decorrelate(fresh.matrix, jnp.where(present[:, None], rows, 0.0))
+    shift, density, unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
+    state = x
+    for i in range(len(innovation)):
+        h, noise_i = rows[i, :-1], jnp.where(present[i], fresh.weights[i], 1.0)
+        state, gain, s, heard = _hear(state, h, noise_i)
+        e = rows[i, -1] - h @ shift
+        shift = shift + gain * e
+        log = jnp.where(heard, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
+        density = density + jnp.where(present[i], log, 0.0)
+        unknown.append(heard & present[i])
+    return state._replace(mean=x.mean + shift), Heard(density, jnp.stack(unknown))
+
+
+def _hear(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
+    """Hear h'x + v, column by column from the last: return x given it, the gain, s or s_inf, and whether it is s_inf.
+
+    Source: Bierman, Factorization methods for discrete sequential estimation (1977), at two levels.
+    """
+    n, root = len(x.mean), x.root
+    s, far, k = noise, jnp.zeros_like(noise), jnp.zeros(n)
+    columns, d, d_inf = [root[:, j] for j in range(n)], list(x.variances), list(x.infinite)
+    for j in reversed(range(n)):
+        column = columns[j]
+        f, reach = h @ column, jnp.abs(h) @ jnp.abs(column)
+        is_far, heard = d_inf[j] > 0, jnp.abs(f) > DEAF * reach
+        new = is_far & heard
+        first_heard = new & (far == 0)
+        # Level of the step: the finite sum before anything unknown is heard, the infinite one after.
+        level = jnp.where(far > 0, far, s)
+        columns[j] = jnp.where(is_far & ~heard, column, column - f * reciprocal_or_zero(level) * k)
+        s_after, far_after = s + jnp.where(is_far, 0.0, f**2 * d[j]), far + jnp.where(new, f**2 * d_inf[j], 0.0)
+        finite_gain = jnp.where(is_far | (far > 0), 0.0, d[j] * f)
+        k = jnp.where(first_heard, 0.0, k) + column * jnp.where(new, d_inf[j] * f, finite_gain)
+        shrunk = jnp.where(far > 0, d[j], d[j] * s * reciprocal_or_zero(s_after))
+        d[j] = jnp.where(is_far, jnp.where(first_heard, s * reciprocal_or_zero(f**2), 0.0), shrunk)
+        d_inf[j] = jnp.where(first_heard, 0.0, jnp.where(new, d_inf[j] * far * reciprocal_or_zero(far_after), d_inf[j]))
+        s, far = jnp.where(far > 0, s, s_after), far_after
+    total = jnp.where(far > 0, far, s)
+    lower = below_diagonal(jnp.stack(columns, axis=1))
+    return Diffuse(x.mean, lower, jnp.stack(d), jnp.stack(d_inf)), k * reciprocal_or_zero(total), total, far > 0
+
+
+def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: Columns) -> BackwardGain:
+    """Regress x on the next state x+ = F x + b + w: Rauch's way back, of what both levels know.
+
+    What of x stays unknown given x+ has a variance that is no number, and so have the estimates that rest on it.
+    """
+    n = len(x.mean)
+    moved, weights = _moved(matrix @ x.root, x, noise)
+    own = jnp.concatenate([x.root, jnp.zeros((n, moved.shape[1] - n))], axis=1)
+    lower, _, rest = triangularise_levels(jnp.concatenate([moved, own]), weights, n)
+    left, levels, _ = triangularise_levels(rest[n:], weights, n, own**2 @ weights.infinite)
+    law = Gaussian(x.mean, below_diagonal(left), jnp.where(levels.infinite > 0, jnp.nan, levels.finite))
+    return BackwardGain(law, lower[n:], ahead, below_diagonal(lower[:n]))
+
+
+def as_gaussian(x: Diffuse) -> Gaussian:
+    """Return what is known of it as a Gaussian; the variance of an unknown direction is no number."""
+    return Gaussian(x.mean, x.lower, jnp.where(x.infinite > 0, jnp.nan, x.variances))

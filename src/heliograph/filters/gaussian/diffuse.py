@@ -1,0 +1,112 @@
+"""The Kalman filter from a start that nobody knows, exactly: factors of two levels, finite and infinite."""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.columns import columns_of, triangularise
+from heliograph.factors.diffuse import (
+    Diffuse,
+    as_gaussian,
+    condition_on_next_diffuse,
+    observe_diffuse,
+    predict_diffuse,
+    start_diffuse,
+)
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
+from heliograph.filters.gaussian.belief import process_noise
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.model.channel import perfect
+from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.premises.premise import Premise, believing
+from heliograph.model.sensor import AnySensor, check_linear, check_sensor
+from heliograph.model.unknown_start import UnknownStart
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import ArrayLike
+
+
+class DiffuseFilter(AbstractSizedFilter):
+    """The Kalman filter of a plant with an unknown start; built by `kalman_filter`.
+
+    The limit of filters with the covariance P + kappa P_inf at the start. Until a direction was measured, the variances
+    that hold it are infinite, and what hears it has no innovation. The log-likelihood is the log of the integral of
+    p(z | delta) over the unknown delta: statsmodels' has 1/2 log 2 pi less for each direction that was learned.
+
+    Source: Koopman, Exact initial Kalman filtering and smoothing for nonstationary time series models (1997), of
+    factors.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    takes_unknown_start: ClassVar[bool] = True
+
+    @compile_on_call
+    def init(self) -> Diffuse:
+        """Return the law before any data."""
+        start = first(self.plant)
+        spread = start.initial_covariance
+        return start_diffuse(jnp.asarray(start.initial_mean), columns_of(spread.known), np.array(spread.unknown))
+
+    @predicts
+    def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
+        """Predict x over x+ = A x + B u + w."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        noise = process_noise(plant, u, _sizes_at_start(first(self.plant)))
+        return predict_diffuse(state, plant.transition_matrix(u), plant.shift(u), noise)
+
+    @corrects
+    def correct(self, state: Diffuse, z: ArrayLike, k: Step = 0) -> tuple[Diffuse, Innovation]:
+        """Condition on z; of what hears an unknown direction the innovation is NaN."""
+        sensor, z = at(self.sensor, k), jnp.asarray(z)
+        matrix, noise = jnp.asarray(sensor.matrix), sensor.noise.columns
+        value = z - matrix @ state.mean - jnp.asarray(sensor.noise.mean)
+        after, heard = observe_diffuse(state, matrix, value, noise)
+        slopes = matrix @ state.root
+        reach = jnp.abs(matrix) @ jnp.abs(state.root)
+        deaf = jnp.all((jnp.abs(slopes) <= 1e-9 * reach) | (state.infinite <= 0), axis=1)
+        shown = jnp.where(deaf, value, jnp.nan)
+        total = (slopes * state.variances) @ slopes.T + noise.covariance
+        there = ~jnp.isnan(shown)
+        return after, Innovation(shown, jnp.where(there[:, None] & there, total, jnp.nan), heard.log_likelihood)
+
+    @estimates
+    def estimate(self, state: Diffuse) -> Estimate:
+        """Return mean and covariance; of what is unknown the variance is infinite, with 0 beside it."""
+        return Estimate(state.mean, state.covariance, self.claim)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return Rauch's way back at two levels."""
+        plant, u = at(self.plant, step.k), jnp.asarray(step.u)
+        noise = triangularise(process_noise(plant, u, _sizes_at_start(first(self.plant))))
+        ahead = jnp.asarray(step.prior.mean)
+        back = condition_on_next_diffuse(step.before, plant.transition_matrix(u), ahead, noise)
+        return SmootherStep(as_gaussian(step.after), back, claim=self.claim)
+
+
+def _sizes_at_start(plant: Any) -> jax.Array:
+    """Return E[x_i^2] of what is known at the start, on which rounding acts."""
+    mean = jnp.asarray(plant.initial_mean)
+    return jnp.asarray(mean**2 + jnp.diagonal(jnp.asarray(plant.initial_covariance.known)))
+
+
+def has_unknown_start(plant: AnyPlant) -> bool:
+    """Return whether nothing is known of some state's start."""
+    return isinstance(getattr(first(plant), "initial_covariance", None), UnknownStart)
+
+
+def diffuse_filter(plant: AnyPlant, sensor: AnySensor) -> DiffuseFilter:
+    """Build the filter of a plant with an unknown start; `kalman_filter` has checked that both are linear."""
+    check_linear("Kalman filter from an unknown start", plant, sensor)
+    if isinstance(plant, OverTime):
+        raise fail("plant with an unknown start", "one that does not vary over time", "one in over_time")
+    check_sensor(first(sensor), len(plant.states))
+    outputs = len(first(sensor).outputs)
+    filter = DiffuseFilter(
+        plant=plant, sensor=sensor, **make_sizes(lower_by_noise("exact", plant, sensor), plant, outputs)
+    )
+    return believing(filter, Premise(plant, sensor, perfect(outputs)))

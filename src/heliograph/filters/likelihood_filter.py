@@ -1,0 +1,35 @@
+"""The filter whose innovations say how likely data are: by what plant, sensor and channel are."""
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.gaussian import cubature_filter, kalman_filter
+from heliograph.filters.linear.linear import linear_filter
+from heliograph.filters.modes.multiple_model import imm_filter
+from heliograph.model.channel import Channel
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.model.unknown_start import UnknownStart
+from heliograph.numerics.check import fail
+from heliograph.random_affine.memory import memories
+
+
+def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: bool) -> AbstractFilter:
+    """Return the filter that a likelihood is computed by.
+
+    Args:
+        plant: the plant; of several modes by `imm_filter`, of an unknown start by `kalman_filter`.
+        sensor: its sensor.
+        channel: from the sensor to the filter.
+        linear: by the state's unconditional moments, `linear_filter`; else by those given data, `cubature_filter`.
+
+    Raises:
+        ValueError: parts that do not fit; a channel beside an unknown start.
+    """
+    if memories((plant, sensor)):
+        return imm_filter(plant, sensor, channel)
+    if isinstance(first(plant).initial_covariance, UnknownStart):
+        if words := first(channel).in_words():
+            raise fail("channel of a network to be learned", "perfect() beside an unknown start", words)
+        return kalman_filter(plant, sensor)
+    return linear_filter(plant, sensor, channel) if linear else cubature_filter(plant, sensor, without_memory(channel))
