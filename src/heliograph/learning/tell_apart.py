@@ -7,9 +7,8 @@ import numpy as np
 import scipy
 
 from heliograph.filters.gaussian.belief import open_loop_filter
-from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.learning.intervals import long_run_deviation
-from heliograph.learning.likelihood.predictive_density import NODES, StackDensities, score_signals
+from heliograph.learning.likelihood.predictive_density import NODES, StackDensities, score_signals, signal_filter
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.module import readable, same
 from heliograph.numerics.types import ArrayLike
@@ -137,7 +136,7 @@ def _draw_likelihood_ratios(
     said = []
     for channel in (true, other):
         received = channel.condition_on_arrival()
-        filter, parts = cubature_filter(network.plant, node.sensor, received), StackDensities.of(received, nodes)
+        filter, parts = signal_filter(network.plant, node.sensor, received), StackDensities.of(received, nodes)
         y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in filter.expect_signals(z, u))
         said.append(score_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
     return np.asarray(said[0] - said[1])

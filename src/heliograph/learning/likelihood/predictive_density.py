@@ -1,7 +1,7 @@
 """Likelihood of a recording with the laws of gains in full, not by two moments alone, and a test of its fit."""
 
 from functools import cache
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ import scipy
 from scipy.special import logsumexp, ndtr
 
 from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
-from heliograph.filters.gaussian.gaussian import cubature_filter
+from heliograph.filters.likelihood_filter import likelihood_filter
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.unequal_steps import judge_dates
@@ -96,6 +96,18 @@ class Predictive(NamedTuple):
         return float(test.statistic), float(test.pvalue)
 
 
+def signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
+    """Return the filter that expects the sensor's signals, of a plant and a sensor of one law.
+
+    Raises:
+        ValueError: a plant or sensor with modes, or an unknown start.
+    """
+    filter = likelihood_filter(plant, sensor, channel, linear=False)
+    if not hasattr(type(filter), "expect_signals"):
+        raise fail("predictive likelihood", "one law of motion, from a known start", type(filter).__name__)
+    return filter
+
+
 def predictive(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -128,7 +140,7 @@ def predictive(
     instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     check_forgets("channel of a predictive likelihood", channel)
     received = channel.condition_on_arrival()
-    filter = cubature_filter(plant, sensor, received)
+    filter = signal_filter(plant, sensor, received)
     judge_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
     z = check_rows("measurements", measurements, None, filter.received, missing=True)
     u = check_rows(
