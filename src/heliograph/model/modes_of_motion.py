@@ -245,6 +245,8 @@ def markov_sensor(
     sensors = _check_models("models of a sensor", models, AbstractSensor)
     for sensor in sensors:
         sensor.refuse_inputs("a mode")
+    for sensor in sensors:
+        sensor.refuse_inputs("a sensor with modes")
     for i, sensor in enumerate(sensors[1:], start=1):
         for what in ("outputs", "circular"):
             if getattr(sensor, what) != getattr(sensors[0], what):

@@ -105,6 +105,7 @@ def diffuse_filter(plant: AnyPlant, sensor: AnySensor) -> DiffuseFilter:
     if isinstance(plant, OverTime):
         raise fail("plant with an unknown start", "one that does not vary over time", "one in over_time")
     check_sensor(first(sensor), len(plant.states))
+    first(sensor).refuse_inputs("a filter from an unknown start")
     outputs = len(first(sensor).outputs)
     filter = DiffuseFilter(
         plant=plant, sensor=sensor, **make_sizes(lower_by_noise("exact", plant, sensor), plant, outputs)
