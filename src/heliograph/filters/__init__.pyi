@@ -38,6 +38,9 @@ from .innovation import (
 from .plausibility import (
     Judgement as Judgement,
 )
+from .likelihood_filter import (
+    likelihood_filter as likelihood_filter,
+)
 from .linear.linear import (
     as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,

@@ -25,6 +25,8 @@ def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, line
 
     Raises:
         ValueError: parts that do not fit; a channel beside an unknown start.
+
+    Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965), by the innovations of each.
     """
     if memories((plant, sensor)):
         return imm_filter(plant, sensor, channel)
