@@ -81,6 +81,7 @@ def test_who_asks_is_named_as_each_version_wants(monkeypatch):
         ([{"name": "t", "columns": ["level"], "values": [[1.0]]}], "returns time, got the columns level"),
         ([{"name": "t", "columns": ["time", "a"], "values": [[1, "x"]]}], "'a': expected numbers or dates, got 'x'"),
         ([], "expected a query with rows, got none"),
+        ([ROWS | {"partial": True}], "expected all rows of the query, got a part of them"),
         ((401, b'{"code":"unauthorized","message":"unauthorized\\naccess"}'), "got 401 unauthorized access"),
         ((400, b'{"error":"error parsing query: found FORM"}'), "got 400 error parsing query: found FORM"),
         ((200, b'{"results":[{"statement_id":0,"error":"database not found: plant"}]}'), "database not found: plant"),

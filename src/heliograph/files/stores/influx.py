@@ -9,6 +9,7 @@ import re
 from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from math import isfinite
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
@@ -41,6 +42,8 @@ def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     if refused is not None:
         raise fail(str(address), "a query that it answers", _shorten(str(refused)))
     series = [part for each in results for part in each.get("series", ())]
+    if any(part.get("partial") for part in (*results, *series)):
+        raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
     if not series:
         raise fail(str(address), "a query with rows", "none")
     return str(series[0].get("name", address.table)), _join_series(address, series)
@@ -64,7 +67,7 @@ def _join_series(address: StoreAddress, series: list[dict[str, Any]]) -> dict[st
 
 
 def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str) -> None:
-    """Write the rows of a table as points of its moments (datetime64[ns]); NaN is left out.
+    """Write the rows of a table as points of its moments (datetime64[ns]); what is not finite is left out.
 
     A point of the same moment and plant is replaced, so that what was interrupted is written anew by the same call.
 
@@ -98,7 +101,7 @@ def _batch_lines(
     names = [_escape(name, ", =") for name in columns]
     lines, size, rows = list[str](), 0, 0
     for time, *cells in zip(moments.astype(np.int64).tolist(), *(c.tolist() for c in columns.values()), strict=True):
-        fields = ",".join(f"{n}={_print_value(v)}" for n, v in zip(names, cells, strict=True) if v == v)
+        fields = ",".join(f"{n}={_print_value(v)}" for n, v in zip(names, cells, strict=True) if isfinite(v))
         rows += 1
         if fields:
             lines.append(f"{key} {fields} {time}\n")
