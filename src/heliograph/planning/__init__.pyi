@@ -1,5 +1,9 @@
 """Public names of the room; the package loads them when first used."""
 
+from .bits import (
+    BitsDesign as BitsDesign,
+    design_bits as design_bits,
+)
 from .budget import (
     Budget as Budget,
 )

@@ -1,0 +1,217 @@
+"""Bits of the senders' words under a total rate: for the least steady error of the best linear filter of all."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.model.words import Words
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Float
+from heliograph.random_affine.flips import Flips
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+MOST = 24  # bits of a word
+STEPS = 300  # of the relaxation
+
+
+@readable
+class BitsDesign(NamedTuple):
+    """Bits of each sender, the steady trace of the error with them, and a bound below that of any bits.
+
+    Args:
+        bits: by node; 0 of one that sends nothing.
+        error: trace of the steady covariance of the best linear filter of all words, with subtracted dither.
+        bound: that no bits of this total rate have less.
+        encoders: of the nodes that send, with these bits and a dither that is taken off.
+    """
+
+    bits: dict[str, int]
+    error: float
+    bound: float
+    encoders: dict[str, Words]
+
+
+class _Senders(NamedTuple):
+    """Plant and senders: rows c_i of the sensors, and information j_i(B) of words of B bits, (sender, MOST + 1)."""
+
+    transition: Float[np.ndarray, "n n"]
+    process: Float[np.ndarray, "n n"]
+    rows: Float[np.ndarray, "senders n"]
+    information: Float[np.ndarray, "senders bits"]
+
+
+def design_bits(network: Network, total: int) -> BitsDesign:
+    """Return the bits of each sender's words, of `total` bits a step, for a small error of the filter of all nodes.
+
+    A word of B bits over a range of 2a, with D = 2a / (2^B - 1), U = D^2 (4^B - 1)/12 and flips of g = 1 - 2p, says as
+    much of y as one measurement of the information j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)). j is convex in B while
+    D^2/12 > R and concave then, so that one more bit may say little where three say much: bits are added greedily,
+    several at once, by the decrease of the error for each. The steady trace is convex in all j; with each j replaced by
+    its concave envelope the best real bits give the bound, by Frank and Wolfe's steps, whose linear part is exact. It
+    is close where steps are no coarser than the noises, and loose where a precise sensor has few bits.
+
+    Args:
+        network: nodes with encoders, whose ranges and links are kept, of one output each.
+        total: bits that all nodes together send at a step.
+
+    Raises:
+        ValueError: no network of senders of words with one output each behind constant error rates, a plant that is not
+            linear or not stable, no bit.
+
+    Source: Frank and Wolfe (1956), for the bound; the concave envelope of an S-shaped utility.
+    """
+    senders = _describe_senders(instance("network", network, Network, "a Network"))
+    budget, names = check_count("total bits", total), list(network.names)
+    bits = _add_greedily(senders, budget)
+    error = _find_error(senders, _information_of(senders, bits))
+    nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
+    encoders = {
+        name: Words(int(count), node.encoder.low, node.encoder.high, "subtracted")
+        for name, node, count in zip(names, nodes, bits, strict=True)
+        if count and node.encoder is not None
+    }
+    found = {name: int(count) for name, count in zip(names, bits, strict=True)}
+    return BitsDesign(found, error, min(_relax(senders, budget), error), encoders)
+
+
+def _describe_senders(network: Network) -> _Senders:
+    """Read plant, sensors and information of words from a network."""
+    plant = network.plant
+    linear = isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise) and not plant.inputs
+    a = np.asarray(plant.matrix) if isinstance(plant, LinearPlant) and linear else np.eye(1)
+    if not isinstance(plant, LinearPlant) or spectral_radius(a) >= 1:
+        expected = "a stable LinearPlant without inputs, as words overload in the end of any other"
+        raise fail("plant of a design of bits", expected, "another")
+    q = np.asarray(plant.noise.covariance)
+    rows, information = list[np.ndarray](), list[np.ndarray]()
+    for name, node in network.nodes.items():
+        if not isinstance(node, Node) or node.encoder is None or len(node.outputs) != 1:
+            raise fail(f"node {name!r} of a design of bits", "one with an encoder and one output", "another")
+        if not isinstance(node.sensor, LinearSensor):
+            raise fail(f"sensor of node {name!r} of a design of bits", "a LinearSensor", type(node.sensor).__name__)
+        r = np.asarray(node.sensor.noise.covariance)
+        rows.append(np.asarray(node.sensor.matrix)[0])
+        g, span = _gain_of(name, node), float(np.max(node.encoder.high) - np.min(node.encoder.low))
+        counts = np.arange(1, MOST + 1)
+        step = span / (2.0**counts - 1)
+        noise = r[0, 0] + step**2 / 12 * (1 + (4.0**counts - 1) * (1 / g**2 - 1))
+        information.append(np.concatenate([[0.0], 1 / noise]))
+    return _Senders(a, q, np.array(rows), np.array(information))
+
+
+def _gain_of(name: str, node: Node) -> float:
+    """Return g of a node's link, of one word with a constant error rate."""
+    link = node.channel
+    if isinstance(link, Flips) and isinstance(link.error, Constant):
+        return float(link.gain.moment(1))
+    if isinstance(link, GainAndNoise):  # a selection, as an encoder demands
+        return 1.0
+    raise fail(f"channel of node {name!r} of a design of bits", "decode_and_forward with constant rates, or perfect()",
+               type(link).__name__)  # fmt: skip
+
+
+def _information_of(senders: _Senders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
+    found: np.ndarray = senders.information[np.arange(len(senders.rows)), np.asarray(bits)]
+    return found
+
+
+def _find_covariance(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, "n n"]:
+    """Return the steady covariance after the words, P = (P-^-1 + sum j c c')^-1."""
+    on = j > 0
+    a, q, c = senders.transition, senders.process, senders.rows[on]
+    if not on.any():
+        open_loop: np.ndarray = solve_discrete_lyapunov(a, q)
+        return open_loop
+    before = solve_discrete_are(a.T, c.T, q, np.diag(1 / j[on]))
+    gain = np.linalg.solve(c @ before @ c.T + np.diag(1 / j[on]), c @ before).T
+    after: np.ndarray = before - gain @ c @ before
+    symmetric: np.ndarray = (after + after.T) / 2
+    return symmetric
+
+
+def _find_error(senders: _Senders, j: Float[np.ndarray, " senders"]) -> float:
+    return float(np.trace(_find_covariance(senders, j)))
+
+
+def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, " senders"]:
+    """Derivatives of the steady trace by each j: -c' P Y P c, Y = I + M' Y M with M = (I - K C) A."""
+    p = _find_covariance(senders, j)
+    before = senders.transition @ p @ senders.transition.T + senders.process
+    m = p @ np.linalg.pinv(before) @ senders.transition
+    y = solve_discrete_lyapunov(m.T, np.eye(len(m)))
+    slopes: np.ndarray = -np.einsum("in,nk,im,mk->i", senders.rows @ p, y, senders.rows @ p, np.eye(len(p)))
+    return slopes
+
+
+def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"]:
+    """Add bits, several at once to one sender, by the decrease of the error for each bit, while there are some left."""
+    bits = np.zeros(len(senders.rows), dtype=int)
+    error = _find_error(senders, _information_of(senders, bits))
+    while (left := total - bits.sum()) > 0:
+        best = (0.0, 0, 0, error)
+        for i in range(len(bits)):
+            for more in range(1, min(left, MOST - bits[i]) + 1):
+                tried = bits.copy()
+                tried[i] += more
+                lower = _find_error(senders, _information_of(senders, tried))
+                best = max(best, ((error - lower) / more, i, more, lower))
+        if best[0] <= 0:
+            return bits
+        bits[best[1]] += best[2]
+        error = best[3]
+    return bits
+
+
+def _relax(senders: _Senders, total: int) -> float:
+    """Bound the error of any bits from below: the best real ones with the concave envelopes of the information."""
+    hulls = [_find_envelope(values) for values in senders.information]
+    j, bound = np.zeros(len(hulls)), -np.inf
+    for k in range(STEPS):
+        slopes, error = _find_slopes(senders, j), _find_error(senders, j)
+        best = _spend(hulls, -slopes, total)
+        gap = float(slopes @ (j - best))
+        bound = max(bound, error - gap)
+        j = j + 2 / (k + 2) * (best - j)
+    return bound
+
+
+def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]]:
+    """Return the corners (B, j) of the concave envelope of j over B, from B = 0 on."""
+    corners = [(0, float(values[0]))]
+    while corners[-1][0] < len(values) - 1:
+        start, low = corners[-1]
+        further = np.arange(start + 1, len(values))
+        rises = (values[further] - low) / (further - start)
+        if rises.max() <= 0:
+            break
+        at = int(further[np.argmax(rises)])
+        corners.append((at, float(values[at])))
+    return corners
+
+
+def _spend(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
+    """Maximise sum worth_i j_i over real bits: edges of the envelopes, the steepest first."""
+    edges = [
+        (worth[i] * (high - low) / (b - a), i, b - a, high - low)
+        for i, hull in enumerate(hulls)
+        for (a, low), (b, high) in pairwise(hull)
+    ]
+    j, left = np.zeros(len(hulls)), float(total)
+    for _, i, width, rise in sorted(edges, reverse=True):
+        share = min(1.0, left / width)
+        j[i] += share * rise
+        left -= share * width
+        if left <= 0:
+            break
+    return j
