@@ -92,6 +92,12 @@ def test_what_does_not_stays_sequential(item):
     assert in_chunks(item) is None
 
 
+def test_means_far_from_zero_are_as_near_as_their_rounding():
+    """Positions of a million metres known to a decimetre: eps of them is 2e-9 of a deviation, and enters the speeds."""
+    far = Z + 1e6 + 100.0 * np.arange(ROWS)[:, None] * STEP
+    assert in_chunks(hg.kalman_filter(WALK, PLACES), far) is not None
+
+
 def test_few_rows_stay_sequential():
     assert in_chunks(hg.kalman_filter(WALK, PLACES), Z[:30_000]) is None
 
