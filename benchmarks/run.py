@@ -41,7 +41,7 @@ ALONE = (
     "startup", "stream", "timeline", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion",
     "links_with_memory", "event_triggered", "fleet", "network_design", "robust", "own_filters",
 )  # fmt: skip
-WITH_PEERS = ("learning",)  # like those alone, but they ask peers of their own
+WITH_PEERS = ("learning", "one_series")  # like those alone, but they ask peers of their own
 
 
 class Program(NamedTuple):

@@ -7,8 +7,8 @@ with which the next one began agree to `TOLERANCE` of a deviation, or the latter
 difference e that is left between two means has an e' P^-1 e that never grows, P the covariance that the filter claims.
 
 Products of a row, of 4 states and 2 outputs: 257. The elements (A, b, C, eta, J) of a scan by an associative operation,
-which need no forgetting, take 257, 160 for the columns of A and 120 for the factors of J, before the row is filtered
-with the state that they give: 2.5 times as many, and W rows ahead of L chunks 1 + W / L times.
+which need no forgetting, take 257, 128 for the columns of A and 120 for the factors of J, before the row is filtered
+with the state that they give: 3.0 times as many, and W rows ahead of L chunks 1 + W / L times.
 
 Source: the elements: Särkkä and García-Fernández, Temporal parallelization of Bayesian smoothers (2021).
 """
