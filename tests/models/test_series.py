@@ -104,6 +104,30 @@ def test_a_regression_that_wanders_is_one_over_time():
     np.testing.assert_allclose(found.means, right.means, atol=1e-9)
 
 
+def test_coefficients_that_wander_and_a_ragged_factor_are_statsmodels():
+    """A time-varying regression with a gap, and a factor of three series with other ends: 1e-7, forecasts 1e-8."""
+    rng = np.random.default_rng(5)
+    u = np.round(rng.normal(size=80), 3)
+    y = np.round(1 + 0.5 * u + rng.normal(size=80), 3)
+    y[20:25] = np.nan
+    model = m.structural([m.level(0.1, 0.0, 10.0), m.regression(["x"], 0.05, 10.0)], 0.5)
+    found = hg.kalman_filter(model.plant, model.sensor).run(y, u[:, None])
+    assert abs(found.log_likelihood + 118.58087615863967) < 1e-7
+    np.testing.assert_allclose(found.means[-1], [0.57518558, 0.72864703], atol=1e-8)
+    # One factor, three series.
+    factor = np.zeros(80)
+    for k in range(1, 80):
+        factor[k] = 0.8 * factor[k - 1] + rng.normal()
+    loading = np.array([1.0, 0.6, -0.4])
+    series = np.round(factor[:, None] * loading + rng.normal(size=(80, 3)) * 0.7, 3)
+    series[:10, 1] = series[-4:, 2] = series[-1, 0] = series[30, :] = np.nan
+    plant = m.arma([0.8], [], 1.0, "factor").plant
+    found = hg.kalman_filter(plant, hg.LinearSensor(loading[:, None], 0.49)).run(series)
+    assert abs(found.log_likelihood + 292.92338516599887) < 1e-7
+    right = [-0.2731473245979196, -0.16388839475875178, 0.10925892983916785]
+    np.testing.assert_allclose(hg.forecast(found, 1).outputs.mean[0], right, atol=1e-8)
+
+
 def test_a_season_of_dummies_sums_to_noise():
     part = m.seasonal(4, 0.0, initial_variance=1.0)
     assert part.plant.states == ("season", "season_1_ago", "season_2_ago")
