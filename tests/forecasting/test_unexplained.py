@@ -67,3 +67,20 @@ def test_filters_without_residuals_are_refused():
         residuals(hg.filters.open_loop_filter(plant), [[1.0]])
     with pytest.raises(ValueError, match="measurements: expected at least one row"):
         predict_rows(filter_of(), np.zeros((0, 1)))
+
+
+def test_quantiles_of_a_normal_law_lie_in_their_band():
+    """500 residuals of an honest filter: nineteen of twenty within bands of 95 %; a heavy tail leaves them."""
+    rng = np.random.default_rng(0)
+    plant, sensor = hg.LinearPlant([[0.0]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 1e-9, outputs=["y"])
+    honest = hg.forecasting.residuals(hg.kalman_filter(plant, sensor), rng.normal(size=500)).quantiles("y")
+    assert np.mean((honest.low <= honest.residuals) & (honest.residuals <= honest.high)) > 0.9
+    heavy = hg.forecasting.residuals(hg.kalman_filter(plant, sensor), rng.standard_t(2, size=500))
+    tails = heavy.quantiles("y")
+    assert tails.residuals[-1] > tails.high[-1] and tails.residuals[0] < tails.low[0]
+    figure = heavy.figure()
+    assert len(figure.axes) == 3 and figure.axes[0].get_ylabel() == "y"
+    with pytest.raises(hg.InputError, match="time: expected 500 times"):
+        heavy.figure([1.0, 2.0])
+    with pytest.raises(hg.InputError, match="output: expected one of y"):
+        heavy.quantiles("z")

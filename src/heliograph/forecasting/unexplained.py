@@ -1,6 +1,7 @@
 """What a model did not predict: one step ahead at every row, and tests of the standardised residuals."""
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +13,17 @@ from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
 from heliograph.forecasting.outlook import Outlook, outlook_of, output_claim, prediction_of
 from heliograph.forecasting.prediction import Array, Forecast, InputsAhead
+from heliograph.forecasting.residual_figure import Quantiles, compare_quantiles, draw_residuals
 from heliograph.model.over_time import first
 from heliograph.numerics.angle import nearest
-from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.node import name_values
+
+if TYPE_CHECKING:  # it takes a second
+    from matplotlib.figure import Figure
 
 FALSE = 0.01  # probability of any false doubt, of all tests together
 LEAST = 20  # residuals for tests
@@ -111,6 +116,30 @@ class Residuals:
             for said, p in tests.items()
             if p[i] < FALSE / made
         ]
+
+    def quantiles(self, name: str) -> Quantiles:
+        """Return the residuals of one output in order, beside the quantiles of a normal law, with a band of 95 % each.
+
+        Raises:
+            ValueError: no output of this name.
+        """
+        if name not in self.names:
+            raise fail("output", f"one of {', '.join(self.names)}", show_value(name))
+        return compare_quantiles(self.values[:, self.names.index(name)])
+
+    def figure(self, time: "Float[ArrayLike, ' steps'] | None" = None) -> "Figure":
+        """Return a figure: of each output residuals over time, autocorrelations with their band, and quantiles.
+
+        Args:
+            time: of the rows, numbers or dates (steps,); 0, 1, ... by default.
+
+        Raises:
+            ValueError: times of another number.
+        """
+        clock = np.arange(len(self.values)) if time is None else np.asarray(time)
+        if clock.shape != (len(self.values),):
+            raise fail("time", f"{len(self.values)} times", f"shape {clock.shape}")
+        return draw_residuals(self.names, self.values, self.autocorrelation, self.band, clock)
 
 
 def residuals(

@@ -1,0 +1,79 @@
+"""Figure of standardised residuals: over time, their autocorrelations, and their quantiles beside the normal law's."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import beta
+
+from heliograph.disk.palette import COLOURS
+
+if TYPE_CHECKING:  # it takes a second
+    from matplotlib.figure import Figure
+
+OUTSIDE = 0.025  # probability beyond each side of a band
+MOST = 20  # outputs of a figure
+
+
+class Quantiles(NamedTuple):
+    """Residuals in order, beside what they would be of a normal law.
+
+    Args:
+        normal: quantiles of the normal law (n,).
+        residuals: sorted residuals that came (n,).
+        low: below which each of them lies with probability 2.5 % where the law is normal (n,).
+        high: above which likewise (n,).
+    """
+
+    normal: np.ndarray
+    residuals: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def compare_quantiles(e: np.ndarray) -> Quantiles:
+    """Return the quantiles of residuals (steps,), NaN where none came: the i-th of n is Beta(i, n + 1 - i) in law."""
+    came = np.sort(e[~np.isnan(e)])
+    n = len(came)
+    place = np.arange(1, n + 1)
+    low, high = (np.asarray(ndtri(beta.ppf(p, place, n + 1 - place))) for p in (OUTSIDE, 1 - OUTSIDE))
+    return Quantiles(ndtri(place / (n + 1)), came, low, high)
+
+
+def draw_residuals(
+    names: tuple[str, ...], values: np.ndarray, autocorrelation: np.ndarray, band: np.ndarray, time: np.ndarray
+) -> "Figure":
+    """Return a figure with a row of three panels for each output, the first twenty of them.
+
+    Args:
+        names: of the outputs.
+        values: residuals (steps, m).
+        autocorrelation: over the first lags (lags, m).
+        band: half-width of the interval of 95 % of one of them (m,).
+        time: of the rows (steps,).
+    """
+    from matplotlib.figure import Figure
+
+    count = min(len(names), MOST)
+    figure = Figure(figsize=(9.0, 0.5 + 1.9 * count), layout="constrained")
+    grid = figure.subplots(count, 3, squeeze=False, width_ratios=[2, 1, 1])
+    for i, (over_time, by_lag, in_order) in enumerate(grid):
+        over_time.plot(time, values[:, i], ".", markersize=3, color=COLOURS[0])
+        for level in (-2, 0, 2):
+            over_time.axhline(level, color="0.6", linewidth=0.8, linestyle="-" if level == 0 else ":")
+        over_time.set_ylabel(names[i])
+        lags = np.arange(1, len(autocorrelation) + 1)
+        by_lag.bar(lags, autocorrelation[:, i], 0.5, color=COLOURS[0])
+        by_lag.axhspan(-band[i], band[i], color="0.85", zorder=0)
+        quantiles = compare_quantiles(values[:, i])
+        in_order.fill_between(quantiles.normal, quantiles.low, quantiles.high, color="0.85", linewidth=0)
+        in_order.plot(quantiles.normal, quantiles.residuals, ".", markersize=3, color=COLOURS[0])
+        for panel in (over_time, by_lag, in_order):
+            panel.spines[["top", "right"]].set_visible(False)
+    for panel, title in zip(
+        grid[0], ("residuals in deviations", "autocorrelation", "quantiles, of a normal law"), strict=True
+    ):
+        panel.set_title(title, fontsize=10, loc="left")
+    for panel, label in zip(grid[-1], ("row or time", "rows apart", "normal quantile"), strict=True):
+        panel.set_xlabel(label)
+    return figure
