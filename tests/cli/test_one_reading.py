@@ -38,6 +38,7 @@ OWN = "".join(json.dumps(dict(node="a", sequence=k, time=t, values=[v])) + "\n" 
 LEAPS = "".join(f"{t},{v}\n" for t, v in [*zip(SECONDS[:2], VALUES[:2], strict=True), (3e8, 99)]) + "".join(
     f"{t},{v}\n" for t, v in zip(SECONDS[2:], VALUES[2:], strict=True)
 )
+FAR = json.dumps(dict(node="a", sequence=9, time="2036-01-01T00:00:01Z", values=[99]))
 NAMED = "".join(f'{{"node": "a", "sequence": {k}, "time": "{t[:-1]}", "y": {v}}}\n' for k, (t, v) in enumerate(PAIRS))
 NO_VALUE = f'{{"node": "a", "sequence": 9, "time": "{DATES[3][:-1]}", "values": [nan]}}\n'
 NO_COUNT = '{"node": "a", "time": 0, "values": [1]}\n'
@@ -64,6 +65,14 @@ FORMS = {
         "log.csv", "time,y\n" + "".join(f"{t},{v}\n" for t, v in reversed(PAIRS)), "{}", 0),
     "rows of numbers of which one leaps": ("log.csv", f"time,y\n{LEAPS}", "{}", 1),
     "our own messages with the newest first": ("log.jsonl", "".join(OWN.splitlines(True)[::-1]), "{}", 0),
+    "our own messages of which some were not set": (
+        "log.jsonl",
+        json.dumps(dict(node="a", sequence=8, time="1970-01-01T00:00:01Z", values=[99])) + "\n"
+        + OWN.replace('{"node": "a", "sequence": 2', f'{FAR}\n{{"node": "a", "sequence": 2'), "{}", 2),
+    "our own messages of numbers of which one leaps": (
+        "log.jsonl", "".join(
+            json.dumps(dict(node="a", sequence=k, time=float(t), values=[float(v)])) + "\n"
+            for k, (t, v) in enumerate(line.split(",") for line in LEAPS.split())), "{}", 1),
     "events with the newest first": (
         "log.csv", "node,sequence,time,y\n" + "".join(EVENTS.splitlines(True)[::-1]), "{}", 0),
     "lines of a log with the newest first": (
@@ -208,7 +217,7 @@ def test_the_same_rows_are_used_whatever_is_done_with_them(folder, monkeypatch, 
     messages, refused = piped(folder / name, path=True)
     np.testing.assert_allclose(of_messages(messages), expected, rtol=0, atol=1e-6)
     assert len(refused) == unread
-    if "other" not in sources and not any(word in form for word in ("newest first", "backwards", "leaps")):
+    if "other" not in sources and not any(word in form for word in ("newest first", "backwards", "leaps", "not set")):
         messages, refused = piped(folder / name, path=False)
         np.testing.assert_allclose(of_messages(messages), expected, rtol=0, atol=1e-6)
         assert len(refused) == unread

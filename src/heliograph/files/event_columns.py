@@ -77,6 +77,11 @@ class Columns:
         counts = np.array([count for _, count in self.unread], dtype=np.int64)
         return count_gaps(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
 
+    def list_lost_digits(self, name: str) -> list[str]:
+        """Return a line where most stamps are those of other events, as of stamps that lost their digits; else none."""
+        count, distinct = len(self.time), len(np.unique(np.array(self.time)))
+        return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
+
     def drop_unset(self, name: str) -> tuple[str, str, int]:
         """Leave out stamps that were not set; return what to say of the clock, why some were left out, and how many.
 

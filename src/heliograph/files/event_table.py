@@ -151,28 +151,30 @@ class EventTable:
         self.refused += 1
         self.reasons += [str(error)] if len(self.reasons) < 3 else []
 
-    def finish(self, source: str) -> None:
+    def finish(self, source: str, strict: bool = False) -> None:
         """End the reading of a source: leave out stamps that were not set; say what was left out.
 
-        A stamp that is more than a year before its arrival, or zero where the others are of our days, was not set;
-        where most of a node's are, they are of another clock, and arrivals say nothing. Numbers of steps are no stamps.
+        A stamp that is more than a year before its arrival, or far from all others, was not set; where most of a node's
+        are, they are of another clock. Steps are no stamps.
+
+        Args:
+            source: name of what was read, for errors.
+            strict: whether a stamp that was not set is an error.
 
         Raises:
-            ValueError: no event, and a message that could not be read.
+            ValueError: no event, and a message that could not be read; a stamp that was not set.
         """
-        for plant in self._plants.values() if self.dated or not self.steps else ():
-            for name, columns in plant.items():
-                note, reason, count = columns.drop_unset(f"{source}, {name}")
-                self.notes += [note] if note else []
-                self.reasons += [reason] if reason else []
-                self.refused += count
-        if not len(self) and (self.reasons or self.broken):
-            raise InputError((self.reasons or [self.broken])[0])
-        # Stamps that lost their digits look like this.
-        for name, time in ((name, c.time) for plant in self._plants.values() for name, c in plant.items()):
-            distinct = len(np.unique(np.array(time)))
-            if len(time) > 3 and 2 * distinct <= len(time) and not self.steps:
-                self.notes.append(f"{source}, {name}: {len(time)} events have {distinct} stamps")
+        every = [each for plant in self._plants.values() for each in plant.items()]
+        for name, columns in every if self.dated or not self.steps else ():
+            note, reason, count = columns.drop_unset(f"{source}, {name}")
+            self.notes += [note] * bool(note)
+            if reason:
+                self.refuse(InputError(reason), strict)
+                self.refused += count - 1
+        if not len(self) and (first := (*self.reasons, self.broken)[0]):
+            raise InputError(first)
+        for name, columns in () if self.steps else every:
+            self.notes += columns.list_lost_digits(f"{source}, {name}")
 
     @property
     def origin(self) -> int:

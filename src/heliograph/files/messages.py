@@ -88,7 +88,7 @@ def read_events(
         events = _map_messages(source, network, known, strict)
     if known is not None:
         _warn_of_left_out(source, known, events)
-    events.finish(str(source))
+    events.finish(str(source), strict)
     return events
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.density import log_density
 from heliograph.numerics.module import readable
-from heliograph.numerics.shares import Share, count_independent, wilson
+from heliograph.numerics.shares import Share, count_independent, round_to, wilson
 from heliograph.numerics.types import Array, Float
 
 
@@ -138,7 +138,8 @@ class InnovationSummary(NamedTuple):
             return f"received 0 of {self.expected}"
         share = f"({100 * self.share.low:.2g} % to {100 * self.share.high:.2g} %)"
         half = (self.bias_high - self.bias_low) / 2
-        return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {self.bias:.2g} +- {half:.1g}"
+        bias, error = (round_to(number, half / 1.96) for number in (self.bias, half))
+        return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {bias} +- {error}"
 
     def describe_left_out(self, filter: str, output: str) -> list[str]:
         """Warn in a line where a filter left out most values of an output, which outliers are not; else empty."""

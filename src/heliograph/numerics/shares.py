@@ -59,3 +59,11 @@ def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     width = int(np.ceil(len(values) ** (1 / 3))) + 1
     sums = np.convolve(apart, np.ones(width))
     return mean, float(np.sqrt(np.mean(sums**2) * (len(sums) / width)) / count)
+
+
+def round_to(value: float, error: float) -> str:
+    """Return a number to two digits of its standard error, to four digits without one."""
+    if not (np.isfinite(value) and 0 < error < np.inf):
+        return f"{value:.4g}"
+    places = 1 - int(np.floor(np.log10(error)))
+    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"

@@ -13,6 +13,7 @@ from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.shares import average_correlated
+from heliograph.numerics.shares import round_to as round_to
 from heliograph.report.held import HeldValue, find_held_value
 from heliograph.report.medians import find_law_medians
 from heliograph.report.results import Json
@@ -64,14 +65,6 @@ def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[st
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
     means = [average_correlated(column)[1] for column in squares.T]
     return {state: e / (2 * rmse[state]) if rmse[state] > 0 else np.nan for state, e in zip(rmse, means, strict=True)}
-
-
-def round_to(value: float, error: float) -> str:
-    """Return a number to two digits of its standard error, to four digits without one."""
-    if not (np.isfinite(value) and 0 < error < np.inf):
-        return f"{value:.4g}"
-    places = 1 - int(np.floor(np.log10(error)))
-    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
 
 
 class OutputJudgement(NamedTuple):

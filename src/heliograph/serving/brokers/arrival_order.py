@@ -1,9 +1,14 @@
 """Messages of a file in the order in which they arrived, whatever the order of its lines."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from datetime import datetime
 from heapq import heappop, heappush, heappushpop
 
+import numpy as np
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.times.row_order import SECOND, YEAR, find_astray
 from heliograph.serving.message import Message, NumberedMessage, Payload, UnreadMessage
 
 HELD = 250_000  # messages that wait for earlier ones
@@ -12,11 +17,17 @@ HELD = 250_000  # messages that wait for earlier ones
 class ArrivalOrder:
     """Messages put in the order of their arrivals, or of their times where those are not known; of equal ones as given.
 
-    What is no message stays behind the one before it. A file of more than `HELD` messages is put in order as far as
-    these reach.
+    What is no message stays behind the one before it. Of messages that say nothing of their arrival, those whose times
+    are more than a year outside of all others of their node were not set: each is refused alone, as by a run. A file of
+    more than `HELD` messages is put in order as far as these reach.
+
+    Args:
+        source: name of the file, for errors.
+        steps: whether times that are numbers are steps, none of which is astray.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, source: str, steps: bool) -> None:
+        self._source, self._steps = source, steps
         self._held = list[tuple[float, int, Payload]]()
         self._count, self._last = 0, float("-inf")
 
@@ -35,7 +46,27 @@ class ArrivalOrder:
 
     def end(self) -> list[Payload]:
         """Return the others."""
+        if self._count == len(self._held):
+            self._refuse_astray()
         return [heappop(self._held)[2] for _ in range(len(self._held))]
+
+    def _refuse_astray(self) -> None:
+        """Put errors in the place of messages whose times were not set."""
+        nodes = defaultdict[tuple[str, str, bool], list[tuple[float, int, Payload]]](list)
+        for entry in sorted(self._held, key=lambda entry: entry[1]):
+            if isinstance(message := entry[2], Message | NumberedMessage):
+                nodes[message.plant, message.node, isinstance(message.time, datetime)].append(entry)
+        for (_, node, dated), entries in nodes.items():
+            known = any(getattr(message, "arrival", None) is not None for *_, message in entries)
+            if known or (self._steps and not dated):
+                continue
+            times = np.array([moment for moment, *_ in entries])
+            for i in np.flatnonzero(find_astray(times, YEAR / SECOND)):
+                moment, number, message = entries[i]
+                came = getattr(message, "time", moment)
+                where, expected = f"{self._source}, {node}", "a time that was set, near the others in order"
+                error = str(fail(where, expected, came.isoformat() if isinstance(came, datetime) else came))
+                self._held[self._held.index(entries[i])] = (moment, number, error)
 
     def _moment(self, payload: Payload) -> float:
         """Return when a payload arrived; what says nothing of that, when the one before it did."""

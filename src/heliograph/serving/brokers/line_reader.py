@@ -11,6 +11,7 @@ from pathlib import Path
 from heliograph.files.fields import decode_json
 from heliograph.files.message_files import FileMessage, convert_line, convert_object, flatten
 from heliograph.files.own_messages import OwnReader, is_own
+from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
 from heliograph.serving.brokers.table_lines import TableLines, read_own
@@ -58,7 +59,7 @@ class LineReader:
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
         self._number = 0
-        self._order = None if path is None else ArrivalOrder()
+        self._order = None if path is None else ArrivalOrder(self.source, TIME_STEP not in network.inputs)
 
     def read(self, lines: Sequence[bytes]) -> list[Payload]:
         """Return the messages of lines, which are not empty.
