@@ -145,7 +145,7 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
 
     first = jnp.where(large | (order == 0), 1.0, size / 2)
     total = jax.lax.while_loop(lambda s: jnp.abs(s[1]) > EPSILON / 8 * s[2], add, (jnp.ones_like(x), first, first))[2]
-    scale = jnp.where(large, 1 / jnp.sqrt(2 * np.pi * jnp.where(large, size, 1.0)), jnp.exp(-size))
+    scale = jnp.where(large, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(large, size, 1.0))), jnp.exp(-size))
     value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
     return jnp.where(x < 0, -value, jnp.where(x == 0, x, value)) if order else value
 

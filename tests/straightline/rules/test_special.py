@@ -59,3 +59,11 @@ def test_functions_of_one_number_are_scipys(name):
         values = over_runs(getattr(jax.scipy.special, name), sign * x)
         rtol = 3e-13 if sign < 0 and name == "digamma" else 2e-14
         np.testing.assert_allclose(values, getattr(special, name)(sign * x), rtol=rtol, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["i0e", "i1e"])
+def test_scaled_bessel_functions_keep_their_tails_where_two_pi_x_overflows(name):
+    """1 / root(2 pi x) to the end of the doubles, and 0 beyond it."""
+    x = np.array([1e20, 1e300, 1e308, np.finfo(float).max, np.inf])
+    values = over_runs(getattr(jax.scipy.special, name), x)
+    np.testing.assert_allclose(values, [*(1 / np.sqrt(2 * np.pi) / np.sqrt(x[:4])), 0.0], rtol=1e-14)
