@@ -23,6 +23,7 @@ MEANS, LIKELIHOOD = 1e-6, 1e-9
 PEERS = {
     "statsmodels": "series_statsmodels.py",
     "pykalman": "series_pykalman.py",
+    "cuthbert": "series_cuthbert.py",
 }
 FOLDER = Path(__file__).resolve().parent / "peers"
 AT_MOST = {"heliograph, filter": 25.0, "heliograph, smoother": 60.0, "heliograph, likelihood": 20.0}
