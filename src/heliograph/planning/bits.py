@@ -88,12 +88,12 @@ def design_bits(network: Network, total: int) -> BitsDesign:
 def _describe_senders(network: Network) -> _Senders:
     """Read plant, sensors and information of words from a network."""
     plant = network.plant
-    linear = isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise) and not plant.inputs
-    a = np.asarray(plant.matrix) if isinstance(plant, LinearPlant) and linear else np.eye(1)
-    if not isinstance(plant, LinearPlant) or spectral_radius(a) >= 1:
-        expected = "a stable LinearPlant without inputs, as words overload in the end of any other"
-        raise fail("plant of a design of bits", expected, "another")
-    q = np.asarray(plant.noise.covariance)
+    expected = "a stable LinearPlant without inputs, as words overload in the end of any other"
+    if not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise) or plant.inputs:
+        raise fail("plant of a design of bits", expected, type(plant).__name__)
+    a, q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
+    if spectral_radius(a) >= 1:
+        raise fail("plant of a design of bits", expected, f"one of spectral radius {spectral_radius(a):.3g}")
     rows, information = list[np.ndarray](), list[np.ndarray]()
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or node.encoder is None or len(node.outputs) != 1:
