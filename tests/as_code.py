@@ -21,6 +21,7 @@ HELD = {  # arguments that an object holds otherwise than under their names
     "drift": lambda faded: faded.memory,
     "weights": lambda mixture: mixture.choice.probabilities,
     "radius": lambda mixture: mixture.choice.radius,
+    "resolution": lambda sensor: None,  # part of the noise
 }
 
 

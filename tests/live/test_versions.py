@@ -87,6 +87,8 @@ def test_a_timeline_of_the_version_before_goes_on(network):
         for name, known in filters.items():
             check_known(estimates[node][name], known)
     hg.Timeline.restore(network, timeline.save())  # of this version now
+    final = timeline.final()
+    assert list(final.time) == [1.0, 2.0] and np.isfinite(final.estimates["b"]["linear"].mean).all()
 
 
 @pytest.mark.slow
@@ -99,7 +101,9 @@ def test_a_timeline_goes_on_with_other_nodes_where_the_user_says_so(network):
         again = hg.Timeline.restore(other, timeline.save(), accept_changes=True)
     begun = {str(line.message) for line in said if "begins with the initial law" in str(line.message)}
     assert begun == {f"timeline, snapshot: c/{name} begins with the initial law" for name in ("linear", "cubature")}
+    assert any("final rows are estimates of other filters" in str(line.message) for line in said)
     known, new = pushed(timeline, 4, 6).estimates(), pushed(again, 4, 6).estimates()
+    hg.Timeline.restore(other, again.save())
     for node in "ab":
         for name, estimate in known[node].items():
             check_known(new[node][name], [estimate.mean, estimate.covariance])

@@ -298,6 +298,7 @@ def clocked():
     yield hg.filters.clock_filter(plant, sensors["a"], NOISY, ["a"]), plant, 0
 
 
+RULER = hg.Words(8, -9.0, 9.0)
 FLAGGED = hg.markov_fading([NOISY, hg.hop(1.0, np.eye(2))], [[0.9, 0.1], [0.2, 0.8]])
 HELPERS = {
     "hg.model.joint_sensor": joint, "hg.model.with_clocks": clocks, "hg.model.with_bias": biases,
@@ -343,6 +344,8 @@ HELPERS = {
     **{f"hg.{name}": on_line(lambda *parts, make=make: make(*parts, 4)) for name, make in
        {"polynomial_filter": hg.polynomial_filter, "filters.memory_filter": hg.filters.memory_filter,
         "filters.scheduled_polynomial_filter": hg.filters.scheduled_polynomial_filter}.items()},
+    "hg.word_filter": on_line(lambda plant, sensor, channel: hg.word_filter(plant, sensor, encoder=RULER)),
+    "hg.filters.likelihood_filter": of_parts(lambda *parts: hg.filters.likelihood_filter(*parts, linear=False)),
     "hg.event_filter": on_line(lambda *parts: hg.event_filter(*parts, hg.SendOnDelta([1.0, 1.0]))),
     # Networks of networks.
     "hg.planning.designed_network": designed, "hg.simulation.freeze": meshed,

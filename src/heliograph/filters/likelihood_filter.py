@@ -7,10 +7,11 @@ from heliograph.filters.modes.multiple_model import imm_filter
 from heliograph.model.channel import Channel
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor, check_sensor
 from heliograph.model.unknown_start import UnknownStart
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, flag, instance
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memory import memories
 
 
@@ -28,10 +29,17 @@ def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, line
 
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965), by the innovations of each.
     """
+    start = check_plant(plant)
+    check_sensor(first(sensor), len(start.states))
+    link = instance("channel", first(channel), AbstractRandomAffine, "a channel")
     if memories((plant, sensor)):
         return imm_filter(plant, sensor, channel)
-    if isinstance(first(plant).initial_covariance, UnknownStart):
-        if words := first(channel).in_words():
+    if isinstance(start.initial_covariance, UnknownStart):
+        if words := link.in_words():
             raise fail("channel of a network to be learned", "perfect() beside an unknown start", words)
         return kalman_filter(plant, sensor)
-    return linear_filter(plant, sensor, channel) if linear else cubature_filter(plant, sensor, without_memory(channel))
+    return (
+        linear_filter(plant, sensor, channel)
+        if flag("linear", linear)
+        else cubature_filter(plant, sensor, without_memory(channel))
+    )

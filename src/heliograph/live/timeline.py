@@ -286,7 +286,8 @@ class Timeline:
             data: what `save` returned.
             accept_changes: go on with the timeline of a network that has changed in numbers, nodes or filters, or that
                 another version saved, and warn of each change. A filter goes on if its state has the same parts; a
-                covariance of a version before 0.3.0 becomes its factors. Others begin with the initial law.
+                covariance of a version before 0.3.0 becomes its factors. Others begin with the initial law, and final
+                rows of estimates go on if their filters are the same.
 
         Raises:
             ValueError: no snapshot, or one of another network or version.
@@ -294,14 +295,15 @@ class Timeline:
         head, arrays = unpack(data)
         mine, other = shared_program(network).identity, head.get("of", {})
         if accept_changes and mine != other:
-            arrays = arrays | {"plant": cls._carry_over(network, head, arrays["plant"].tobytes())}
-            return cls._resume(network, head, arrays)
+            return cls._resume(network, head, cls._carry_over(network, head, arrays))
         check_same("snapshot", mine, other, SAME)
         return cls._resume(network, head, arrays)
 
     @classmethod
-    def _carry_over(cls, network: Network, head: Mapping[str, Any], plant: bytes) -> np.ndarray:
-        """Return the bytes of a plant that another network or version saved, as this one would."""
+    def _carry_over(
+        cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Return the plant and the final rows that another network or version saved, as this one would."""
         window, ahead, capacity = head["options"]
         fleet = Fleet(shared_program(network), Options(window, ahead, capacity=capacity), alone=True)
         mine, other = fleet.program.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
@@ -312,9 +314,15 @@ class Timeline:
         carrier = Carrier(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
         carrier.begin("snapshot", there)
         try:
-            return np.frombuffer(carrier.carried({"": plant})[""], np.uint8)
+            plant = np.frombuffer(carrier.carried({"": arrays["plant"].tobytes()})[""], np.uint8)
         except ValueError as error:
             raise fail("snapshot", "rows of the filters that are here", f"other ones: {error}") from None
+        time, final = arrays["final.time"], carrier.carry_outputs(arrays["final"])
+        if final is None:
+            said = f"timeline, snapshot: {len(time)} final rows are estimates of other filters, and not carried on"
+            warnings.warn(said, stacklevel=4)
+            time, final = np.zeros(0), np.zeros((0, fleet.pool.step_rows.outputs.size))
+        return {"plant": plant, "final.time": time, "final": final}
 
     @classmethod
     def _resume(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":

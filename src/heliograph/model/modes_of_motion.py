@@ -15,7 +15,7 @@ import numpy as np
 from heliograph.model.over_time import OverTime
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.check import fail, items, show_value
+from heliograph.numerics.check import fail, instance, items, show_value
 from heliograph.numerics.module import Module, same
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import MarkovChain
@@ -42,7 +42,8 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant]):
-        self.memory, self.models = memory, tuple(models)
+        self.memory = instance("memory", memory, MarkovChain, "a MarkovChain")
+        self.models = _check_models("models of a plant", models, AbstractPlant)
         start = self.models[0]
         self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
         self.deviation, self.states, self.inputs, self.circular = (
@@ -121,7 +122,8 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractSensor]):
-        self.memory, self.models = memory, tuple(models)
+        self.memory = instance("memory", memory, MarkovChain, "a MarkovChain")
+        self.models = _check_models("models of a sensor", models, AbstractSensor)
         self.outputs, self.circular = self.models[0].outputs, self.models[0].circular
 
     @property  # type: ignore[misc]
@@ -243,8 +245,6 @@ def markov_sensor(
             probabilities that are none.
     """
     sensors = _check_models("models of a sensor", models, AbstractSensor)
-    for sensor in sensors:
-        sensor.refuse_inputs("a mode")
     for sensor in sensors:
         sensor.refuse_inputs("a sensor with modes")
     for i, sensor in enumerate(sensors[1:], start=1):

@@ -24,7 +24,7 @@ from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import Premise, believing
-from heliograph.model.sensor import AbstractSensor, AnySensor, refuse_angles
+from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
 from heliograph.model.word_route import FLAG, about_centres, find_places
 from heliograph.model.words import Dither, Words
 from heliograph.numerics.check import fail, instance
@@ -258,6 +258,7 @@ def word_filter(
     Source: Curry, Estimation and control with quantized measurements (1970), the Gaussian fit, for any word channel.
     """
     start = check_plant(plant)
+    check_sensor(first(sensor), len(start.states))
     channel = perfect(len(first(sensor).outputs)) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states), late=True)
     refuse_angles("word filter", plant, sensor)

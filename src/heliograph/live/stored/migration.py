@@ -15,7 +15,7 @@ from heliograph.live.stored.old_layout import can_read, describe_old_layout, pla
 from heliograph.live.stored.plant_codec import BEFORE_LEAP, PlantParts, pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import Identity
 from heliograph.numerics.check import fail
-from heliograph.numerics.types import PyTree
+from heliograph.numerics.types import Bool, Float, PyTree
 from heliograph.simulation.network import Network
 
 DESCRIPTION = "description"  # key of an identity: its numbers and the layout of its rows, as JSON
@@ -36,14 +36,24 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
     parts |= {f"node {name!r}": node for name, node in network.nodes.items()}
     parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
     filters, size = _filter_columns(fleet, covariances)
+    # Before 0.3.0 no probabilities of modes were among the outputs.
+    outputs = fleet.pool.step_rows.outputs.size - (np.count_nonzero(_mode_columns(fleet)) if covariances else 0)
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
         "given": fleet.program.given,
         "state": size,
-        "outputs": fleet.pool.step_rows.outputs.size,
+        "outputs": int(outputs),
         "filters": filters,
     }
     return json.dumps({"values": {name: _numbers_by_path(tree) for name, tree in parts.items()}, "layout": layout})
+
+
+def _mode_columns(fleet: Fleet) -> Bool[np.ndarray, " outputs"]:
+    """Return which of a network's outputs are probabilities of modes."""
+    results = np.zeros(fleet.pool.step_rows.outputs.size, bool)
+    for place in fleet.program.places:
+        results[slice(*(place.modes or (0, 0)))] = True
+    return results
 
 
 def _numbers_by_path(tree: PyTree) -> dict[str, object]:
@@ -147,6 +157,19 @@ class Carrier:
         results = {name: pack_plant(plant, self.fleet) for name, plant in plants.items()}
         for plant in plants.values():
             self.fleet.end(plant)
+        return results
+
+    def carry_outputs(self, rows: Float[np.ndarray, "row output"]) -> Float[np.ndarray, "row output"] | None:
+        """Return outputs with this network's columns, NaN for modes that were not told; None of other filters."""
+        new, told = json.loads(self.mine[DESCRIPTION])["layout"], ~_mode_columns(self.fleet)
+        if any(list(self._old[part]) != list(new[part]) for part in ("nodes", "filters")):
+            return None
+        if rows.shape[1] == len(told):
+            return rows
+        if rows.shape[1] != np.count_nonzero(told):
+            return None
+        results = np.full((len(rows), len(told)), np.nan)
+        results[:, told] = rows
         return results
 
     def _translate(self, body: bytes) -> bytes:
