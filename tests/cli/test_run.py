@@ -188,3 +188,26 @@ def test_forecasts_are_rows_behind_the_data_and_a_part_of_the_page(tmp_path, cap
     assert "Inputs are held at those of the last row." in (tmp_path / "report" / "report.html").read_text()
     assert cli.main([*call, "--out", str(tmp_path / "out.mcap")]) == 2
     assert "--forecast: expected a table of estimates" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_predictions_of_each_row_are_columns_and_a_figure(tmp_path, capsys):
+    """`--predicted`: of messages those rows that the estimates have; MCAP is refused."""
+    (tmp_path / "level.py").write_text(
+        "import heliograph as hg\n"
+        "plant = hg.LinearPlant([[1.0]], 1.0, [0.0], 4.0, states=['level'])\n"
+        "sensor = hg.LinearSensor([[1.0]], 0.5, outputs=['height'])\n"
+        "node = hg.Node(sensor, hg.perfect(1), {'f': hg.kalman_filter(plant, sensor)})\n"
+        "network = hg.Network(plant, {'a': node})\n"
+    )
+    (tmp_path / "data.csv").write_text("time,height\n" + "".join(f"{k},{'' if k == 7 else k}\n" for k in range(30)))
+    call = ["run", str(tmp_path / "level.py"), "--measurements", str(tmp_path / "data.csv"), "--predicted"]
+    report = tmp_path / "report"
+    assert cli.main([*call, "--forecast", "2", "--out", str(tmp_path / "out.csv"), "--report", str(report)]) == 0
+    written = read_table(tmp_path / "out.csv")
+    assert written["predicted.output.height"][7] == written["predicted.level"][7] == written["level"][7]
+    assert len(written["time"]) == 32
+    assert "What each filter expected of a row" in (report / "report.html").read_text()
+    assert (report / "predicted_0.svg").exists()
+    assert cli.main([*call, "--out", str(tmp_path / "out.mcap")]) == 2
+    assert "--predicted: expected a table of estimates" in capsys.readouterr().err

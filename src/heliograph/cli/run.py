@@ -44,6 +44,9 @@ def run(
     smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
     lag: Annotated[float | None, Parameter(help="Of messages: also estimates given what came so much later.")] = None,
     forecast: Annotated[str, Parameter(help="How far ahead: 12 rows, or 5s,1min, or dates; marked as such.")] = "",
+    predicted: Annotated[
+        bool, Parameter(help="Also what was predicted of each row from those before it.", negative="")
+    ] = False,
     reading: ReadingOptions | None = None,
 ) -> None:
     """Run the filters of your own network over measured data.
@@ -71,8 +74,9 @@ def run(
     later, options = _parse_smoothing(smooth), reading or ReadingOptions()
     _check_options(measurements, out, report, lag, options)
     ahead = horizons_in(forecast) if forecast else None
-    if ahead is not None and isinstance(out, Path) and out.suffix.lower() == ".mcap":
-        raise fail("--forecast", "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
+    asked = [option for option, used in {"--forecast": ahead is not None, "--predicted": predicted}.items() if used]
+    if asked and isinstance(out, Path) and out.suffix.lower() == ".mcap":
+        raise fail(asked[0], "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
     with progress(4) as advance:
         advance("starting")
         from heliograph.files.network_file import load_module
@@ -94,15 +98,17 @@ def run(
             written = _select_rows(record, data.rows)
             lines = [*_describe_doubted(loaded, record), *data.summary]
             future = _make_forecasts(record, ahead, lines)
+            each_row = heliograph.forecasting.predict_record(record, data.recording.inputs) if predicted else {}
             if place is not None:
                 advance(f"writing {place}")
                 write = _choose_writer(data, module)
-                _write_rows(write, written, future, place, data)
+                _write_rows(write, written, (future, _select_predicted(each_row, data.rows)), place, data)
                 lines += _write_lagged(loaded, data, lag, options, place, write)
-            done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines, future))
+            doubted = [*data.warnings, *record.failures(), *doubts]
+            done.append((data, record, written, place, doubted, lines, (future, each_row)))
     # Report, then warnings and a summary.
     if report is not None:
-        plants = {data.plant: (record, data.recording, future) for data, record, *_, future in done}
+        plants = {data.plant: (record, data.recording, *ahead_of_each) for data, record, *_, ahead_of_each in done}
         _write_report(network, loaded, plants, report)
     for _, _, written, place, doubts, lines, _ in done:
         _print_lines(list(dict.fromkeys(doubts)), [*_describe_results(written, place, report), *lines])
@@ -177,21 +183,33 @@ def _make_forecasts(record: "Record", ahead: "Horizons | None", lines: list[str]
     return forecasts
 
 
+def _select_predicted(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
+    """Return what was predicted of some of the rows."""
+    if rows is None or rows.all():
+        return predicted
+    return {
+        node: {name: forecast.select(rows) for name, forecast in filters.items()} for node, filters in predicted.items()
+    }
+
+
 def _write_rows(
-    write: "Write", record: "Record", forecasts: "ByFilter", place: Path | StoreAddress, data: "Measured"
+    write: "Write", record: "Record", ahead: "tuple[ByFilter, ByFilter]", place: Path | StoreAddress, data: "Measured"
 ) -> None:
-    """Write estimates, with rows of forecasts below them where there are any."""
-    if not forecasts:
+    """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
+    forecasts, predicted = ahead
+    if not forecasts and not predicted:
         write(record, place)
         return
-    from heliograph.files.estimates.forecasts import forecast_columns, write_forecast
-
-    if isinstance(place, Path):
-        write_forecast(record, forecasts, place)
-        return
+    from heliograph.files.estimates.forecasts import forecast_columns
+    from heliograph.files.estimates.table import estimate_columns
     from heliograph.files.stores.tables import write_columns
+    from heliograph.files.table import write_table
 
-    write_columns(place, forecast_columns(record, forecasts), data.plant, _find_origin(data))
+    columns = forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
+    if isinstance(place, Path):
+        write_table(columns, place)
+    else:
+        write_columns(place, columns, data.plant, _find_origin(data))
 
 
 def _write_lagged(
@@ -353,7 +371,7 @@ def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | 
 
 
 def _write_report(
-    name: str, network: "Network", plants: "Mapping[str, tuple[Record, Recording, ByFilter]]", report: Path
+    name: str, network: "Network", plants: "Mapping[str, tuple[Record, Recording, ByFilter, ByFilter]]", report: Path
 ) -> None:
     """Examine the records of all plants and write the report, a page for each plant and one of all."""
     from dataclasses import replace
@@ -363,8 +381,8 @@ def _write_report(
 
     def examined(advance: "Advance") -> dict[str, Health]:
         return {
-            plant: replace(examine(network, record, recording.inputs, advance), forecasts=future)
-            for plant, (record, recording, future) in plants.items()
+            plant: replace(examine(network, record, recording.inputs, advance), forecasts=future, predicted=each_row)
+            for plant, (record, recording, future, each_row) in plants.items()
         }
 
     def results_of(health: dict[str, Health]) -> Results:

@@ -12,9 +12,12 @@ from .backtest import (
     Backtest as Backtest,
     Score as Score,
 )
+from .one_step import (
+    predict_record as predict_record,
+    predict_rows as predict_rows,
+)
 from .unexplained import (
     Residuals as Residuals,
-    predict_rows as predict_rows,
     residuals as residuals,
 )
 from .prediction import (

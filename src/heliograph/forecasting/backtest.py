@@ -172,7 +172,7 @@ def backtest(
     segments = [(row, targets_of(_origin(fitted, record, measurements, inputs, time, truth))) for row, fitted in known]
     scores = list[Score]()
     for several in zip(*(targets for _, targets in segments), strict=True):
-        if (several[0].node, several[0].filter) in _with_filter(network):
+        if (several[0].node, several[0].filter) in filtered_places(network):
             starts = [row for row, _ in segments]
             scores += _score_filter(list(zip(starts, several, strict=True)), record, u, ahead, first)
     if not scores:
@@ -201,10 +201,18 @@ def _origin(network: Network, record: Record, *data: Any) -> Origin:
     return own
 
 
-def _with_filter(network: Network) -> set[tuple[str, str]]:
+def filtered_places(network: Network) -> set[tuple[str, str]]:
     """Return the estimates that are those of a filter, which can be stepped by itself."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
     return set(network.places) | central
+
+
+def measured_by(target: Target, record: Record) -> np.ndarray:
+    """Return the measurements of a filter (steps, received)."""
+    z = record.measurements.get(target.node)
+    if z is None:  # of a central filter, all nodes' numbers
+        z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
+    return z if target.outlook.filter.received else z[:, :0]
 
 
 def _score_filter(
@@ -218,10 +226,7 @@ def _score_filter(
     filter, node = target.outlook.filter, target.node
     if filter.claim == "none":
         return []
-    z = record.measurements.get(node)
-    if z is None:  # of a central filter, all nodes' numbers
-        z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
-    z = z if filter.received else z[:, :0]
+    z = measured_by(target, record)
     rolled = [roll(each.outlook, z, u, ahead) for _, each in segments]
     ends = [*(row for row, _ in segments[1:]), len(z)]
     starts = [0, *ends[:-1]]

@@ -1,6 +1,6 @@
 """What a forecast says of several numbers at several horizons: mean, covariance, quantiles, probabilities."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -124,6 +124,29 @@ class Forecast:
     outputs: Prediction | None
     received: Prediction | None
     inputs: InputsAhead
+
+    def select(self, rows: ArrayLike) -> "Forecast":
+        """Return the forecast at some of its horizons.
+
+        Args:
+            rows: which, (horizons,) of true and false.
+
+        Raises:
+            ValueError: another number of them.
+        """
+        kept = np.asarray(rows)
+        if kept.shape != self.steps.shape or kept.dtype.kind != "b":
+            raise fail("rows", f"{len(self.steps)} of true and false", f"shape {kept.shape} of {kept.dtype}")
+        states, outputs, received = (
+            part
+            and replace(part, **{
+                name: getattr(part, name)[kept]
+                for name in ("mean", "covariance", "weights", "part_means", "part_variances")
+            })
+            for part in (self.states, self.outputs, self.received)
+        )  # fmt: skip
+        assert states is not None
+        return Forecast(self.steps[kept], self.time[kept], states, outputs, received, self.inputs)
 
     def named(self, name: str) -> tuple[Prediction, int]:
         """Return the prediction that has a number of this name, states first, and its place there.

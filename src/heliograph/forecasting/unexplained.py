@@ -1,26 +1,20 @@
-"""What a model did not predict: one step ahead at every row, and tests of the standardised residuals."""
+"""What a model did not predict: the standardised residuals of its predictions one step ahead, and tests of them."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2, f
 
-from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
-from heliograph.forecasting.outlook import Outlook, outlook_of, output_claim, prediction_of
-from heliograph.forecasting.prediction import Array, Forecast, InputsAhead
+from heliograph.forecasting.one_step import predict_rows
+from heliograph.forecasting.prediction import Array, Forecast
 from heliograph.forecasting.residual_figure import Quantiles, compare_quantiles, draw_residuals
-from heliograph.model.over_time import first
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import check_count, fail, instance, show_value
-from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.node import name_values
+from heliograph.numerics.types import ArrayLike, Float
 
 if TYPE_CHECKING:  # it takes a second
     from matplotlib.figure import Figure
@@ -28,54 +22,6 @@ if TYPE_CHECKING:  # it takes a second
 FALSE = 0.01  # probability of any false doubt, of all tests together
 LEAST = 20  # residuals for tests
 NORMAL = 1.959963984540054  # quantile of an interval of 95 %
-
-
-def predict_rows(
-    filter: AbstractFilter,
-    z: Float[ArrayLike, "steps received"],
-    u: Float[ArrayLike, "steps inputs"] | None = None,
-) -> Forecast:
-    """Predict each row given those before it: states, outputs and what arrives, at rows where nothing arrived too.
-
-    Args:
-        filter: a filter.
-        z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
-        u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
-
-    Returns:
-        A forecast one step ahead whose horizons are the rows: `received.mean[k]` is E[z_k | z_0 ... z_(k-1)].
-
-    Raises:
-        ValueError: data of another size than the filter's, no rows.
-    """
-    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    rows, inputs = check_data(filter, z, u)
-    if not len(rows):
-        raise fail("measurements", "at least one row", "none")
-    outlook = outlook_of(filter)
-    states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, rows, inputs))
-    angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
-    names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
-    measured = outputs and prediction_of(outputs, tuple(sensor.outputs), output_claim(filter, outlook), sensor.angles)
-    arriving = received and prediction_of(received, names, filter.claim, angles.received)
-    whole = prediction_of(states, filter.states, filter.claim, angles.states)
-    given: InputsAhead = "given" if filter.inputs else "none"
-    return Forecast(np.ones(len(rows), int), np.arange(float(len(rows))), whole, measured, arriving, given)
-
-
-def _predict_each_row(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
-    """Filter a recording; return the moments predicted for each row from those before it."""
-
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        k, z_k, u_k = row
-        prior, moments = outlook.step(state, u_k, k)
-        return outlook.filter.correct(prior, z_k, k)[0], moments
-
-    start = jax.tree.map(jnp.asarray, outlook.filter.init())
-    return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
-
-
-_by_xla = quickly_compiled(_predict_each_row)
 
 
 @readable

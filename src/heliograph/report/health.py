@@ -74,6 +74,7 @@ class Health:
     shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
     beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
     forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
+    predicted: Forecasts = field(default_factory=dict)  # of each row, by node and filter, where it was asked for
     off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
     apart: ConstantError | None = None  # of one node against the others, which filter by themselves
 

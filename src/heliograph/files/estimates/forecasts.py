@@ -21,18 +21,18 @@ FORECAST = "forecast"  # the column that marks rows, and what stands before the 
 ByFilter = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by node and filter
 
 
-def forecast_columns(record: Record, forecasts: ByFilter) -> dict[str, np.ndarray]:
+def forecast_columns(record: Record, forecasts: ByFilter, predicted: ByFilter | None = None) -> dict[str, np.ndarray]:
     """Return the columns of the estimates with rows of forecasts below them, in which `forecast` is true.
 
     What each sensor would measure stands in the columns forecast.OUTPUT and forecast.OUTPUT.sd, named after node and
-    filter as the states are; NaN in rows of data.
+    filter as the states are; NaN in rows of data. What was `predicted` of those is NaN in rows of forecasts.
     """
     one = next(forecast for filters in forecasts.values() for forecast in filters.values())
     estimates = {
         node: {name: Estimate(f.states.mean, f.states.covariance, f.states.claim) for name, f in filters.items()}
         for node, filters in forecasts.items()
     }
-    above = estimate_columns(record)
+    above = estimate_columns(record, predicted)
     below = estimate_columns(replace(record, time=one.time, truth=None, estimates=estimates, smoothed=None))
     columns = {name: _joined(values, below.get(name), len(one.time)) for name, values in above.items()}
     ahead = np.arange(len(record.time) + len(one.time)) >= len(record.time)
@@ -45,7 +45,7 @@ def forecast_columns(record: Record, forecasts: ByFilter) -> dict[str, np.ndarra
     return columns
 
 
-def write_forecast(record: Record, forecasts: ByFilter, path: str | Path) -> None:
+def write_forecast(record: Record, forecasts: ByFilter, path: str | Path, predicted: ByFilter | None = None) -> None:
     """Write the estimates of a run, and forecasts in rows below them, to a CSV or Parquet file, whole or not at all.
 
     Rows of forecasts have 1 in the column `forecast`; what each sensor would measure stands in forecast.OUTPUT and
@@ -55,6 +55,7 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path) -> Non
         record: the result of `run`.
         forecasts: what `forecast` returned for it.
         path: the file, ending in .csv or .parquet.
+        predicted: what was predicted of each row of data, as of `write_estimates`; None by default.
 
     Raises:
         ValueError: no record, no forecast, another format, or a folder that cannot be written.
@@ -65,7 +66,7 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path) -> Non
         raise fail("forecasts", "those of `forecast`, by node and filter", show_value(forecasts))
     if not forecasts:
         raise fail("forecasts", "one at least", "none")
-    write_table(forecast_columns(record, forecasts), path)
+    write_table(forecast_columns(record, forecasts, predicted), path)
 
 
 def _joined(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:

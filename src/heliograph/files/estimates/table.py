@@ -3,17 +3,24 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from heliograph.files.table import TIME, write_table
 from heliograph.model.estimate import Estimate, is_sound
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.check import fail, instance, show_value
+from heliograph.numerics.types import units_in
 from heliograph.simulation.results.record import Record
 
+if TYPE_CHECKING:
+    import heliograph
 
-def estimate_columns(record: Record) -> dict[str, np.ndarray]:
-    """Return the estimates of a recording as columns."""
+Predicted = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by node and filter
+
+
+def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict[str, np.ndarray]:
+    """Return the estimates of a recording as columns, with what was predicted of each row where it is given."""
     columns = [(TIME, record.time)]
     several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
     for node, filters in record.estimates.items():
@@ -24,25 +31,35 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
             if name in later:
                 known = _make_columns(record.states, record.units, later[name])
                 columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in known]
+            if predicted is not None and name in predicted.get(node, {}):
+                known = _make_predicted_columns(predicted[node][name], record)
+                columns += [(f"{prefix}predicted.{key}", values) for key, values in known]
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
         raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")
     return dict(columns)
 
 
-def write_estimates(record: Record, path: str | Path) -> None:
+def write_estimates(record: Record, path: str | Path, predicted: Predicted | None = None) -> None:
     """Write `estimate_columns` to a CSV or Parquet file, as a whole or not at all; in CSV, valid is 1 or 0.
 
     Args:
         record: the result of `run`.
         path: the file, ending in .csv or .parquet.
+        predicted: what `hg.forecasting.predict_record` returned for the record: of each row what was predicted of it
+            from those before, as columns predicted.STATE and predicted.output.OUTPUT with their deviations (.sd);
+            None by default.
 
     Raises:
-        ValueError: another format, or a folder that cannot be written.
+        ValueError: another format, a folder that cannot be written, predictions of other rows.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     instance("record", record, Record, "a Record")
-    write_table(estimate_columns(record), path)
+    if predicted is not None and not (
+        isinstance(predicted, Mapping) and all(isinstance(filters, Mapping) for filters in predicted.values())
+    ):
+        raise fail("predicted", "what predict_record returns, by node and filter", show_value(predicted))
+    write_table(estimate_columns(record, predicted), path)
 
 
 def make_header(name: str, unit: str | None) -> str:
@@ -72,6 +89,24 @@ def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Est
     if estimate.modes is not None:
         columns += [(f"mode.{i}", values) for i, values in enumerate(np.asarray(estimate.modes).T)]
     return [*columns, ("valid", is_sound(estimate))]
+
+
+def _make_predicted_columns(
+    predicted: "heliograph.forecasting.Forecast", record: Record
+) -> list[tuple[str, np.ndarray]]:
+    """Return the columns of what was predicted of each row: means, and deviations where there is a claim."""
+    parts = [("", predicted.states, record.units)]
+    if predicted.outputs is not None:
+        parts.append(("output.", predicted.outputs, units_in(predicted.outputs.names)))
+    columns = []
+    for prefix, law, units in parts:
+        if len(law.mean) != len(record.time):
+            raise fail("predicted", f"{len(record.time)} rows, as the record has", f"{len(law.mean)} rows")
+        for i, name in enumerate(law.names):
+            columns.append((prefix + make_header(name, units.get(name)), law.mean[:, i]))
+            if law.claim != "none":
+                columns.append((prefix + make_header(f"{name}.sd", units.get(name)), law.deviation[:, i]))
+    return columns
 
 
 def _pad_start(values: np.ndarray, rows: int) -> np.ndarray:

@@ -29,6 +29,7 @@ from heliograph.report.innovations import (
 )
 from heliograph.report.outputs import compare_with_truth, round_to
 from heliograph.report.pages.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.predicted import predicted_figures, predicted_sections
 from heliograph.report.pages.run_summary import run_summary
 from heliograph.report.position_map import coordinates_of, draw_position_map
 from heliograph.report.results import Json, Results, write_into
@@ -98,6 +99,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
     for kind, record in _collect_estimates(health):
         drawn |= {f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_nodes_to_draw(record))}
     drawn |= {name: draw_innovations(health, tested) for name, tested in tested_by_figure(health).items()}
+    drawn |= predicted_figures(health)
     if health.links:
         drawn["links"] = _draw_deliveries(health)
     return drawn
@@ -194,6 +196,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
             ),
             Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
             *([Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []),
+            *predicted_sections(health, drawings),
             make_innovations_section(health, drawings),
             Section("Links", _make_links_section(health, drawings)),
         ],

@@ -1,0 +1,71 @@
+"""Part of a run's report on its predictions: what each filter expected of each row, beside what arrived."""
+
+from collections.abc import Mapping
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.report.figures import INK, place_legend_above, stacked_panels
+from heliograph.report.health import Health
+from heliograph.report.innovations import BAND, COLOURS, LOOK, MOST, choose_picture, label_time_axis, say_not_drawn
+from heliograph.report.pages.page import Picture, Section, Text
+
+PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
+
+
+def predicted_figures(health: Health) -> dict[str, Figure]:
+    """Return a figure for each node whose filters predict what arrives, by file name; none unless asked for."""
+    return {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_nodes(health)[:MOST])}
+
+
+def predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
+    """Return the section of the page with these figures; none unless predictions were asked for."""
+    if not health.predicted:
+        return []
+    nodes = _list_nodes(health)
+    places = {node: f"predicted_{i}" for i, node in enumerate(nodes[:MOST])}
+    pictures = {
+        node: Picture(drawings[name], f"What filters of {visible(node)} predicted, and what arrived",
+                      f"{visible(node)}: predictions of what arrives, with bands of {BAND:g} claimed deviations on "
+                      "each side, and the data.")
+        for node, name in places.items() if name in drawings
+    }  # fmt: skip
+    text = (
+        "What each filter expected of a row, given the rows before it: also where nothing arrived. Of what arrived, "
+        "95 of 100 should lie in the band of a filter whose claim is exact."
+    )
+    left = [node for node in nodes if node not in pictures]
+    missing = say_not_drawn(left, "Their predictions are in the table of estimates.")
+    return [Section("Predictions", [Text([text]), *choose_picture(pictures), *missing])]
+
+
+def _list_nodes(health: Health) -> list[str]:
+    """Return the nodes that have a filter which predicts what arrives."""
+    return [
+        node
+        for node, filters in health.predicted.items()
+        if any(forecast.received is not None for forecast in filters.values())
+    ]
+
+
+@matplotlib.rc_context(LOOK)
+def _draw_predicted(health: Health, node: str) -> Figure:
+    """Draw what filters of a node predicted of each number that arrives, with bands and the data, a panel each."""
+    record, filters = health.record, health.predicted[node]
+    laws = {name: forecast.received for name, forecast in filters.items() if forecast.received is not None}
+    names = next(iter(laws.values())).names
+    z = record.measurements.get(node)
+    data = np.concatenate(list(record.measurements.values()), axis=1) if z is None else z
+    figure, panels = stacked_panels(min(len(names), PANELS), 1.7, 0.8)
+    for i, panel in enumerate(panels):
+        for (name, law), colour in zip(laws.items(), COLOURS, strict=False):
+            mean, band = law.mean[:, i], BAND * law.deviation[:, i]
+            panel.plot(record.time, mean, color=colour, linewidth=1.2, label=quote_for_figure(name))
+            panel.fill_between(record.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+        panel.plot(record.time, data[:, i], ".", markersize=3, color=INK, label="data")
+        panel.set_ylabel(quote_for_figure(names[i]))
+    place_legend_above(figure, panels[0])
+    label_time_axis(record, panels[-1])
+    return figure
