@@ -55,6 +55,10 @@ class ServeOptions:
     forecast: Annotated[
         str, Parameter(help="How far ahead forecasts are published beside estimates: 5s,1min, or steps.")
     ] = ""
+    threshold: Annotated[
+        list[str] | None,
+        Parameter(help="Of --forecast: a level whose passing has its probability, as level>30; again.", negative=""),
+    ] = None
     states: Annotated[
         str | None, Parameter(help="mqtt://host:port/topic: a retained topic for each state, of the newest estimates.")
     ] = None
@@ -73,6 +77,7 @@ class ServeOptions:
         from heliograph.numerics.times.dates import horizons_in
         from heliograph.serving.brokers.url import parse_address
         from heliograph.serving.settings import ServiceSettings, name_of, settings_of_node, store_of
+        from heliograph.serving.thresholds import parse_threshold
 
         broker = None if self.broker is None else parse_address(self.broker)
         options = Options(self.window, self.ahead, self.leap)
@@ -95,6 +100,7 @@ class ServeOptions:
             accept_changes=self.accept_changes,
             every=self.every,
             forecast=horizons_in(self.forecast) if self.forecast else None,
+            thresholds=tuple(map(parse_threshold, self.threshold or ())),
             states=self._read_states(),
         )
         return settings if self.node is None else settings_of_node(settings, self.node)

@@ -18,6 +18,10 @@ from .output import (
     Output as Output,
     Refused as Refused,
 )
+from .thresholds import (
+    Threshold as Threshold,
+    parse_threshold as parse_threshold,
+)
 from .storage.store_protocol import (
     AwayError as AwayError,
     InMemoryStore as InMemoryStore,

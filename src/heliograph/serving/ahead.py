@@ -11,6 +11,7 @@ from heliograph.live.row_origin import make_row_origin
 from heliograph.live.rows import HeldRow
 from heliograph.model.origin import Origin
 from heliograph.numerics.check import fail, show_value
+from heliograph.serving.thresholds import Thresholds, check_names, find_crossings
 
 Spans = int | list[float | np.timedelta64 | np.datetime64]  # how far ahead, as `horizons_in` reads it
 SECOND = np.timedelta64(1, "s")
@@ -29,12 +30,16 @@ class ForecastPublisher:
     Args:
         fleet: the plants.
         horizons: a number of steps, or spans of time, as `horizons_in` reads them.
+        thresholds: levels of which the probability to pass them is said; none by default.
 
     Raises:
-        ValueError: a number of steps of a plant whose time is continuous, dates, spans that are no whole steps.
+        ValueError: a level of what is no state or output; a number of steps of a plant whose time is continuous,
+            dates, spans that are no whole steps.
     """
 
-    def __init__(self, fleet: Fleet, horizons: Spans):
+    def __init__(self, fleet: Fleet, horizons: Spans, thresholds: Thresholds = ()):
+        check_names(fleet.network, thresholds)
+        self._thresholds = thresholds
         self._fleet, self._continuous = fleet, fleet.program.dt is not None
         if isinstance(horizons, int):
             if self._continuous:
@@ -58,21 +63,55 @@ class ForecastPublisher:
             raise fail("--forecast", f"whole steps of {step:g} s", f"{seconds:g} s")
         return int(seconds // step)
 
-    def forecasts(self, row: HeldRow) -> list[tuple[float, dict[str, dict[str, object]]]]:
-        """Return the time of each horizon behind a row, and what each filter says; nothing behind the last step."""
+    def forecasts(self, row: HeldRow) -> list[tuple[float, float, dict[str, dict[str, object]]]]:
+        """Return of each horizon its time, how far ahead it is, and what each filter says; none behind the last step.
+
+        How far: in seconds where the messages have dates, else in the unit of their time.
+        """
         now = float(row.key[0])
         start = ForecastStart(make_row_origin(self._fleet, row.slot, now))
         if not self._continuous and start.origin.step + max(self.horizons) - 1 > self._fleet.end_step:
             return []
         found = heliograph.forecast(start, self.horizons, inputs="held")
         assert isinstance(found, dict)  # of a network
+        said = {
+            (node, name): _write_forecasts(forecast, self._pass_levels(start, (node, name), forecast))
+            for node, filters in found.items()
+            for name, forecast in filters.items()
+        }
+        unit = 1.0 if self._continuous else self._fleet.options.step or 1.0
         return [
             (
                 now + distance,
-                {node: {name: _write_forecast(f, i) for name, f in filters.items()} for node, filters in found.items()},
+                distance * unit,
+                {node: {name: said[node, name][i] for name in filters} for node, filters in found.items()},
             )
             for i, distance in enumerate(self.horizons)
         ]
+
+    def _pass_levels(
+        self, start: ForecastStart, place: tuple[str, str], forecast: "heliograph.forecasting.Forecast"
+    ) -> dict[str, list[dict[str, float]]]:
+        """Return by level the probabilities that it is passed, at each horizon; of levels that the filter knows."""
+        outputs = () if forecast.outputs is None else forecast.outputs.names
+        known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
+        return {
+            str(threshold): find_crossings(start, place, threshold, self.horizons, not self._continuous)
+            for threshold in self._thresholds
+            if threshold.name in known
+        }
+
+
+def _write_forecasts(
+    forecast: "heliograph.forecasting.Forecast", crossings: dict[str, list[dict[str, float]]]
+) -> list[dict[str, object]]:
+    """Return what one filter says of each horizon, as it is published, with the probabilities to pass levels."""
+    bodies = [_write_forecast(forecast, i) for i in range(len(forecast.steps))]
+    if not crossings:
+        return bodies
+    return [
+        body | {"thresholds": {level: said[i] for level, said in crossings.items()}} for i, body in enumerate(bodies)
+    ]
 
 
 def _write_forecast(forecast: "heliograph.forecasting.Forecast", i: int) -> dict[str, object]:

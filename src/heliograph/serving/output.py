@@ -100,6 +100,20 @@ class OutputAhead(BaseModel):
     deviation: float | None
 
 
+class Passing(BaseModel):
+    """Probabilities that a level is passed, from drawn paths.
+
+    Args:
+        then: that the number is beyond the level at the horizon.
+        by: that it has been so at the horizon or any step before; where time is continuous, at an earlier horizon.
+        by_error: standard error of the drawing of `by`.
+    """
+
+    then: float
+    by: float
+    by_error: float
+
+
 class FilterAhead(BaseModel):
     """Forecast of one filter at one horizon; null stands for a number that is not finite.
 
@@ -108,12 +122,14 @@ class FilterAhead(BaseModel):
         covariance: n rows of n numbers; null if the filter claims no covariance.
         claim: what the covariance is: exact, upper, nominal or none.
         outputs: what the filter's sensor would measure, by name; left out where it is not known.
+        thresholds: by level, as level>30, the probabilities that it is passed; left out unless asked for.
     """
 
     mean: list[float | None]
     covariance: list[list[float | None]] | None
     claim: Claim
     outputs: dict[str, OutputAhead] = {}
+    thresholds: dict[str, Passing] = {}
 
 
 class Horizon(BaseModel):
@@ -121,10 +137,12 @@ class Horizon(BaseModel):
 
     Args:
         time: of the horizon: steps, seconds or an ISO 8601 date.
+        ahead: how far it is, in seconds, or steps of messages without dates.
         estimates: of each filter, by node and filter.
     """
 
     time: float | str
+    ahead: float
     estimates: dict[str, dict[str, FilterAhead]]
 
 

@@ -208,7 +208,8 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, look:
     with signals(stop), contextlib.ExitStack() as owning:
         # The store first, whose state the service goes on from.
         store = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet, owning), stop)
-        resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every, settings.forecast)
+        ahead = settings.forecast, settings.thresholds
+        resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every, *ahead)
         try:
             service.resume()
             broker = settings.broker
@@ -292,7 +293,8 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, look
         # The journal of a part continues with whichever process serves it.
         store = Store(store_name, mine, f"part {number} of {parts}", opened=first)
         try:
-            service = look(Service(Fleet(program, settings.options), store, _say))
+            ahead = settings.forecast, settings.thresholds
+            service = look(Service(Fleet(program, settings.options), store, _say, None, *ahead))
             await serve_until(stop, WaitingService(service, stop), make_transport(broker, Part(number, parts)))
         finally:
             store.close()

@@ -27,6 +27,7 @@ from heliograph.serving.message import AnyMessage, Message, Payload, Read, Unrea
 from heliograph.serving.output import Output
 from heliograph.serving.silence import Silence, find_dead_senders
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
+from heliograph.serving.thresholds import Thresholds
 
 LARGE, MILLION = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
 ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store
@@ -69,6 +70,7 @@ class Service:
         every: seconds after which the estimate of a plant whose senders are silent is published again although it has
             hardly changed; None for never.
         forecast: how far ahead provisional estimates are accompanied by forecasts; None for not at all.
+        thresholds: levels of which forecasts have the probability that they are passed; none by default.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class Service:
         say: Callable[[str], None] | None = None,
         every: float | None = None,
         forecast: Spans | None = None,
+        thresholds: Thresholds = (),
     ):
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
@@ -86,7 +89,7 @@ class Service:
         self._writer, self._using = EstimateWriter(fleet.program), Using(fleet, self.plants)
         self._exchange, self._silence = Exchange(fleet, self._time_in_messages), Silence(fleet, every)
         self._angles, self._doubt = FleetAngles(fleet), say
-        self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast)
+        self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
@@ -311,8 +314,8 @@ class Service:
         self._silence.note_published(rows)
         for (plant, row), body in zip(rows, self._write_estimates(b"provisional", rows), strict=True):
             if self._ahead is not None:
-                ahead = [{"time": self._time_in_messages(plant, time), "estimates": estimates}
-                         for time, estimates in self._ahead.forecasts(row)]  # fmt: skip
+                ahead = [{"time": self._time_in_messages(plant, time), "ahead": distance, "estimates": estimates}
+                         for time, distance, estimates in self._ahead.forecasts(row)]  # fmt: skip
                 body = b'%b,"forecast":%b}' % (body[:-1], line(ahead))
             if self.fleet.deciding:
                 senders = {name: status._asdict() | {"dead": status.dead}

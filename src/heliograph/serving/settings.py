@@ -12,6 +12,7 @@ from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.serving.ahead import Spans
 from heliograph.serving.brokers.transport import encode_name
 from heliograph.serving.brokers.url import Address
+from heliograph.serving.thresholds import Thresholds
 from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
 
@@ -46,6 +47,7 @@ class ServiceSettings:
             hardly changed; None for never.
         states: where single states are published beside the outputs; None for nowhere.
         forecast: how far ahead forecasts are published beside provisional estimates; None for not at all.
+        thresholds: levels of which forecasts have the probability that they are passed; none by default.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -68,6 +70,7 @@ class ServiceSettings:
     accept_changes: bool = False
     every: float | None = None
     forecast: Spans | None = None
+    thresholds: Thresholds = ()
     states: "StateTopics | None" = None
 
     def __post_init__(self) -> None:
@@ -76,6 +79,8 @@ class ServiceSettings:
             raise fail("--host", "a page for this host name (--page PORT)", "none")
         if self.every is not None:
             scalar("--every", self.every, TINY)
+        if self.thresholds and self.forecast is None:
+            raise fail("--threshold", "how far ahead (--forecast 5s,1min)", "no --forecast")
         if self.snapshot is not None:
             if self.store is None:
                 raise fail("--from-snapshot", "a store to begin in (--store FILE)", "none")

@@ -28,6 +28,8 @@ ALERTS = (  # name, expression, for how long, what is said
      "more than a tenth of the messages of {{ $labels.node }} are late, implausible or contradict others"),
     ("HeliographMalformed", "increase(heliograph_malformed_total[10m]) > 0", "1m",
      "messages that cannot be read: the refused lines say why"),
+    ("HeliographPassing", "heliograph_plant_passing > 0.9", "1m",
+     "{{ $labels.plant }} passes {{ $labels.threshold }} by {{ $labels.ahead }} ahead, with probability {{ $value }}"),
     ("HeliographSilent", "sum by (job, instance) (rate(heliograph_messages_total[10m])) == 0", "10m",
      "no message comes any more"),
     ("HeliographBehind", "histogram_quantile(0.99, rate(heliograph_lag_seconds_bucket[10m])) > 60", "10m",

@@ -48,6 +48,7 @@ class Tallies(Collector):
         yield from _collect_nis(self.watch)
         yield from _collect_outputs(self.watch)
         yield from _yield_plant_metrics(self.watch)
+        yield _collect_passing(self.watch)
         yield _count_doubted_fused(self.watch)
         yield _collect_dead_senders(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
@@ -78,6 +79,16 @@ def _yield_plant_metrics(watch: Watch) -> Iterable[Metric]:
         for node in item.dead:
             dead.add_metric([item.plant, node], 1.0)
     return wrong, *families, dead
+
+
+def _collect_passing(watch: Watch) -> Metric:
+    """Return the metric of levels that may be passed, of the plants in which that is most probable."""
+    what = "Probability that a level of --threshold is passed by so far ahead."
+    labels = ["plant", "node", "filter", "threshold", "ahead"]
+    passing = GaugeMetricFamily("heliograph_plant_passing", what, labels=labels)
+    for key, probability in watch.passing(SHOWN):
+        passing.add_metric(list(key), probability)
+    return passing
 
 
 def _collect_links(watch: Watch) -> Iterable[Metric]:

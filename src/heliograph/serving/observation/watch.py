@@ -101,6 +101,7 @@ class Watch:
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self.totals, self._overview, self._dead = Totals(), Overview(), dict[str, list[str]]()
+        self._passing: OrderedDict[str, dict[tuple[str, ...], float]] = OrderedDict()
         self._begun: float | None = None  # of the batch that is being taken
         self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
         self.registry = CollectorRegistry()
@@ -143,6 +144,8 @@ class Watch:
             if output.kind in ("provisional", "final"):
                 message = from_json(output.body)
                 self._keep_point(output.plant, message)
+                if message["kind"] == "provisional":
+                    self._keep_passing(output.plant, message.get("forecast", []))
                 if output.kind == "final":
                     self._test_claims(output.plant, message["estimates"])
 
@@ -175,6 +178,28 @@ class Watch:
             self._dead[plant] = [node for node, sender in message["senders"].items() if sender["dead"]]
             if not self._dead[plant]:
                 del self._dead[plant]
+
+    def _keep_passing(self, plant: str, horizons: Sequence[Mapping[str, Any]]) -> None:
+        """Keep the probabilities that a plant's levels are passed, by node, filter, level and how far ahead."""
+        passing: dict[tuple[str, ...], float] = {
+            (node, name, level, f"{horizon['ahead']:g}"): said["by"]
+            for horizon in horizons
+            for node, filters in horizon["estimates"].items()
+            for name, body in filters.items()
+            for level, said in body.get("thresholds", {}).items()
+        }
+        self._passing.pop(plant, None)
+        if passing:
+            _move_to_newest(self._passing, plant, dict).update(passing)
+
+    def passing(self, most: int) -> list[tuple[tuple[str, ...], float]]:
+        """Return the probabilities of levels to be passed, by plant, node, filter, level and how far ahead.
+
+        Of so many plants, those in which one is most probable.
+        """
+        with self._noting:
+            first = sorted(self._passing, key=lambda plant: -max(self._passing[plant].values()))[:most]
+            return [((plant, *key), value) for plant in first for key, value in self._passing[plant].items()]
 
     def plants(self) -> Iterator[tuple[str, WatchedPlant]]:
         """Yield all plants of all services."""

@@ -1,0 +1,92 @@
+"""Levels of which a service publishes the probability that they are passed, as they are typed: level>30, flow<600."""
+
+import re
+from typing import NamedTuple
+
+from typing_extensions import TypeAliasType
+
+import heliograph
+from heliograph.model.modes_of_motion import ModalPlant
+from heliograph.model.origin import HasOrigin
+from heliograph.model.over_time import first
+from heliograph.numerics.check import fail, show_value
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+DRAWS = 2000  # paths for each probability, whose standard error is then 1.1 % at most
+TYPED = re.compile(r"\s*(?P<name>.+?)\s*(?P<sign>[<>])\s*(?P<level>[-+.\deE]+)\s*")
+
+
+class Threshold(NamedTuple):
+    """A level of a state or an output, for whose passing a service publishes the probability.
+
+    Args:
+        name: of the state or output.
+        level: what is passed.
+        above: whether beyond is above it.
+    """
+
+    name: str
+    level: float
+    above: bool
+
+    def __str__(self) -> str:
+        return f"{self.name}{'>' if self.above else '<'}{self.level:g}"
+
+
+Thresholds = TypeAliasType("Thresholds", tuple[Threshold, ...])
+
+
+def parse_threshold(text: str) -> Threshold:
+    """Read a level as it is typed.
+
+    Args:
+        text: a name, a sign and a number, as level>30 or flow<600.
+
+    Raises:
+        ValueError: what is no name, sign and number.
+    """
+    typed = TYPED.fullmatch(text) if isinstance(text, str) else None
+    try:
+        return Threshold(typed["name"], float(typed["level"]), typed["sign"] == ">")  # type: ignore[index]
+    except (TypeError, ValueError):
+        raise fail(
+            "--threshold", "a state or output and its level, as level>30 or flow<600", show_value(text)
+        ) from None
+
+
+def check_names(network: Network, thresholds: Thresholds) -> None:
+    """Refuse a level of what is no state of the network and no output of its sensors, and any of a plant of modes.
+
+    Raises:
+        ValueError: such a level.
+    """
+    if thresholds and isinstance(first(network.plant), ModalPlant):
+        raise fail("--threshold", "a plant of one law of motion, whose paths can be drawn", "a markov_plant")
+    sensors = [first(node.sensor) for node in network.nodes.values() if isinstance(node, Node)]
+    known = dict.fromkeys([*network.states, *(output for sensor in sensors for output in sensor.outputs)])
+    for threshold in thresholds:
+        if threshold.name not in known:
+            raise fail("--threshold", f"a state or output: {', '.join(known)}", repr(threshold.name))
+
+
+def find_crossings(
+    source: HasOrigin, place: tuple[str, str], threshold: Threshold, horizons: list[float], whole: bool
+) -> list[dict[str, float]]:
+    """Return at each horizon the probabilities that a level is passed then, and by then, as they are published.
+
+    Args:
+        source: where the forecast starts.
+        place: node and filter.
+        threshold: the level.
+        horizons: how far ahead, in steps or in the unit of dt.
+        whole: whether horizons are steps; every step up to the last is then looked at, else the horizons alone.
+    """
+    ahead = int(horizons[-1]) if whole else horizons
+    found = heliograph.forecasting.crossing(
+        source, *threshold[:2], ahead, threshold.above, "held", DRAWS, node=place[0], filter=place[1]
+    )
+    rows = [int(horizon) - 1 for horizon in horizons] if whole else range(len(horizons))
+    return [
+        {"then": float(found.beyond[i]), "by": float(found.by[i]), "by_error": float(found.by_error[i])} for i in rows
+    ]
