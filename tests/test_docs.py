@@ -11,6 +11,8 @@ import matplotlib
 import matplotlib.pyplot as plt
 import pytest
 
+from heliograph import cli
+
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 GALLERY = sorted((ROOT / "docs" / "gallery").glob("*.py"))
@@ -24,7 +26,12 @@ def test_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # some write files
     scope = {}
     for block in BLOCK.findall(page.read_text()):
-        exec(compile(block, page.name, "exec"), scope)
+        try:
+            exec(compile(block, page.name, "exec"), scope)
+        except ModuleNotFoundError as error:
+            if error.name not in cli.EXTRAS:
+                raise
+            pytest.skip(f"{error.name}: the extra `{cli.EXTRAS[error.name]}`")
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ def inspect(
     network: Annotated[
         str, Parameter(help="Its nodes and inputs are listed: my_network.py, or my_network.py:name.")
     ] = "",
+    dbc: Annotated[Path | None, Parameter(help="Database of the bus of a log of CAN: car.dbc.")] = None,
     seconds: Annotated[float, Parameter(help="How long to listen to a broker.")] = 10.0,
 ) -> None:
     """List the topics of a bag, a file or a broker: rates, gaps, lateness, and `sources` to paste into a network.
@@ -24,8 +25,8 @@ def inspect(
     Parameters
     ----------
     recording:
-        A bag (.mcap, .db3, .bag, or a folder), a file of messages (lines of JSON, a log, a table), or the URL of a
-        broker: mqtt://, nats:// or opc.tcp://.
+        A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg), a file of messages (lines of
+        JSON, a log, a table), or the URL of a broker: mqtt://, nats:// or opc.tcp://.
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.inspection import suggest_sources
@@ -39,7 +40,7 @@ def inspect(
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
     # What there is, and what to paste.
-    topics, broken = _collect_topics(recording, seconds)
+    topics, broken = _collect_topics(recording, seconds, dbc)
     _print_table(topics)
     if topics:
         print(suggest_sources(topics, names))
@@ -47,9 +48,10 @@ def inspect(
         print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)
 
 
-def _collect_topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
+def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, Topic], str]":
     """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
-    from heliograph.files.inspection import inspect_bag, inspect_file
+    from heliograph.files.inspection import inspect_bag, inspect_file, inspect_log
+    from heliograph.files.logs.log import is_log
     from heliograph.files.message_files import LINES
     from heliograph.files.text.text_file import kind_of
     from heliograph.report.progress import progress
@@ -65,6 +67,9 @@ def _collect_topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], 
         if path.is_file() and kind_of(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")
             return inspect_file(path)
+        if is_log(path):
+            advance(f"reading {recording}")
+            return inspect_log(path, dbc)
         return inspect_bag(path, lambda done, total: advance(f"reading {recording}", done, total))
 
 

@@ -137,6 +137,7 @@ def read_events(
 ) -> "EventTable | None":
     """Read the messages of a bag, a file or a store; None for rows of time."""
     from heliograph.files.bags.bag import is_bag
+    from heliograph.files.logs.log import is_log
     from heliograph.files.messages import is_mapped
     from heliograph.files.messages import read_events as read_mapped
     from heliograph.numerics.check import fail
@@ -144,7 +145,7 @@ def read_events(
     sources = module.get("sources")
     if not is_mapped(path, sources):
         return None
-    if sources is None and isinstance(path, Path) and is_bag(path):
+    if sources is None and isinstance(path, Path) and (is_bag(path) or is_log(path)):
         hint = f"heliograph inspect {path} --network {reference} suggests them"
         raise fail(f"network {reference}", f"sources, for the topics of {path} ({hint})", "none")
 

@@ -52,11 +52,12 @@ def run(
     """Run the filters of your own network over measured data.
 
     A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
-    A bag (.mcap, .db3, .bag, or a folder), a log or a table of somebody else's making is events too, by the `sources`
-    of the network's file. The estimates are those of the events that a timeline uses, in the order of measuring; with
-    --lag, those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT, and
-    a page of its own behind the report's overview, which has the most doubted first; in a store each has its name in
-    the column `plant`, and those of a lag go to the table TABLE_lagged.
+    A bag (.mcap, .db3, .bag, or a folder), a vehicle's log (.mf4, .blf, .asc, .ulg), a log or a table of somebody
+    else's making is events too, by the `sources` of the network's file. The estimates are those of the events that a
+    timeline uses, in the order of measuring; with --lag, those of a lag later go to a second file, OUT.lagged. Of
+    several plants each has a file, OUT.PLANT, and a page of its own behind the report's overview, which has the most
+    doubted first; in a store each has its name in the column `plant`, and those of a lag go to the
+    table TABLE_lagged.
 
     Parameters
     ----------
@@ -348,12 +349,14 @@ def _claim(estimate: "Estimate") -> str:
 def _check_places(measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None) -> None:
     """Check before the work starts that files can be read and written, and that what that takes is installed."""
     from heliograph.disk.whole_file import FORMATS, check_output
+    from heliograph.files.logs.log import PACKAGES
     from heliograph.numerics.check import fail
     from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results import NEEDS
 
     kinds = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
-    needs = [*(["rosbags"] if kinds & BAGS else []), *(["pyarrow"] if ".parquet" in kinds else [])]
+    needs = [package for kind in kinds & PACKAGES.keys() for package in PACKAGES[kind]]
+    needs += [*(["rosbags"] if kinds & BAGS else []), *(["pyarrow"] if ".parquet" in kinds else [])]
     check_installed([*needs, *(NEEDS if report is not None else ())])
     if isinstance(out, StoreAddress):
         from heliograph.files.stores.tables import check_store

@@ -30,6 +30,9 @@ from .json_field import (
     Stamp as Stamp,
     json_field as json_field,
 )
+from .logs.log_sources import (
+    LogSources as LogSources,
+)
 from .lorawan import (
     chirpstack as chirpstack,
     the_things_stack as the_things_stack,

@@ -13,6 +13,8 @@ import numpy as np
 from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
 from heliograph.files.fields import TimeUnit, convert_time, decode_json, parse_arrival
+from heliograph.files.logs.log_sources import LogSources
+from heliograph.files.logs.reading import open_log
 from heliograph.files.message_files import decode_payload, is_message_file, message_name, read_message_file
 from heliograph.numerics.check import InputError, fail, show_error
 from heliograph.numerics.times.dates import UNITS, looks_like_date
@@ -50,6 +52,8 @@ class Topic:
         dates: by dotted path the dates in the messages, in nanoseconds since 1970, and how late these are.
         units: by dotted path the unit of dates that are numbers.
         messages: how many there were.
+        bits: by dotted path the bits of a whole number, where the file says them.
+        measured_in: by dotted path the unit of its values, where the file names one.
     """
 
     kind: str
@@ -60,6 +64,8 @@ class Topic:
     dates: "dict[str, tuple[array[int], array[float]]]" = field(default_factory=dict)
     units: dict[str, TimeUnit] = field(default_factory=dict)
     messages: int = 0
+    measured_in: dict[str, str] = field(default_factory=dict)
+    bits: Mapping[str, int] = field(default_factory=dict)
 
     def choose_time(self) -> None:
         """Take for the time of the messages the first date that is not the same in all of them, or else the first."""
@@ -191,6 +197,32 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
     return topics, broken
 
 
+def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
+    """Return the messages of a vehicle's log, and the first reason why one cannot be read, "" if all can be.
+
+    Args:
+        path: the log.
+        dbc: database of its bus; None where it needs none, or for the identifiers alone.
+
+    Raises:
+        ValueError: no such file, one that cannot be opened, a database that does not fit; one line.
+    """
+    log = open_log(path, LogSources({}, dbc=dbc), lambda name: True)
+    topics, broken = dict[str, Topic](), ""
+    for message in log.messages:
+        if isinstance(message, InputError):
+            broken = broken or str(message)
+            continue
+        name = str(message.topic)
+        if name not in topics:
+            units = log.units.get(name, {})
+            known = {signal: unit for signal, unit in units.items() if unit}
+            kind, bits = log.kinds.get(name, "CAN, not described"), log.bits.get(name, {})
+            topics[name] = Topic(kind, list(units), measured_in=known, bits=bits)
+        topics[name].logged.append(parse_arrival(message.arrival, message.where))
+    return topics, broken
+
+
 def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) -> str:
     """Return sources to paste into a network's file: a line for each topic that has numbers.
 
@@ -205,14 +237,26 @@ def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[st
         fields = topic.list_measured()
         if not fields:
             continue
-        more = ", ".join(fields[1:FEW]) + (", ..." if len(fields) > FEW else "")
+        others = [f"{path}{_say_unit(topic, path, '')}" for path in fields[1:FEW]]
+        more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
         when = "" if topic.time is None else f", time={topic.time!r}"
         unit = "s" if topic.time is None else topic.units.get(topic.time, "s")
         when += "" if unit == "s" else f", time_unit={unit!r}"
-        when += "" if topic.count is None else f", sequence={topic.count!r}"
-        lines.append(f"    {name!r}: hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{when}),")
+        when += "" if topic.count is None else f", sequence={_describe_count(topic, topic.count)}"
+        source = f"hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{when})"
+        lines.append(f"    {name!r}: {source},{_say_unit(topic, fields[0])}")
         lines += [f"    #   or {more}"] if more else []
     return "\n".join([*lines, "}"])
+
+
+def _describe_count(topic: Topic, path: str) -> str:
+    """Return a running count as a source has it: with its bits, where the file says them."""
+    return f"hg.files.Count({path!r}, bits={topic.bits[path]})" if path in topic.bits else repr(path)
+
+
+def _say_unit(topic: Topic, path: str, mark: str = "  #") -> str:
+    """Return the unit of a field as a comment, "" if the file names none."""
+    return f"{mark} {topic.measured_in[path]}" if path in topic.measured_in else ""
 
 
 def _rank_field(path: str) -> int:

@@ -6,6 +6,8 @@ from pathlib import Path
 from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
 from heliograph.files.fields import parse_arrival
+from heliograph.files.logs.log import is_log
+from heliograph.files.logs.reading import read_log
 from heliograph.files.message_files import (
     TOPIC,
     FileMessage,
@@ -32,7 +34,7 @@ def read_messages(
     strict: bool = False,
     ignore_unknown: bool = False,
 ) -> EventTable:
-    """Read the events of a network from a bag, a file of messages, or a store.
+    """Read the events of a network from a bag, a vehicle's log, a file of messages, or a store.
 
     A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2 or of such files; each event has the
     time of its source and the time when it was logged. A file of messages is CSV or Parquet, of which each row is a
@@ -42,6 +44,9 @@ def read_messages(
     `arrival` or `tst`, beside a payload also in `timestamp`, `time` or `ts` (a date with a zone, or seconds), else at
     its own. Messages in our own form, with node, sequence, time and values, need no sources. Rows of a store, of a URL
     as `read_store` takes it, are messages as rows of CSV are; the topic is the measurement's or the database's name.
+
+    A vehicle's log is BLF (.blf) or ASC (.asc), whose frames a database describes, MDF4 (.mf4) or ULog (.ulg), read by
+    `LogSources`; each message arrives when it was logged.
 
     A message that cannot be read is refused alone: `refused` of the result counts them, `reasons` has the first.
     Where a bag is damaged what came before stays, and `broken` says where.
@@ -57,7 +62,7 @@ def read_messages(
 
     Raises:
         ValueError: no such file, no bag, sources that do not fit the network or the file, nothing that can be read.
-        ModuleNotFoundError: a bag without rosbags (extra "bags").
+        ModuleNotFoundError: a bag without rosbags (extra "bags"), a log without what reads it ("can", "mdf", "ulog").
     """
     source = ask_store(parse_store(str(path))) if is_store(path) else file_path("recording", path)
     return read_events(source, network, sources, progress, strict, ignore_unknown)
@@ -82,6 +87,10 @@ def read_events(
         events = EventTable(network, known.step)
         for part in parts_of(source) or [source]:
             read_bag(part, known, events, progress, strict)
+    elif isinstance(source, Path) and is_log(source):
+        if known is None:
+            raise fail("sources", f"hg.files.LogSources for the messages of {source}", "none")
+        events = _read_log(source, sources, known, strict)
     elif _holds_own_rows(source):
         events = _read_own_table(source, network, strict, ignore_unknown)
     else:
@@ -97,7 +106,7 @@ def is_mapped(path: Path | StoreTable, sources: object) -> bool:
     if isinstance(path, StoreTable):
         named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
         return named or _holds_own_rows(path)
-    if is_bag(path) or holds_events(path) or is_message_file(path):
+    if is_bag(path) or is_log(path) or holds_events(path) or is_message_file(path):
         return True
     if kind_of(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
         return False
@@ -144,6 +153,19 @@ def _map_messages(path: Path | StoreTable, network: Network, sources: Sources | 
     events.broken = broken
     events.refused += own.refused if own.used == 0 else 0
     events.reasons += own.reasons if own.used == 0 else []
+    return events
+
+
+def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> EventTable:
+    """Read the messages of a vehicle's log."""
+    events = EventTable(sources.network, sources.step)
+    for message in read_log(path, table, sources, events.notes):
+        if isinstance(message, CutOffError) and not strict:
+            events.broken = str(message)
+        elif isinstance(message, InputError):
+            events.refuse(message, strict)
+        else:
+            _append_message(path, message, sources, events, strict)
     return events
 
 

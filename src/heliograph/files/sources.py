@@ -79,7 +79,7 @@ class Sources:
     """
 
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
-        self.others = others
+        self.network, self.others = network, others
         self.senders = SeveralSenders()
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber

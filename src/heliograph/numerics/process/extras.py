@@ -36,6 +36,10 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "psycopg": "postgres",
     "rosbags": "bags",
     "asyncua": "opcua",
+    "can": "can",
+    "cantools": "can",
+    "asammdf": "mdf",
+    "pyulog": "ulog",
 }
 
 

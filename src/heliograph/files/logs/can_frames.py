@@ -1,0 +1,205 @@
+"""Frames of a CAN bus, of BLF, ASC and MDF4, to messages with the signals that a database describes."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from heliograph.files.logs.log import DIGITS, Log, Wanted
+from heliograph.files.logs.log_sources import STAMP, LogSources
+from heliograph.files.message_files import FileMessage
+from heliograph.files.text.text_file import CutOffError
+from heliograph.numerics.check import InputError, fail, show_error
+
+if TYPE_CHECKING:
+    from can import Message
+    from can.io.generic import MessageReader
+    from cantools.database.can import Message as Description
+
+LISTED = 8  # identifiers in one line
+Database = dict[tuple[int, bool], "Description"]  # by identifier, and whether it has 29 bits
+
+
+def open_frames(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Open a log of frames; without a database its messages are named by their identifiers and have no signals.
+
+    Raises:
+        ValueError: no database, or one that cannot be read.
+        ModuleNotFoundError: python-can or cantools is not installed (extra "can"), or asammdf (extra "mdf").
+    """
+    database = {} if sources.dbc is None else read_database(sources.dbc)
+    notes = list[str]()
+    units = {m.name: {s.name: s.unit or "" for s in m.signals} for m in database.values()}
+    kinds = {m.name: f"CAN 0x{m.frame_id:x}" for m in database.values()}
+    bits = {m.name: {s.name: s.length for s in m.signals if s.scale == 1 and not s.unit} for m in database.values()}
+    return Log(units, kinds, FrameReader(path, sources, database, wanted, notes).read(), notes, bits)
+
+
+def read_database(path: Path) -> Database:
+    """Return the messages of a database of a bus by their identifiers.
+
+    Raises:
+        ValueError: no such file, or no database of a CAN bus; one line.
+    """
+    from cantools import database
+    from cantools.database.can import Database as CanDatabase
+
+    if not path.is_file():
+        raise fail(str(path), "a database of a CAN bus", "a folder" if path.is_dir() else "nothing of that name")
+    try:
+        # Signals of real databases overlap.
+        loaded: Any = database.load_file(path, strict=False)
+    except Exception as error:  # whatever a damaged file makes a parser do
+        raise fail(str(path), "a database of a CAN bus", show_error(error)) from None
+    if not isinstance(loaded, CanDatabase):
+        raise fail(str(path), "a database of a CAN bus", "one of diagnostics")
+    return {(m.frame_id, m.is_extended_frame): m for m in loaded.messages if not m.is_container}
+
+
+class FrameReader:
+    """Frames to messages; counts what is left out.
+
+    Args:
+        path: the log.
+        sources: the bus's channel, the date of the begin, and the name of the database.
+        database: messages by identifier.
+        wanted: whether a message of a name is decoded.
+        notes: lines on what was left out, appended at the end.
+    """
+
+    def __init__(self, path: Path, sources: LogSources, database: Database, wanted: Wanted, notes: list[str]):
+        self._path, self._sources, self._database, self._wanted, self._notes = path, sources, database, wanted, notes
+        self._decoded, self._longer = Counter[str](), Counter[str]()
+        self._short: dict[str, Counter[int]] = defaultdict(Counter)  # sizes of frames that are too short
+        self._identifiers, self._left = Counter[str](), Counter[str]()
+        self._channels: dict[str, set[object]] = defaultdict(set)
+
+    def read(self) -> Iterator[FileMessage | InputError]:
+        """Yield the messages in the order of the file.
+
+        Raises:
+            ValueError: no frame of a wanted message, frames all of which are too short for it, or of two buses.
+        """
+        for number, item in enumerate(_read_frames(self._path, self._sources), 1):
+            if isinstance(item, InputError):
+                yield item
+                continue
+            frame, moment = item
+            if frame.is_error_frame or frame.is_remote_frame:
+                self._left["error" if frame.is_error_frame else "remote"] += 1
+            elif self._sources.channel in (None, frame.channel):
+                yield from self._decode(frame, moment, f"{self._path}, frame {number}")
+            else:
+                self._left[f"of channel {frame.channel}"] += 1
+        self._check_fit()
+        if self._left:
+            counts = ", ".join(f"{kind} ({count})" for kind, count in self._left.items())
+            self._notes.append(f"{self._path}: frames left out: {counts}")
+        if self._longer:
+            counts = ", ".join(f"{name} ({count})" for name, count in self._longer.items())
+            self._notes.append(f"{self._path}: frames longer than {self._sources.dbc} has them: {counts}")
+
+    def _decode(self, frame: "Message", moment: float, where: str) -> Iterator[FileMessage | InputError]:
+        """Yield the message of a frame, if it is wanted, or why it cannot be read."""
+        described = self._database.get((frame.arbitration_id, frame.is_extended_id))
+        name = f"0x{frame.arbitration_id:x}" if described is None else described.name
+        self._identifiers[f"0x{frame.arbitration_id:x}"] += 1
+        if not self._wanted(name):
+            return
+        content: dict[str, Any] = {}
+        if described is not None:
+            self._check_channel(name, frame.channel)
+            size, length = len(frame.data), described.length
+            where = f"{where}, {name}"
+            if size < length:
+                self._short[name][size] += 1
+                yield fail(where, f"{length} bytes, as {self._sources.dbc} has it", f"{size}")
+                return
+            try:
+                signals: Any = described.decode(bytes(frame.data), decode_choices=False)
+            except Exception as error:  # a multiplexer that the database does not know
+                yield fail(where, f"what {self._sources.dbc} describes", show_error(error))
+                return
+            # Of a multiplexed message the signals that it has not did not arrive.
+            content = dict.fromkeys(signal.name for signal in described.signals) | signals
+            self._longer[name] += size > length
+            self._longer += Counter()
+        self._decoded[name] += 1
+        yield FileMessage(where, name, {STAMP: moment, **content}, moment)
+
+    def _check_channel(self, name: str, channel: object) -> None:
+        """Raise ValueError where a message comes from two buses."""
+        seen = self._channels[name]
+        seen.add(channel)
+        if len(seen) > 1:
+            raise fail(f"{self._path}, {name}", "one bus, which channel= of LogSources names", sorted(map(str, seen)))
+
+    def _check_fit(self) -> None:
+        """Raise ValueError where the database does not fit the frames."""
+        remedy = "another database, or another bus (channel=)?"
+        for name, sizes in self._short.items():
+            if not self._decoded[name]:
+                length = next(m.length for m in self._database.values() if m.name == name)
+                got = f"{sizes.total()} of {', '.join(map(str, sorted(sizes)))}; {remedy}"
+                raise fail(f"{self._path}, {name}", f"frames of {length} bytes, as {self._sources.dbc} has it", got)
+        wanted = [f"{m.name} (0x{m.frame_id:x})" for m in self._database.values() if self._wanted(m.name)]
+        if wanted and not self._decoded:
+            among = f"only {_join(list(self._identifiers))}; {remedy}" if self._identifiers else "no frame at all"
+            if self._sources.channel is not None and not self._identifiers:
+                among = ", ".join(f"frames {kind}" for kind in self._left) or among
+            raise fail(str(self._path), f"a frame of {_join(wanted)}", among)
+
+
+def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, float] | InputError]":
+    """Yield frames with their moments in seconds since 1970; where the file is damaged the last is an error."""
+    number = 0
+    with ExitStack() as stack:
+        try:
+            reader, begin, shift = _open_frames(path, stack)
+        except (InputError, ModuleNotFoundError):
+            raise
+        except Exception as error:  # whatever a damaged file makes a reader do
+            raise fail(str(path), "a log of a CAN bus", show_error(error)) from None
+        shift = shift if sources.start is None else sources.start - begin
+        frames = iter(reader)
+        while True:
+            try:
+                frame = next(frames, None)
+            except Exception as error:  # the same
+                yield CutOffError(str(fail(f"{path}, after frame {number}", "a log without damage", show_error(error))))
+                return
+            if frame is None:
+                return
+            number += 1
+            yield frame, round(frame.timestamp + shift, DIGITS)
+
+
+def _open_frames(path: Path, stack: ExitStack) -> "tuple[MessageReader, float, float]":
+    """Return a reader, the time in it of the log's begin, and what makes its times seconds since 1970."""
+    from can import ASCReader, BLFReader
+
+    kind = path.suffix.lower()
+    if kind == ".blf":
+        blf = stack.enter_context(BLFReader(path))
+        return blf, blf.start_timestamp, 0.0
+    if kind == ".asc":
+        # Frames have seconds from the begin, whose date has no zone: it is read as UTC, on every machine.
+        dated = stack.enter_context(ASCReader(path, relative_timestamp=False))
+        next(iter(dated), None)
+        begin = datetime.fromtimestamp(dated.start_time).replace(tzinfo=UTC).timestamp() if dated.start_time else 0.0
+        if dated.timestamps_format == "relative":
+            expected = "times from the log's begin ('timestamps absolute' in its header)"
+            raise fail(str(path), expected, "times from each event to the next")
+        return stack.enter_context(ASCReader(path)), 0.0, begin
+    import asammdf
+    from can.io.mf4 import MF4Reader
+
+    with asammdf.MDF(path) as file:
+        begin = file.start_time.timestamp()
+    return stack.enter_context(MF4Reader(path)), begin, 0.0
+
+
+def _join(names: list[str]) -> str:
+    return ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")

@@ -1,0 +1,65 @@
+"""A vehicle's log of any kind: its signals with their units, and its messages in order of time."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.files.logs.log_sources import STAMP
+from heliograph.files.message_files import FileMessage
+from heliograph.numerics.check import InputError
+from heliograph.numerics.types import Float
+
+FRAMES, MDF, ULOG = (".blf", ".asc"), (".mf4",), (".ulg",)
+LOGS = (*FRAMES, *MDF, *ULOG)
+PACKAGES = {".blf": ("can", "cantools"), ".asc": ("can", "cantools"), ".mf4": ("asammdf",), ".ulg": ("pyulog",)}
+DIGITS = 6  # of a second: doubles of our years tell microseconds apart
+Wanted = Callable[[str], bool]
+
+
+class Log(NamedTuple):
+    """A vehicle's log.
+
+    Attributes:
+        units: unit of each signal by message, "" where the file names none.
+        kinds: what each message is, such as "CAN 0x1a0".
+        messages: those that are wanted, in order of time, and why others cannot be read; may raise ValueError.
+        bits: bits of the signals that are whole numbers without a unit, by message, where the file says them.
+        notes: lines on what was left out, complete when the messages were read.
+    """
+
+    units: dict[str, dict[str, str]]
+    kinds: dict[str, str]
+    messages: Iterator[FileMessage | InputError]
+    notes: list[str]
+    bits: Mapping[str, Mapping[str, int]] = MappingProxyType({})
+
+
+class Series(NamedTuple):
+    """Messages of one name: seconds from the log's begin, and the values of each signal. Shape of all: (messages,)."""
+
+    time: Float[np.ndarray, " messages"]
+    values: Mapping[str, np.ndarray]
+
+
+def is_log(path: Path) -> bool:
+    """Return whether a path is that of a vehicle's log, by its name."""
+    return path.suffix.lower() in LOGS
+
+
+def merge_series(path: Path, begin: float, series: Mapping[str, Series]) -> Iterator[FileMessage]:
+    """Yield the messages of several series in order of time; `begin` is in seconds since 1970."""
+    names = list(series)
+    times = np.concatenate([np.zeros(0), *(each.time for each in series.values())])
+    sizes = [len(each.time) for each in series.values()]
+    which = np.repeat(np.arange(len(names)), sizes)
+    rows = np.concatenate([np.zeros(0, dtype=int), *(np.arange(size) for size in sizes)])
+    columns = [[values.tolist() for values in each.values.values()] for each in series.values()]
+    fields = [list(each.values) for each in series.values()]
+    for number, at in enumerate(np.argsort(times, kind="stable").tolist(), 1):
+        i, row = which[at], rows[at]
+        moment = round(begin + float(times[at]), DIGITS)
+        content = {name: column[row] for name, column in zip(fields[i], columns[i], strict=True)}
+        yield FileMessage(f"{path}, message {number}", names[i], {STAMP: moment, **content}, moment)

@@ -1,0 +1,71 @@
+"""Signals of MDF4 files: the messages of a group are its samples."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heliograph.files.logs.log import Log, Series, Wanted, merge_series
+from heliograph.files.logs.log_sources import LogSources
+from heliograph.numerics.check import InputError, fail, show_error
+
+if TYPE_CHECKING:
+    from asammdf import MDF
+
+RAW = "CAN_DataFrame"  # the signal that frames of a bus are recorded as
+
+
+def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Open an MDF4 file; a message is a sample of a channel group, named as the group's acquisition or "group N".
+
+    Raises:
+        ValueError: no MDF4 file, or frames of a bus without a database.
+        ModuleNotFoundError: asammdf is not installed (extra "mdf").
+    """
+    from asammdf import MDF
+
+    try:
+        with MDF(path) as file:
+            names = _name_groups(file)
+            units = {name: _list_units(file, i) for i, name in enumerate(names)}
+            if any(RAW in signals for signals in units.values()):
+                raise fail(str(path), "dbc= of LogSources, for its frames of CAN", "none")
+            series = {name: _read_group(file, i, units[name]) for i, name in enumerate(names) if wanted(name)}
+            begin = file.start_time.timestamp() if sources.start is None else sources.start
+    except InputError:
+        raise
+    except Exception as error:  # whatever a damaged file makes a reader do
+        raise fail(str(path), "an MDF4 file", show_error(error)) from None
+    return Log(units, dict.fromkeys(names, "MDF4"), merge_series(path, begin, series), [])
+
+
+def _name_groups(file: "MDF") -> list[str]:
+    """Return a distinct name for each channel group."""
+    names = list[str]()
+    for i, group in enumerate(file.groups):
+        name = str(group.channel_group.acq_name or f"group {i}").strip()
+        names.append(name if name not in names else f"{name} {i}")
+    return names
+
+
+def _list_units(file: "MDF", group: int) -> dict[str, str]:
+    """Return the units of the signals of a group, without its times."""
+    master = file.masters_db.get(group)
+    channels: Any = enumerate(file.groups[group].channels)
+    return {c.name: file.get_channel_unit(c.name, group=group, index=i) or "" for i, c in channels if i != master}
+
+
+def _read_group(file: "MDF", group: int, names: dict[str, str]) -> Series:
+    """Read the signals of a group; a sample that the file marks as invalid did not arrive."""
+    time, values = np.zeros(0), dict[str, np.ndarray]()
+    for name in names:
+        signal = file.get(name, group=group, ignore_invalidation_bits=True)
+        time, samples = np.asarray(signal.timestamps, dtype=np.float64), np.asarray(signal.samples)
+        if samples.ndim > 1 or samples.dtype.names:
+            continue
+        column = np.char.decode(samples, errors="replace") if samples.dtype.kind == "S" else samples
+        if signal.invalidation_bits is not None:
+            column = column.astype(object)
+            column[np.asarray(signal.invalidation_bits, dtype=bool)] = None
+        values[name] = column
+    return Series(time, values)

@@ -1,0 +1,84 @@
+"""Messages of a vehicle's log for the sources of a network, checked against the signals that the log has."""
+
+from collections.abc import Iterator
+from difflib import get_close_matches
+from pathlib import Path
+
+from heliograph.files.logs.can_frames import open_frames
+from heliograph.files.logs.log import MDF, ULOG, Log, Wanted
+from heliograph.files.logs.log_sources import STAMP, LogSources
+from heliograph.files.logs.mdf import open_mdf
+from heliograph.files.logs.ulog import open_ulog
+from heliograph.files.message_files import FileMessage
+from heliograph.files.sources import Sources
+from heliograph.numerics.check import InputError, fail
+
+LISTED = 8  # names in one line
+
+
+def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Open a vehicle's log; only messages that are wanted are decoded.
+
+    Raises:
+        ValueError: no such file, one that cannot be opened, frames without a database; one line.
+        ModuleNotFoundError: what reads it is not installed (extra "can", "mdf" or "ulog").
+    """
+    if not path.is_file():
+        raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
+    kind = path.suffix.lower()
+    if kind in ULOG:
+        return open_ulog(path, sources, wanted)
+    if kind in MDF and sources.dbc is None:
+        return open_mdf(path, sources, wanted)
+    return open_frames(path, sources, wanted)
+
+
+def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
+
+    Args:
+        path: the log.
+        table: the sources as the network's file has them, a `LogSources` or a dictionary.
+        sources: the same, checked against the network.
+        notes: lines on units and on what was left out, which are appended.
+
+    Raises:
+        ValueError: no such log, no database, a message or a signal that is not there; one line with the remedy.
+    """
+    given = table if isinstance(table, LogSources) else LogSources({})
+    log = open_log(path, given, lambda name: bool(sources.of(name)))
+    place = str(path) if given.dbc is None else f"{path} by {given.dbc}"
+    used = _check_signals(place, path, log, sources)
+    yield from log.messages
+    notes += log.notes
+    if used:
+        notes.append(f"{place}: in the file's units, before scale= and offset=: {', '.join(used)}")
+
+
+def _check_signals(place: str, path: Path, log: Log, sources: Sources) -> list[str]:
+    """Return the units of the signals of sources; raise ValueError where a message or a signal is not in the log."""
+    remedy = f"heliograph inspect {path} lists what there is"
+    for topic in sources.topics:
+        if topic not in log.units and not set("+#") & set(topic):
+            hint = "; dbc= of LogSources names their database" if not log.units else f"; {remedy}"
+            raise fail(place, f"a message {topic!r} of the sources", f"{_name_near(topic, log.units)}{hint}")
+    used = dict[str, None]()
+    for topic, signals in log.units.items():
+        for mapped in sources.of(topic):
+            for path_in_message in mapped.source.fields:
+                name = path_in_message if path_in_message in signals else path_in_message.split(".")[0]
+                if name not in signals and name != STAMP:
+                    got = f"{_name_near(path_in_message, signals)}; {remedy}"
+                    raise fail(f"{place}, {topic}", f"a signal {path_in_message!r} of the sources", got)
+                if signals.get(name):
+                    used[f"{topic}.{name} in {signals[name]}"] = None
+    return list(used)
+
+
+def _name_near(name: str, known: dict[str, object] | dict[str, str] | dict[str, dict[str, str]]) -> str:
+    """Say which names there are: the closest, or else the first."""
+    close = get_close_matches(name, known, 1)
+    if close:
+        return f"none of that name (closest: {close[0]!r})"
+    more = f" and {len(known) - LISTED} more" if len(known) > LISTED else ""
+    return f"only {', '.join(list(known)[:LISTED])}{more}" if known else "no message with signals"

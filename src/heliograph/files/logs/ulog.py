@@ -1,0 +1,57 @@
+"""Topics of ULog, as PX4 writes it."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heliograph.files.logs.log import Log, Series, Wanted, merge_series
+from heliograph.files.logs.log_sources import STAMP, LogSources
+from heliograph.numerics.check import fail, show_error
+
+if TYPE_CHECKING:
+    from pyulog import ULog
+
+MICROSECOND = 1e-6
+CLOCKS = "vehicle_gps_position", "sensor_gps"  # topics of which a field is the date
+DATE = "time_utc_usec"
+
+
+def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Open a ULog file; a further instance of a topic is named with its number, "sensor_baro.1".
+
+    Times are since the device began to run; their date is that of the first fix of its satellite receiver.
+
+    Raises:
+        ValueError: no ULog file.
+        ModuleNotFoundError: pyulog is not installed (extra "ulog").
+    """
+    from pyulog import ULog
+
+    try:
+        with path.open("rb") as opened:
+            file = ULog(opened)
+    except Exception as error:  # whatever a damaged file makes a reader do
+        raise fail(str(path), "a ULog file", show_error(error)) from None
+    topics = {data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}": data for data in file.data_list}
+    units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
+    series = {
+        name: Series(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
+        for name, data in topics.items()
+        if wanted(name)
+    }
+    begin = _find_date(file)
+    if sources.start is not None:
+        begin = sources.start - file.start_timestamp * MICROSECOND
+    notes = [f"{path}: the device lost {len(file.dropouts)} times what it should have logged"] * bool(file.dropouts)
+    notes += [f"{path}: damaged; what could be read is used"] * bool(file.file_corruption)
+    return Log(units, dict.fromkeys(topics, "ULog"), merge_series(path, begin, series), notes)
+
+
+def _find_date(file: "ULog") -> float:
+    """Return the date, in seconds since 1970, at which the device began to run; 0 if the log does not say it."""
+    for data in file.data_list:
+        if data.name in CLOCKS and DATE in data.data and len(known := np.flatnonzero(data.data[DATE])):
+            first = known[0]
+            return (int(data.data[DATE][first]) - int(data.data[STAMP][first])) * MICROSECOND
+    return 0.0

@@ -1,0 +1,176 @@
+"""Logs of vehicles, read by their sources: the same values at the same moments, whatever recorded them."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph import cli
+from tests.files import logs
+
+RESOLUTION = 0.005 / 3.6  # half a step of the signal, in m/s
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """Write the drive in a format; return it with its sources."""
+
+    def write(kind, **given):
+        path = tmp_path / f"drive{kind[-4:]}"
+        if kind == "signals.mf4":
+            return logs.write_mdf(path), hg.files.LogSources({"WheelSpeeds": logs.wheel()}, **given)
+        if kind == ".ulg":
+            return logs.write_ulog(path), hg.files.LogSources({"WheelSpeeds": logs.wheel()}, **given)
+        sources = hg.files.LogSources({"WheelSpeeds": logs.wheel()}, dbc=logs.database(tmp_path), **given)
+        return logs.write_frames(path), sources
+
+    return write
+
+
+def recorded(path, sources):
+    events = hg.files.read_messages(path, logs.car(), sources)
+    return events, events.columns["wheel"].arrays()[0], np.array([event.values[0] for event in events.sort_events()])
+
+
+KINDS = (".blf", ".asc", "frames.mf4", "signals.mf4", ".ulg")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_values_and_times_are_those_that_were_recorded(drive, kind):
+    """Values to the resolution of the signal; times to a microsecond (ASC: its date is that of the local clock)."""
+    events, time, values = recorded(*drive(kind))
+    assert np.abs(values - logs.SPEED / 3.6).max() < RESOLUTION
+    moments = (time - time[0]) / 1e9 if kind == ".asc" else time / 1e9 - logs.START
+    assert np.abs(moments - logs.TIME).max() < 1.1e-6
+    assert any("WheelSpeeds.FrontLeft in km/h" in note for note in events.notes) == (kind != ".ulg")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_start_is_the_date_of_the_logs_begin(drive, kind):
+    path, sources = drive(kind, start="2020-01-01T01:00:00+01:00")
+    _, time, _ = recorded(path, sources)
+    assert abs(time[0] / 1e9 - 1_577_836_800 - (logs.START - logs.find_begin(path))) < 1.1e-6
+
+
+def test_a_latency_of_a_source_moves_its_measurements_and_not_their_arrival(tmp_path):
+    path = logs.write_frames(tmp_path / "drive.blf")
+    late = logs.wheel(time=hg.files.Stamp("timestamp", offset=-0.08))
+    sources = hg.files.LogSources({"WheelSpeeds": late}, dbc=logs.database(tmp_path))
+    events = hg.files.read_messages(path, logs.car(), sources)
+    assert np.allclose(events.lateness()["wheel"], 0.08, rtol=0, atol=2e-6)
+
+
+def test_a_counter_of_four_bits_counts_what_was_lost_across_its_end(tmp_path):
+    kept = [logs.frame(k) for k in range(logs.COUNT) if k not in (15, 16, 30)]
+    path = logs.write_frames(tmp_path / "drive.blf", kept)
+    counted = logs.wheel(sequence=hg.files.Count("Counter", bits=4))
+    sources = hg.files.LogSources({"WheelSpeeds": counted}, dbc=logs.database(tmp_path))
+    _, lost = hg.files.read_messages(path, logs.car(), sources).judge()
+    assert lost == {"wheel": 3}
+
+
+def test_samples_that_a_file_marks_as_invalid_did_not_arrive(tmp_path):
+    path = logs.write_mdf(tmp_path / "drive.mf4", invalid=[3, 4])
+    _, _, values = recorded(path, {"WheelSpeeds": logs.wheel()})
+    assert np.flatnonzero(np.isnan(values)).tolist() == [3, 4]
+
+
+def test_a_log_without_a_date_begins_in_1970(tmp_path):
+    path = logs.write_ulog(tmp_path / "drive.ulg", date=False)
+    _, time, _ = recorded(path, {"WheelSpeeds": logs.wheel(time="timestamp")})
+    assert time[0] == 7_000_000_000
+
+
+def test_error_and_short_frames_are_left_out_and_counted(tmp_path):
+    frames = [logs.frame(k) for k in range(logs.COUNT)]
+    frames[5] = logs.frame(5, bytes(4))
+    frames.append(logs.frame(39, b"", is_error_frame=True))
+    path = logs.write_frames(tmp_path / "drive.blf", frames)
+    dbc = logs.database(tmp_path)
+    sources = hg.files.LogSources({"WheelSpeeds": logs.wheel()}, dbc=dbc)
+    events, time, _ = recorded(path, sources)
+    assert len(time) == logs.COUNT - 1 and events.refused == 1
+    assert events.reasons == [f"{path}, frame 6, WheelSpeeds: expected 8 bytes, as {dbc} has it, got 4"]
+    assert f"{path}: frames left out: error (1)" in events.notes
+
+
+def test_a_log_that_ends_in_the_middle_is_used_up_to_there(tmp_path):
+    path = logs.write_frames(tmp_path / "drive.asc")
+    text = path.read_text().splitlines()
+    path.write_text("\n".join([*text[:20], "0.9 1 xyz Rx d 8 zz", *text[20:]]))
+    sources = hg.files.LogSources({"WheelSpeeds": logs.wheel()}, dbc=logs.database(tmp_path))
+    events, time, _ = recorded(path, sources)
+    assert 0 < len(time) < logs.COUNT and "expected a log without damage" in events.broken
+
+
+def mistake(path, sources):
+    with pytest.raises(ValueError) as caught:
+        hg.files.read_messages(path, logs.car(), sources)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_mistakes_name_file_signal_and_remedy(tmp_path):
+    path, dbc = logs.write_frames(tmp_path / "drive.blf"), logs.database(tmp_path)
+
+    def given(table, **more):
+        return hg.files.LogSources(table, **({"dbc": dbc} | more))
+
+    place = f"{path} by {dbc}"
+    seen = f"heliograph inspect {path} lists what there is"
+    assert mistake(path, given({"WheelSpeds": logs.wheel()})) == (
+        f"{place}: expected a message 'WheelSpeds' of the sources, "
+        f"got none of that name (closest: 'WheelSpeeds'); {seen}"
+    )
+    assert mistake(path, given({"WheelSpeeds": logs.wheel("FrontRight")})) == (
+        f"{place}, WheelSpeeds: expected a signal 'FrontRight' of the sources, "
+        f"got none of that name (closest: 'FrontLeft'); {seen}"
+    )
+    assert "dbc= of LogSources names their database" in mistake(path, given({"WheelSpeeds": logs.wheel()}, dbc=None))
+    assert mistake(path, given({"Imu": logs.wheel("YawRate")})) == (
+        f"{path}: expected a frame of Imu (0x1a1), got only 0x1a0; another database, or another bus (channel=)?"
+    )
+    assert "channel" in mistake(path, given({"WheelSpeeds": logs.wheel()}, channel=3))
+    assert "expected a file, got nothing of that name" in mistake(tmp_path / "none.blf", given({}))
+    short = logs.database(tmp_path / "..", logs.DBC.replace("WheelSpeeds: 8", "WheelSpeeds: 12"))
+    assert mistake(path, given({"WheelSpeeds": logs.wheel()}, dbc=short)) == (
+        f"{path}, WheelSpeeds: expected frames of 12 bytes, as {short} has it, "
+        "got 40 of 8; another database, or another bus (channel=)?"
+    )
+
+
+def test_a_message_of_two_buses_needs_its_channel(tmp_path):
+    frames = [logs.frame(k, channel=k % 2) for k in range(logs.COUNT)]
+    path, dbc = logs.write_frames(tmp_path / "drive.blf", frames), logs.database(tmp_path)
+    table = {"WheelSpeeds": logs.wheel()}
+    assert "expected one bus, which channel= of LogSources names" in mistake(path, hg.files.LogSources(table, dbc=dbc))
+    events, time, _ = recorded(path, hg.files.LogSources(table, dbc=dbc, channel=1))
+    assert len(time) == 20 and f"{path}: frames left out: of channel 0 (20)" in events.notes
+
+
+@pytest.mark.parametrize("ending", [".blf", ".asc", ".mf4", ".ulg"])
+def test_a_file_that_is_none_is_one_line(tmp_path, ending):
+    logs.write_frames(tmp_path / "there.mf4"), logs.write_ulog(tmp_path / "there.ulg")
+    path = tmp_path / f"drive{ending}"
+    path.write_bytes(b"not a log\n" * 20)
+    assert str(path) in mistake(path, {"WheelSpeeds": logs.wheel()})
+
+
+def test_sources_of_a_log_are_checked():
+    for given, words in (
+        ({"sources": [1]}, "LogSources, sources"),
+        ({"sources": {}, "start": "2026-09-27"}, "LogSources, start"),
+        ({"sources": {}, "channel": -1}, "LogSources, channel"),
+        ({"sources": {}, "dbc": 3}, "LogSources, dbc"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            hg.files.LogSources(**given)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_inspect_lists_signals_with_rate_gap_and_unit(drive, kind, capsys):
+    path, sources = drive(kind)
+    assert cli.main(["inspect", str(path), *(["--dbc", str(sources.dbc)] if sources.dbc else [])]) == 0
+    said = capsys.readouterr().out
+    assert "WheelSpeeds" in said and "10 Hz" in said and "0.1 s" in said and "'FrontLeft'" in said
+    assert ("# km/h" in said) == (kind != ".ulg")
+    assert ("Count('Counter', bits=4)" in said) == (sources.dbc is not None)
