@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+import heliograph as hg
 from heliograph import cli
 
 NETWORK = """
@@ -43,3 +44,32 @@ def test_a_backtest_is_a_page_by_horizon(call, tmp_path, capsys):
 def test_horizons_are_rows(call, capsys):
     assert cli.main([*call, "--horizons", "5s"]) == 2
     assert "--horizons: expected numbers of rows" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_refits_are_those_of_the_library(call, tmp_path, capsys):
+    """`--refit 20`: scores as of `hg.backtest` with fits to the rows before; without free numbers a line."""
+    assert cli.main([*call, "--horizons", "1", "--refit", "20"]) == 2
+    assert "free" in capsys.readouterr().err
+    (tmp_path / "level.py").write_text(NETWORK.replace("0.5, [0.0]", "hg.free(0.1, 'q'), [0.0]"))
+    assert cli.main([*call, "--horizons", "1", "--skip", "30", "--refit", "20"]) == 0
+    folder = tmp_path / "results" / "backtest"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["refit"] == 20
+    assert "fitted every 20 rows, to those before" in (folder / "report.html").read_text()
+
+    def build():
+        return hg.files.load_network(str(tmp_path / "level.py"))
+
+    z = {"a": hg.files.read_table(tmp_path / "data.csv")["height"][:, None]}
+
+    def refit(rows):
+        return hg.fit(build, {"a": z["a"][:rows]}).network
+
+    (score,) = hg.backtest(build(), z, [1], skip=30, refit=refit, every=20).scores
+    assert summary["scores"][0]["log score"] == pytest.approx(score.log_score.value, rel=1e-9)
+
+
+def test_a_refit_is_a_number_of_rows(call, capsys):
+    assert cli.main([*call, "--refit", "-1"]) == 2
+    assert "--refit: expected" in capsys.readouterr().err

@@ -6,13 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import folder, measured_option, path_option
+from heliograph.cli.app import folder, measured_option, number, path_option
 from heliograph.cli.reading import ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from heliograph.files.recording import Recording
     from heliograph.report.progress import Advance
     from heliograph.report.results import Results
+    from heliograph.simulation.network import Network
 
 NAME = "backtest"
 
@@ -25,10 +29,14 @@ def backtest(
     out: Annotated[Path, path_option("Folder for the page and its figure; made if missing.")],
     horizons: Annotated[str, Parameter(help="Rows ahead, as 1,3,12.")] = "1,2,5,10",
     skip: Annotated[int, Parameter(help="Rows at the start from which nothing is forecast.")] = 10,
+    refit: Annotated[
+        int, number("Rows between fits of the free numbers to the rows before; 0: the numbers of the file throughout.")
+    ] = 0,
     reading: ReadingOptions | None = None,
 ) -> None:
     """Forecast from each row of measured data, and score what was said against what came.
 
+    With --refit, each row is forecast by a network whose free numbers (hg.free) were fitted to rows before it.
     By horizon: error, coverage of 50, 80 and 95 %, log score and CRPS, with standard errors that know the overlap.
 
     Parameters
@@ -38,7 +46,7 @@ def backtest(
         holds several.
     """
     from heliograph.disk.quoting import visible
-    from heliograph.numerics.check import fail
+    from heliograph.numerics.check import check_count, fail
     from heliograph.numerics.times.dates import horizons_in
     from heliograph.report.results import write_results
 
@@ -48,6 +56,7 @@ def backtest(
     ahead = [horizon for horizon in listed if isinstance(horizon, int)]
     if len(ahead) < len(listed):
         raise fail("--horizons", "numbers of rows, as 1,3,12", horizons)
+    check_count("--refit", refit, 0)
 
     def compute(advance: "Advance") -> "heliograph.forecasting.Backtest":
         from heliograph.files.network_file import load_module
@@ -59,16 +68,30 @@ def backtest(
             raise fail("backtest", "data of one plant (--plant NAME)", f"{len(others) + 1} plants")
         advance(f"forecasting from {len(data.recording.time)} rows")
         z, u, time, truth = data.recording
-        return heliograph.backtest(loaded, z, ahead, u, time, truth, skip)
+        again = _make_refit(network, data.recording, advance) if refit else None
+        return heliograph.backtest(loaded, z, ahead, u, time, truth, skip, again, refit or 1)
 
     def results(found: "heliograph.forecasting.Backtest") -> "Results":
         from heliograph.report.pages.backtest import make_backtest_results
 
-        return make_backtest_results(found, network)
+        return make_backtest_results(found, network, refit)
 
-    found = write_results(target, 3, compute, results)
+    found = write_results(target, 4 if refit else 3, compute, results)
     for score in found.scores:
         shares = ", ".join(f"{share.value:.1%} +- {share.error:.1%}" for share in score.coverage)
         print(visible(f"{score.node}/{score.filter} {score.part} {score.name}, {score.horizon} ahead: within the "
                       f"intervals of 50, 80, 95 %: {shares}"))  # fmt: skip
     print(visible(str(target / "report.html")))
+
+
+def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "Callable[[int], Network]":
+    """Return what fits the free numbers of a network to the first rows of a recording."""
+    from heliograph.files.fitted import NetworkAgain
+
+    build, (z, u, _, _) = NetworkAgain(reference), recording
+
+    def refit(rows: int) -> "Network":
+        advance("fitting to the rows before", rows, len(recording.time))
+        return heliograph.fit(build, {name: values[:rows] for name, values in z.items()}, u[:rows]).network
+
+    return refit

@@ -21,12 +21,18 @@ SHARES = ("50 %", "80 %", "95 %")
 CLAIMED = (0.5, 0.8, 0.95)
 
 
-def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str) -> Results:
-    """Return the content of the results folder; `network` is the user's name of the network."""
+def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str, refit: int = 0) -> Results:
+    """Return the content of the results folder.
+
+    Args:
+        found: the scores.
+        network: the user's name of the network.
+        refit: rows between fits of its free numbers; 0 by default, for none.
+    """
     return Results(
         {"coverage": _draw_coverage(found)},
-        lambda drawings: make_backtest_page(found, network, drawings),
-        _summarise(found),
+        lambda drawings: make_backtest_page(found, network, drawings, refit),
+        _summarise(found) | ({"refit": refit} if refit else {}),
     )
 
 
@@ -61,13 +67,16 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
     return figure
 
 
-def make_backtest_page(found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes]) -> Page:
-    """Return the page; `drawings` holds each figure as SVG."""
+def make_backtest_page(
+    found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes], refit: int = 0
+) -> Page:
+    """Return the page; `drawings` holds each figure as SVG, `refit` is how many rows lay between fits, 0 for none."""
     doubts = [visible(line) for line in list_doubts(found)]
     title = f"{len(doubts)} claims ahead do not hold" if doubts else "What was said ahead held"
     lead = (
         f"From each of {found.rows:,} rows `{visible(network)}` forecast {', '.join(map(str, found.horizons))} rows "
         "ahead, as if nothing more arrived; scored is what came."
+        + (f" Its free numbers were fitted every {refit} rows, to those before." if refit else "")
     )
     caption = (
         "Share of what came within the intervals of 80 % (squares) and 95 % (dots), with two standard errors, which "
