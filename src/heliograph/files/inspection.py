@@ -198,7 +198,7 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
 
 
 def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
-    """Return the messages of a vehicle's log, and the first reason why one cannot be read, "" if all can be.
+    """Return the messages of a vehicle's log, and the first reason why some cannot be read, "" if all can be.
 
     Args:
         path: the log.
@@ -220,6 +220,8 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
             kind, bits = log.kinds.get(name, "CAN, not described"), log.bits.get(name, {})
             topics[name] = Topic(kind, list(units), measured_in=known, bits=bits)
         topics[name].logged.append(parse_arrival(message.arrival, message.where))
+    if topics and not log.units:
+        broken = broken or str(fail(str(path), "the database of its frames, to list signals (--dbc car.dbc)", "none"))
     return topics, broken
 
 

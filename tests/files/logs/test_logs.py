@@ -1,5 +1,7 @@
 """Logs of vehicles, read by their sources: the same values at the same moments, whatever recorded them."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -174,3 +176,46 @@ def test_inspect_lists_signals_with_rate_gap_and_unit(drive, kind, capsys):
     assert "WheelSpeeds" in said and "10 Hz" in said and "0.1 s" in said and "'FrontLeft'" in said
     assert ("# km/h" in said) == (kind != ".ulg")
     assert ("Count('Counter', bits=4)" in said) == (sources.dbc is not None)
+
+
+def test_inspect_without_a_database_lists_identifiers_and_asks_for_it(tmp_path, capsys):
+    assert cli.main(["inspect", str(logs.write_frames(tmp_path / "drive.blf"))]) == 0
+    said = capsys.readouterr()
+    assert "0x1a0" in said.out and "--dbc car.dbc" in said.err
+
+
+@pytest.mark.parametrize("zone", ["UTC", "Asia/Tokyo"])
+def test_a_date_without_a_zone_is_utc_wherever_it_is_read(tmp_path, monkeypatch, zone):
+    pytest.importorskip("can", reason="the extra `can`")
+    pytest.importorskip("cantools", reason="the extra `can`")
+    path = tmp_path / "drive.asc"
+    date = "Mon Sep 21 02:13:20.000 PM 2026"
+    frames = "".join(f" {k / 10:.6f} 1  1A0             Rx   d 8 10 0E 0{k} 00 00 00 00 00\n" for k in range(9))
+    header = f"date {date}\nbase hex  timestamps absolute\nno internal events logged\nBegin Triggerblock {date}\n"
+    path.write_text(f"{header} 0.000000 Start of measurement\n{frames}End TriggerBlock\n")
+    sources = hg.files.LogSources({"WheelSpeeds": logs.wheel()}, dbc=logs.database(tmp_path))
+    with monkeypatch.context() as there:
+        there.setenv("TZ", zone)
+        time.tzset()
+        _, moments, _ = recorded(path, sources)
+    time.tzset()
+    assert np.abs(moments / 1e9 - logs.START - np.arange(9) / 10).max() < 1.1e-6
+    # Times from event to event would need every event, also those that are no frames.
+    path.write_text(path.read_text().replace("absolute", "relative"))
+    assert "expected times from the log's begin" in mistake(path, sources)
+
+
+def test_signals_that_a_multiplexed_frame_has_not_did_not_arrive(tmp_path):
+    text = """VERSION ""
+BU_: ECU
+BO_ 2566834709 Wheel: 8 ECU
+ SG_ Page M : 0|8@1+ (1,0) [0|255] "" ECU
+ SG_ Speed m0 : 8|16@1+ (0.01,0) [0|655] "km/h" ECU
+ SG_ Heat m1 : 8|16@1+ (0.1,0) [0|655] "degC" ECU
+"""
+    long = {"arbitration_id": 2566834709 & 0x1FFFFFFF, "is_extended_id": True}
+    frames = [logs.frame(k, bytes([k % 2, 16, 14, 0, 0, 0, 0, 0]), **long) for k in range(10)]
+    path = logs.write_frames(tmp_path / "drive.blf", frames)
+    sources = hg.files.LogSources({"Wheel": logs.wheel("Speed")}, dbc=logs.database(tmp_path, text))
+    _, _, values = recorded(path, sources)
+    assert np.allclose(values[::2], 10.0) and np.isnan(values[1::2]).all()
