@@ -105,7 +105,7 @@ def test_a_recording_is_smoothed_from_a_fixed_point_on():
 def test_what_cannot_be_smoothed_is_refused_in_one_line():
     particle = hg.filters.particle_filter(PLANT, SENSOR, FADING, particles=10)
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, FADING, {"one": particle})})
-    with pytest.raises(ValueError, match=r"smoothing: expected .* got ParticleFilter"):
+    with pytest.raises(ValueError, match=r"smoothing: expected .* got StateParticleFilter"):
         hg.monte_carlo(network, 4, 2, 0, smooth=hg.smoothing.FixedInterval())
     with pytest.raises(ValueError, match=r"smooth: expected one such as .*, got 'interval'"):
         hg.monte_carlo(WHOLE, 4, 2, 0, smooth="interval")

@@ -26,6 +26,13 @@ from heliograph.filters.modes.multiple_model import (
     replicate,
 )
 from heliograph.filters.modes.patterns import SideInformation
+from heliograph.filters.particles.resampling import (
+    effective_number,
+    fold_in_bits,
+    invert_distribution,
+    resample_systematically,
+)
+from heliograph.filters.particles.state_particles import MANY, StateParticleFilter, build_state_particles
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
@@ -37,7 +44,9 @@ from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
+from heliograph.random_affine.memory import memories
 
+FEW = 300  # particles of modes
 NODES = 9  # modes that stand for a gain that drifts: they cost no more than few
 
 
@@ -86,7 +95,7 @@ class ParticleFilter(AbstractSizedFilter):
         """Return the prior in every particle, with modes in proportion to their initial law."""
         start, n = at(self.plant, 0), self.particles
         parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
-        mode = _invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
+        mode = invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
         return Particles(parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
 
     @predicts
@@ -95,7 +104,7 @@ class ParticleFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
-        drawn = jax.vmap(_invert_distribution)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
+        drawn = jax.vmap(invert_distribution)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
         start = second_moments_at_start(self.plant)
         parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
         mode = jnp.where(state.moved, drawn, state.mode)
@@ -113,9 +122,9 @@ class ParticleFilter(AbstractSizedFilter):
         )
         after = after._replace(mean=align_angles(plant, after.mean, weight))
         # Systematic resampling.
-        key = _fold_in_bits(state.key, z)
-        chosen = _resample_systematically(weight, jax.random.uniform(key, (), weight.dtype))
-        poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
+        key = fold_in_bits(state.key, z)
+        chosen = resample_systematically(weight, jax.random.uniform(key, (), weight.dtype))
+        poor = effective_number(weight) < self.particles / 2
         which = jnp.where(poor, chosen, jnp.arange(self.particles))
         weight = jnp.where(poor, 1 / self.particles, weight)
         kept: Gaussian = jax.tree.map(lambda leaf: leaf[which], after)
@@ -128,62 +137,57 @@ class ParticleFilter(AbstractSizedFilter):
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
 
-def _invert_distribution(law: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Invert each distribution function at a uniform number: the index that it draws."""
-    return jnp.searchsorted(jnp.cumsum(law)[:-1], uniform)
-
-
-def _resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
-    """Resample systematically: indices where the distribution function passes (start + 0 ... N - 1) / N."""
-    return _invert_distribution(weight, (start + jnp.arange(len(weight))) / len(weight))
-
-
-def _fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
-    """Return the key made of another one and of the bits of a measurement."""
-    bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
-    for word in bits.ravel():
-        key = jax.random.fold_in(key, word)
-    return key
-
-
 @believes
 def particle_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    particles: int = 300,
+    plant: "AnyPlant",
+    sensor: "AnySensor",
+    channel: "Channel",
+    particles: int | None = None,
     seed: int = 0,
-    transform: AbstractTransform | None = None,
+    transform: "AbstractTransform | None" = None,
     nodes: int = NODES,
-) -> ParticleFilter:
-    """Rao-Blackwellised particle filter of a plant behind links with memory: a reference for the other filters.
+    proposal: str = "optimal",
+    resample: float = 0.5,
+) -> "ParticleFilter | StateParticleFilter":
+    """Particle filter: of the state, or behind links with memory of their modes (Rao-Blackwell).
 
-    Each particle draws a path of modes and carries the Gaussian filter of that path; systematic resampling where the
-    effective number of particles is below half. Error of the mixture's moments: in proportion to 1 / root of
-    `particles`.
+    Of the state: N points with weights, for any plant, and any sensor and link without memory whose noise has a
+    density: x_i is drawn from a proposal q, and its weight multiplied by p(z | x_i) p(x_i | before) / q(x_i). Of modes:
+    each particle draws a path of modes and carries the Gaussian filter of that path. Systematic resampling where the
+    effective number 1 / sum w_i^2 is below a share of N, of the state at the start of the next step, so that an
+    estimate has all weights. A row that no particle can explain is not used: its log-likelihood is -inf. Error of the
+    mixture's moments: in proportion to 1 / root of `particles`.
 
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter, with memory.
-        particles: their number; 300 by default.
+        channel: from the sensor to the filter.
+        particles: their number; by default 1,000 of the state, 300 of modes.
         seed: of the random numbers, which depend on the data too; 0 by default.
-        transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
-        nodes: number of modes that stand for a gain that drifts; 9 by default.
+        transform: of modes: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
+        nodes: of modes: number of modes that stand for a gain that drifts; 9 by default.
+        proposal: of the state: "optimal", by default, draws the noise given z, to first order in h, a tenth of the
+            particles without z where h is not linear or the noise a mixture; "prior" draws it without z, and takes any
+            law of the process noise.
+        resample: of the state: share of N below which the effective number leads to resampling; 0.5 by default.
 
-    Claim: "nominal": with finitely many particles, and a Gaussian in each, it approaches the truth from either side.
+    Claim: "nominal": with finitely many particles it approaches the truth from either side.
 
     Raises:
-        ValueError: a count of particles below 1, and as for `imm_filter`.
+        ValueError: a count of particles below 1; as for `imm_filter`; of the state also a received number without
+            noise, gains that are not of finitely many values, a sensor that depends on inputs.
 
     Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
-        2001.
+        2001; Gordon, Salmond and Smith (1993) and Doucet, Godsill and Andrieu (2000) of the state.
     """
     for kind, model in (("plant", plant), ("sensor", sensor)):
         if isinstance(model, ModalPlant | ModalSensor):
             raise fail(kind, "one law (imm_filter and gpb2_filter take several)", f"a markov_{kind}")
+    if not memories(channel):
+        count = MANY if particles is None else particles
+        return build_state_particles(plant, sensor, channel, count, seed, proposal, resample)
     return ParticleFilter(
-        particles=check_count("particles", particles),
+        particles=check_count("particles", FEW if particles is None else particles),
         seed=np.asarray(check_count("seed", seed, 0)),
         **fields_of_mode_filters(plant, sensor, channel, transform, nodes),
     )

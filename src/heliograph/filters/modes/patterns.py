@@ -1,6 +1,7 @@
 """A channel at one step by mode and by which components arrive, and flags that come with a packet."""
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +77,19 @@ def _describe_step_by_pattern(
     return SideInformation(before.transition, present, chance, mean, np.reshape(gains, spread.shape), noise, flags)
 
 
-def pattern_of(channel: SideInformation, arrived: Bool[Array, " m"]) -> jax.Array:
+class HasPatterns(Protocol):
+    """Whatever knows by pattern which components arrive, and the pattern's chance in each mode."""
+
+    @property
+    def present(self) -> Bool[Array, "A m"]:
+        """Which components arrive."""
+
+    @property
+    def chance(self) -> Float[Array, "M A"]:
+        """Chance of each pattern by mode."""
+
+
+def pattern_of(channel: HasPatterns, arrived: Bool[Array, " m"]) -> jax.Array:
     """Return the index of the smallest possible pattern in which all components that arrived arrive."""
     present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
     fits = jnp.all(present | ~arrived, axis=1) & possible

@@ -1,0 +1,71 @@
+"""Where particles are drawn with a measurement: from the law of the noise given it, a tenth from the prior.
+
+Notation: x+ = m + G e, e ~ N(0, I), and z = M (h(m) + H G e) + c + r, r ~ N(0, R), to first order.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.particles.received_density import Atoms
+from heliograph.model.sensor import AbstractSensor, LinearSensor
+from heliograph.numerics.angle import Angles, nearest
+
+SAFE = 0.1  # share of the proposal that is the prior: weights are then bounded, where h saturates too
+LOG_TURN = float(np.log(2 * np.pi))
+
+
+class Moved(NamedTuple):
+    """Law of x+ before the measurement, of each particle: m + G e with e ~ N(0, I).
+
+    Shapes: center m (N, n), root G (n, n), the same of all particles; zero once it was drawn with a measurement.
+    """
+
+    center: jax.Array
+    root: jax.Array
+
+
+class Proposed(NamedTuple):
+    """Positions (N, n) that were drawn with the measurement, and log N(e; 0, I) / q(e) of each (N,)."""
+
+    position: jax.Array
+    correction: jax.Array
+
+
+def propose(
+    moved: Moved, sensor: AbstractSensor, atoms: Atoms, z: jax.Array, angles: Angles, key: jax.Array
+) -> Proposed:
+    """Draw e from q, which is N(C' S^-1 r, I - C' S^-1 C) with C = M H G, S = C C' + R and r what z exceeds E z by.
+
+    In coordinates of the noise, so that its covariance may be singular; (I + C' R^-1 C)^-1 is the same covariance.
+    Where the sensor is linear and the noise Gaussian q is the law of e given z; else a tenth of it is N(0, I).
+    """
+    safe = 0.0 if isinstance(sensor, LinearSensor) and len(atoms.weight) == 1 else SAFE
+    gain, offset, noise = atoms.moments()
+    arrived = ~jnp.isnan(z)
+    noise = jnp.where(arrived[:, None] & arrived, noise, jnp.eye(len(z)))
+    draws = jax.random.normal(key, moved.center.shape, dtype=float)
+    chosen = jax.random.uniform(jax.random.fold_in(key, 1), moved.center.shape[:1], dtype=float) < safe
+
+    def one(center: jax.Array, draw: jax.Array, from_prior: jax.Array) -> tuple[jax.Array, jax.Array]:
+        slope = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else jax.jacfwd(sensor.measure)(center)
+        columns = jnp.where(arrived[:, None], gain @ slope @ moved.root, 0.0)
+        rest = nearest(z - gain @ sensor.measure(center) - offset, jnp.zeros(len(z)), angles)
+        # The law of e given z, by its precision L L'.
+        scaled = jnp.linalg.solve(noise, columns)
+        lower = jnp.linalg.cholesky(jnp.eye(len(center)) + columns.T @ scaled)
+        # As matrices, which are the same of all particles where the sensor is linear.
+        kalman_gain = jax.scipy.linalg.cho_solve((lower, True), scaled.T)
+        spread = jax.scipy.linalg.solve_triangular(lower.T, jnp.eye(len(center)), lower=False)
+        mean = kalman_gain @ jnp.where(arrived, rest, 0.0)
+        told = mean + spread @ draw
+        e = jnp.where(from_prior | ~jnp.all(jnp.isfinite(told)), draw, told)
+        # log N(e; 0, I) - log q(e), without the constants that both have.
+        log_prior = -e @ e / 2
+        log_told = -jnp.sum((lower.T @ (e - mean)) ** 2) / 2 + jnp.sum(jnp.log(jnp.diagonal(lower)))
+        log_q = log_told if not safe else jnp.logaddexp(jnp.log(1 - safe) + log_told, jnp.log(safe) + log_prior)
+        return center + moved.root @ e, jnp.where(jnp.isfinite(log_q), log_prior - log_q, 0.0)
+
+    return Proposed(*jax.vmap(one)(moved.center, draws, chosen))

@@ -1,0 +1,125 @@
+"""Density of what is received given the sensor's h(x): a mixture of Gaussians, for each set of what arrives."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.modes.patterns import pattern_of
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.angle import Angles, nearest
+from heliograph.numerics.check import fail
+from heliograph.numerics.density import log_density
+from heliograph.numerics.module import Module
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import Array, Bool, Float
+from heliograph.random_affine.base import AbstractRandomAffine, Outcome
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.moments.components import Component
+
+CERTAIN = 1e-14  # of the largest eigenvalue of a noise's correlations: below it a combination has no noise
+
+
+class Atoms(Module):
+    """Atoms of z given y = h(x) for one set of arrivals: z = gain y + offset + N(0, noise) with probability `weight`.
+
+    Shapes: weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
+    """
+
+    weight: Array
+    gain: Array
+    offset: Array
+    noise: Array
+
+    def expected(self, y: jax.Array) -> jax.Array:
+        """Return E[z | y, atom] of each atom, (a, m)."""
+        expected: jax.Array = jnp.asarray(self.gain) @ y + jnp.asarray(self.offset)
+        return expected
+
+    def log_density(self, y: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
+        """Return log p(z | y) of the components that arrived; -inf where y is no number."""
+
+        def of_atom(expected: jax.Array, noise: jax.Array) -> jax.Array:
+            value = jnp.where(jnp.isnan(z), jnp.nan, jnp.where(jnp.isfinite(expected), z - expected, jnp.inf))
+            value = jnp.where(jnp.isfinite(value), nearest(value, jnp.zeros_like(value), angles), value)
+            density: jax.Array = log_density(value, noise, jnp.zeros_like(value))
+            return density
+
+        each = jax.vmap(of_atom)(self.expected(y), jnp.asarray(self.noise))
+        total = jax.nn.logsumexp(jnp.log(jnp.asarray(self.weight)) + each)
+        return jnp.where(jnp.isnan(total), -jnp.inf, total)
+
+    def moments(self) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return mean gain (m, p), mean offset (m,), and the noise's covariance about it (m, m)."""
+        weight, offset = jnp.asarray(self.weight), jnp.asarray(self.offset)
+        mean = weight @ offset
+        noise = jnp.einsum("a,aij->ij", weight, jnp.asarray(self.noise) + jnp.einsum("ai,aj->aij", offset, offset))
+        return jnp.einsum("a,aij->ij", weight, jnp.asarray(self.gain)), mean, noise - jnp.outer(mean, mean)
+
+
+class ReceivedDensity(Module):
+    """Atoms of what is received at one step, for each set of components that arrive together.
+
+    Shapes: present (A, m), chance (1, A), and the atoms' with a first axis A.
+    """
+
+    present: Bool[Array, "A m"]
+    chance: Float[Array, "1 A"]
+    atoms: Atoms
+
+    def given_arrivals(self, z: jax.Array) -> Atoms:
+        """Return the atoms of the smallest set in which all arrive that did."""
+        kind = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
+        chosen: Atoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[kind], self.atoms)
+        return chosen
+
+
+def find_received_density(sensor: AbstractSensor, channel: AbstractRandomAffine) -> ReceivedDensity:
+    """Return the density of z given h(x) behind a channel without memory.
+
+    Raises:
+        ValueError: gains or noises that are no mixture of finitely many Gaussians; a received number, or a combination
+            of several, without noise.
+    """
+    outcomes = sorted(channel.list_outcomes(), key=lambda outcome: (sum(outcome.arrived), tuple(outcome.arrived)))
+    by_outcome = [_list_atoms(sensor, outcome) for outcome in outcomes]
+    most = max(len(atoms) for atoms in by_outcome)
+    padded = [_stack_atoms(atoms, most) for atoms in by_outcome]
+    present = np.array([outcome.arrived for outcome in outcomes], dtype=bool)
+    chance = np.array([[outcome.probability for outcome in outcomes]], dtype=float)
+    return ReceivedDensity(present, chance, jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
+
+
+def _list_atoms(sensor: AbstractSensor, outcome: Outcome) -> list[Component]:
+    """List the atoms of one set of arrivals, each with noise in all that arrives."""
+    outputs = len(sensor.outputs)
+    received = GainAndNoise(Constant(1.0), np.eye(outputs), sensor.noise)
+    try:
+        atoms = Series([received, outcome.map]).list_atoms()
+    except ValueError as error:
+        expected = "gains of finitely many values and noises that are Gaussian or mixtures of such"
+        raise fail("channel of particles", expected, str(error).rsplit("got ", 1)[-1]) from error
+    if is_traced(atoms):
+        raise fail("plant, sensor and channel of particles", "numbers: their likelihood jumps", "what is to be learned")
+    for atom in atoms:
+        _check_noise(np.asarray(atom.noise)[np.ix_(outcome.arrived, outcome.arrived)])
+    return [atom for atom in atoms if atom.weight > 0]
+
+
+def _check_noise(covariance: np.ndarray) -> None:
+    """Raise ValueError unless every combination of what arrives has noise."""
+    deviation = np.sqrt(np.diagonal(covariance))
+    correlation = covariance / np.outer(*[np.where(deviation > 0, deviation, 1.0)] * 2)
+    if len(covariance) and not np.min(np.linalg.eigvalsh(correlation)) > CERTAIN:
+        expected = "noise in everything that arrives, so that it has a density (give the sensor or the link a variance)"
+        raise fail("output of particles", expected, f"the covariance {covariance.tolist()}")
+
+
+def _stack_atoms(atoms: Sequence[Component], count: int) -> Atoms:
+    """Stack atoms into arrays of `count`, the missing ones of weight zero."""
+    filled = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
+    weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*filled, strict=True))
+    return Atoms(weight / weight.sum(), gain, offset, noise)
