@@ -182,11 +182,13 @@ def _open_frames(path: Path, stack: ExitStack) -> "tuple[MessageReader, float, f
 
     kind = path.suffix.lower()
     if kind == ".blf":
-        blf = stack.enter_context(BLFReader(path))
+        blf = BLFReader(path)
+        stack.callback(blf.stop)
         return blf, blf.start_timestamp, 0.0
     if kind == ".asc":
         # Frames have seconds from the begin, whose date has no zone: it is read as UTC, on every machine.
-        dated = stack.enter_context(ASCReader(path, relative_timestamp=False))
+        dated = ASCReader(path, relative_timestamp=False)
+        stack.callback(dated.stop)
         next(iter(dated), None)
         begin = datetime.fromtimestamp(dated.start_time).replace(tzinfo=UTC).timestamp() if dated.start_time else 0.0
         if dated.timestamps_format == "relative":

@@ -42,7 +42,8 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 def _name_groups(file: "MDF") -> list[str]:
     """Return a distinct name for each channel group."""
     names = list[str]()
-    for i, group in enumerate(file.groups):
+    groups: Any = file.groups
+    for i, group in enumerate(groups):
         name = str(group.channel_group.acq_name or f"group {i}").strip()
         names.append(name if name not in names else f"{name} {i}")
     return names
