@@ -12,6 +12,11 @@ from .backtest import (
     Backtest as Backtest,
     Score as Score,
 )
+from .disturbances import (
+    Disturbances as Disturbances,
+    Shock as Shock,
+    disturbances as disturbances,
+)
 from .one_step import (
     predict_record as predict_record,
     predict_rows as predict_rows,
