@@ -23,6 +23,9 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
+Rows = np.ndarray  # an entry for each step along the first axis
+FEW = 10  # effective number of particles below which their moments say nothing
+
 
 class SteppedFilter(Protocol):
     """Filter as a scan over rows reads it."""
@@ -72,17 +75,20 @@ class Filtered:
             that weighs nothing.
         origin: the state after the last row, from which `hg.forecast` predicts; None where it was not kept.
         modes: probabilities of the modes (steps, M); None of a filter that weighs none.
+        effective_numbers: of particles after each row (steps,), 1 / sum of the squared weights; None of a filter
+            without particles of the state.
     """
 
-    means: np.ndarray
-    covariances: np.ndarray
-    innovations: np.ndarray
-    innovation_covariances: np.ndarray
-    log_likelihoods: np.ndarray
-    claim: Claim
+    means: "Rows"
+    covariances: "Rows"
+    innovations: "Rows"
+    innovation_covariances: "Rows"
+    log_likelihoods: "Rows"
+    claim: "Claim"
     weights: "Array | None" = None
-    origin: KeptOrigin = field(default=None, compare=False, repr=False)
+    origin: "KeptOrigin" = field(default=None, compare=False, repr=False)
     modes: "Array | None" = None
+    effective_numbers: "Array | None" = None
 
     @property
     def log_likelihood(self) -> float:
@@ -123,7 +129,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> F
     rows_z, rows_u = check_data(filter, z, u)
     whole = filter_in_chunks(filter, rows_z, rows_u, _tell_estimate)
     state, outputs = whole or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u))
-    mean, covariance, innovation, modes = outputs
+    mean, covariance, innovation, modes, counts = outputs
     lost = find_lost(mean, 1)
     if lost.any():
         said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
@@ -134,8 +140,20 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None) -> F
     origin = Origin(filter, state, len(rows_z), last_input(np.asarray(rows_u)), last, spacing, months=months)
     return Filtered(
         mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
-        innovation.weight, origin, modes,
+        innovation.weight, origin, modes, _warn_of_few(counts),
     )  # fmt: skip
+
+
+def _warn_of_few(counts: Array | None) -> Array | None:
+    """Warn where the effective number of particles is below FEW, and return the numbers."""
+    if counts is None:
+        return None
+    few = np.flatnonzero(np.asarray(counts) < FEW)
+    if len(few):
+        least = float(np.min(np.asarray(counts)))
+        said = f"particle_filter: fewer than {FEW} particles count after {len(few)} of the rows, first row {few[0] + 1}"
+        warnings.warn(f"{said} ({least:.2g} at least); take more of them", stacklevel=4)
+    return counts
 
 
 def _compute_filtered(filter: SteppedFilter, z: Array, u: Array) -> PyTree:
@@ -146,7 +164,7 @@ def _compute_filtered(filter: SteppedFilter, z: Array, u: Array) -> PyTree:
 def _tell_estimate(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
     """Return the estimate of a row, and its innovation."""
     estimate = filter.after_step(state, k)
-    return estimate.mean, estimate.covariance, innovation, estimate.modes
+    return estimate.mean, estimate.covariance, innovation, estimate.modes, getattr(state, "effective_number", None)
 
 
 _by_xla = quickly_compiled(_compute_filtered)

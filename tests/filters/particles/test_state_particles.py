@@ -50,6 +50,17 @@ def test_by_steps_is_the_run_and_another_seed_draws_others():
         state, estimate = filters[0].step(state, row, k=k)
         np.testing.assert_allclose(estimate.mean, runs[0].means[k], rtol=1e-12)  # one program or six: rounding
     assert 1 <= state.effective_number <= 50
+    np.testing.assert_allclose(state.effective_number, runs[0].effective_numbers[-1], rtol=1e-9)
+
+
+def test_weights_that_collapse_are_warned_of():
+    sensor = hg.LinearSensor([[1.0, 0.0]], 1e-8)
+    filter = hg.filters.particle_filter(PLANT, sensor, hg.perfect(), 100, proposal="prior")
+    with pytest.warns(UserWarning, match="fewer than 10 particles count after 2 of the rows, first row 2"):
+        result = filter.run([[np.nan], [0.3], [0.2]])
+    assert result.effective_numbers[0] == pytest.approx(100)
+    assert max(result.effective_numbers[1:]) < 10
+    assert hg.kalman_filter(PLANT, sensor).run([[0.3]]).effective_numbers is None
 
 
 def on_grid(z, noise_density):
@@ -180,7 +191,8 @@ def heading():
 
 @pytest.mark.slow
 def test_a_heading_that_nothing_measures():
-    runs = [hg.filters.particle_filter(*heading(), hg.perfect(), seed=key).run(np.ones((600, 1))) for key in range(30)]
+    parts = (*heading(), hg.perfect())  # the same functions for all keys: one program
+    runs = [hg.filters.particle_filter(*parts, seed=key).run(np.ones((600, 1))) for key in range(30)]
     means = np.array([run.means[-1] for run in runs])
     second = np.mean([run.covariances[-1] for run in runs], axis=0) + np.cov(means.T)
     # Means of 30 keys; between keys x varies by some 7 (1,000 particles), so its mean by 1.3: three of those.

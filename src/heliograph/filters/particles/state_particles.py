@@ -54,11 +54,13 @@ class StateParticles(NamedTuple):
     moved: Bool[jax.Array, ""]
 
     @property
+    @in_float64
     def weight(self) -> jax.Array:
         """Weights (N,), which sum to 1."""
         return jax.nn.softmax(self.log_weight)
 
     @property
+    @in_float64
     def effective_number(self) -> jax.Array:
         """1 / sum of the squared weights: how many particles of equal weight would say as much."""
         return effective_number(self.weight)
@@ -169,7 +171,7 @@ class StateParticleFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: StateParticles) -> Estimate:
         """Return the weighted mean and covariance; of an angle its mean direction, and second moments about it."""
-        angles, weight, x = first(self.plant).angles, state.weight, state.position
+        angles, weight, x = first(self.plant).angles, jnp.asarray(state.weight), jnp.asarray(state.position)
         mean = weight @ x
         for i in angles:
             mean = mean.at[i].set(jnp.arctan2(weight @ jnp.sin(x[:, i]), weight @ jnp.cos(x[:, i])))
