@@ -16,6 +16,7 @@ from heliograph.files.stores.address import StoreAddress
 if TYPE_CHECKING:
     import numpy as np
 
+    from heliograph.files.stores.tables import StoreTable
     from heliograph.live.event import Event
 
 LONGEST = 1e6  # seconds that the system sleeps at once
@@ -107,7 +108,7 @@ def _read_events(
         yield name, list(events.sort_events()), None if events.steps or events.numbers else events.date
 
 
-def _describe_finer(path: Path, time: "np.ndarray") -> list[str]:
+def _describe_finer(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:
     """Say how many dates are finer than the microseconds that messages have; nothing if none is."""
     if time.dtype.kind != "M":
         return []
