@@ -167,7 +167,7 @@ def particle_filter(
         transform: of modes: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
         nodes: of modes: number of modes that stand for a gain that drifts; 9 by default.
         proposal: of the state: "optimal", by default, draws the noise given z, to first order in h, a tenth of the
-            particles without z where h is not linear or the noise a mixture; "prior" draws it without z, and takes any
+            particles without z where h is not linear or the gain random; "prior" draws it without z, and takes any
             law of the process noise.
         resample: of the state: share of N below which the effective number leads to resampling; 0.5 by default.
 

@@ -81,7 +81,7 @@ def find_received_density(sensor: AbstractSensor, channel: AbstractRandomAffine)
     """Return the density of z given h(x) behind a channel without memory.
 
     Raises:
-        ValueError: gains or noises that are no mixture of finitely many Gaussians; a received number, or a combination
+        ValueError: gains not of finitely many values, noises not Gaussian; a received number, or a combination
             of several, without noise.
     """
     outcomes = sorted(channel.list_outcomes(), key=lambda outcome: (sum(outcome.arrived), tuple(outcome.arrived)))
@@ -100,7 +100,7 @@ def _list_atoms(sensor: AbstractSensor, outcome: Outcome) -> list[Component]:
     try:
         atoms = Series([received, outcome.map]).list_atoms()
     except ValueError as error:
-        expected = "gains of finitely many values and noises that are Gaussian or mixtures of such"
+        expected = "gains of finitely many values and Gaussian noises"
         raise fail("channel of particles", expected, str(error).rsplit("got ", 1)[-1]) from error
     if is_traced(atoms):
         raise fail("plant, sensor and channel of particles", "numbers: their likelihood jumps", "what is to be learned")
