@@ -23,7 +23,8 @@ def rows(count, seed=0):
     return np.array([*z[:4], [np.nan], *z[5:]])
 
 
-@pytest.mark.parametrize("proposal", ["optimal", pytest.param("prior", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("proposal", ["optimal", "prior"])
 def test_it_tends_to_the_kalman_filter(proposal):
     z = rows(20)
     right = hg.kalman_filter(PLANT, SENSOR).run(z)
