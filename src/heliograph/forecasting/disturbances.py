@@ -1,7 +1,7 @@
 """Noises given all data: what moved the states and what disturbed the outputs, with the rows of breaks and outliers."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import jax
 import numpy as np
@@ -22,7 +22,9 @@ FALSE = 0.01  # probability of any false shock, of all tests together
 ROUNDING = 1e-12  # of a variance, below which nothing is known of a noise
 
 
-class Shock(NamedTuple):
+@readable
+@dataclass(frozen=True)
+class Shock:
     """A row at which a noise is too large to be one.
 
     Args:
