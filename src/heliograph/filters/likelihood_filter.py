@@ -29,11 +29,11 @@ def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, line
 
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965), by the innovations of each.
     """
+    if memories((plant, sensor)):
+        return imm_filter(plant, sensor, channel)
     start = check_plant(plant)
     check_sensor(first(sensor), len(start.states))
     link = instance("channel", first(channel), AbstractRandomAffine, "a channel")
-    if memories((plant, sensor)):
-        return imm_filter(plant, sensor, channel)
     if isinstance(start.initial_covariance, UnknownStart):
         if words := link.in_words():
             raise fail("channel of a network to be learned", "perfect() beside an unknown start", words)

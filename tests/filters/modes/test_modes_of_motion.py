@@ -142,7 +142,9 @@ def test_smoothing_by_pairs_is_better_than_that_of_the_mixture():
     assert record.smoothed is not None
     estimate = record.smoothed.estimates["node"]["imm"]
     errors = record.truth[:, 29] - estimate.mean[:, 29]
-    np.testing.assert_allclose(np.mean(errors**2, axis=0), [0.2215, 0.216], rtol=0.05)  # three errors of 1.6 percent
+    # Squares have heavy tails: of 8,000 runs their means have errors of 2.3 and 4.1 percent, as has what is compared
+    # with. Three of both together are less than what lies between pairs and mixture.
+    np.testing.assert_allclose(np.mean(errors**2, axis=0), [0.2215, 0.216], rtol=0.098)
     size = np.einsum("ri,rij,rj->r", errors, np.linalg.inv(estimate.covariance[:, 29]), errors).mean() / 2
     assert 0.92 < size < 1.04
     np.testing.assert_allclose(estimate.modes.sum(axis=-1), 1.0, atol=1e-12)

@@ -1,6 +1,7 @@
 """States published to MQTT beside what a service publishes: a retained topic each, with availability and discovery."""
 
 import asyncio
+import threading
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -61,11 +62,11 @@ class StatePublishing:
         return await self._inner.receive()
 
     async def publish(self, outputs: Sequence[Output]) -> None:
-        """Send outputs, then the newest states, which are not waited for: the next ones replace them."""
+        """Send outputs, then the newest states, which are not waited for: they are sent again with each connection."""
         await self._inner.publish(outputs)
         newest = {output.plant: output.body for output in outputs if output.kind == "provisional"}
-        for body in newest.values():
-            self._writer.publish(body)
+        for plant, body in newest.items():
+            self._writer.publish(plant, body)
 
     async def close(self) -> None:
         """Say offline, and release both connections."""
@@ -73,17 +74,29 @@ class StatePublishing:
 
 
 class _StateWriter(Connection):
-    """Connection that publishes states; its last will is that the service is offline."""
+    """Connection that publishes states; its last will is that the service is offline.
+
+    What the client is given while it has no broker it drops, so the newest states are published again with each
+    connection, by the client's thread.
+    """
 
     def __init__(self, topics: StateTopics, states: Sequence[str]):
         super().__init__(topics.address, "")
         self._topics, self._states, self._announced = topics, states, set[str]()
+        self._newest, self._one_at_a_time = dict[str | None, bytes](), threading.Lock()
         self._available = availability_topic(topics.address.topic)
         self.client.will_set(self._available, OFFLINE, AT_LEAST_ONCE, retain=True)
         self.start()
 
-    def publish(self, body: bytes) -> None:
-        """Publish the states of an estimate, and before the first of a filter what Home Assistant has to know."""
+    def publish(self, plant: str | None, body: bytes) -> None:
+        """Publish the states of an estimate of a plant."""
+        with self._one_at_a_time:
+            self._newest[plant] = body
+            if self.client.is_connected():
+                self._publish(body)
+
+    def _publish(self, body: bytes) -> None:
+        """Publish states, and before the first of a filter what Home Assistant has to know."""
         topic = self._topics.address.topic
         if self._topics.discovery:
             for message in make_discovery_messages(topic, self._states, body, self._topics.discovery):
@@ -94,10 +107,13 @@ class _StateWriter(Connection):
             self.client.publish(message.topic, message.body, 0, retain=True)
 
     def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
-        """Say online, and announce everything again: the broker may have forgotten."""
+        """Say online, and publish everything again: the broker may have forgotten."""
         super().connected(client, data, flags, code, more)
-        self._announced.clear()
         client.publish(self._available, ONLINE, AT_LEAST_ONCE, retain=True)
+        with self._one_at_a_time:
+            self._announced.clear()
+            for body in self._newest.values():
+                self._publish(body)
 
     def close(self) -> None:
         """Say offline, which a connection that ends in order does not."""
