@@ -1,5 +1,7 @@
 """Covariances and reception that messages declare, as numbers that are told: of bags, of JSON, of LoRaWAN uplinks."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -78,6 +80,56 @@ def test_fixes_of_a_bag(tmp_path):
     events = list(hg.files.read_messages(str(bag), NETWORK, sources).sort_events())
     expected = [[2.0 * k, 1.0 * k, *(np.nan if k == 3 else (1 + k) * x for x in (4.0, 0.5, 9.0))] for k in range(20)]
     np.testing.assert_array_equal([event.values for event in events], expected)
+    # On a plane: longitudes and latitudes of up to 38 degrees, the covariance that of the axes there.
+    on_plane = {"/fix": replace(GEODETIC, time=hg.files.Stamp("header.stamp"))}
+    events = list(hg.files.read_messages(str(bag), NETWORK, on_plane).sort_events())
+    np.testing.assert_array_equal(
+        [event.values[:2] for event in events], [PLANE.to_plane(1.0 * k, 2.0 * k, 0.0)[:2] for k in range(20)]
+    )
+    turned = PLANE.turn_covariance(19.0, 38.0, 20 * np.reshape(MATRIX, (3, 3)))
+    np.testing.assert_allclose(events[19].values[2:], turned[[0, 0, 1], [0, 1, 1]], rtol=1e-13)
+
+
+PLANE = hg.models.LocalPlane(52.5, 13.4, 34.0)
+POSITION = hg.files.Geodetic(PLANE)
+GEODETIC = json_field(
+    [POSITION.east, POSITION.north, *(POSITION.covariance(i, j) for i, j in ((0, 0), (0, 1), (1, 1)))], "gps"
+)
+
+
+def at_place(latitude, longitude, covariance=MATRIX, kind=2):
+    return fix(covariance, kind) | {"latitude": latitude, "longitude": longitude, "altitude": 50.0}
+
+
+def test_a_fix_in_degrees_is_on_the_plane():
+    """Its covariance, declared in the axes of the fix, is turned into those of the plane."""
+    values = read(GEODETIC, at_place(53.1, 14.9))
+    np.testing.assert_array_equal(values[:2], PLANE.to_plane(53.1, 14.9, 50.0)[:2])
+    turned = PLANE.turn_covariance(53.1, 14.9, np.reshape(MATRIX, (3, 3)))
+    np.testing.assert_allclose(values[2:], turned[[0, 0, 1], [0, 1, 1]], rtol=1e-14)
+    assert np.isnan(read(GEODETIC, at_place(None, 14.9))).all()
+    assert np.isnan(read(GEODETIC, at_place(53.1, 14.9, kind=0))).tolist() == [False, False, True, True, True]
+
+
+def test_whole_numbers_of_degrees_and_millimetres():
+    small = hg.files.Geodetic(PLANE, "lat", "lon", "alt", degrees=1e-7, metres=1e-3)
+    names = ["east", "north"]
+    network = hg.Network(PLANT, {"gps": hg.Node(SENSOR, hg.perfect(2), {})})
+    message = {"lat": 525100000, "lon": 134100000, "alt": 50000}
+    values = read(json_field([small.east, small.north], "gps", names), message, network)
+    np.testing.assert_allclose(values, PLANE.to_plane(52.51, 13.41, 50.0)[:2], rtol=1e-13)
+    flat = hg.files.Geodetic(PLANE, "lat", "lon", None, degrees=1e-7)
+    values = read(json_field([flat.east, flat.up], "gps", names), message, network)
+    np.testing.assert_allclose(values, PLANE.to_plane(52.51, 13.41, 34.0)[[0, 2]], rtol=1e-12)
+
+
+def test_what_is_no_latitude_is_refused_alone():
+    with pytest.raises(ValueError, match=r"latitude of points: expected -90 to 90 degrees .* got 134"):
+        read(GEODETIC, at_place(134.0, 52.5))
+    with pytest.raises(ValueError, match="Geodetic, covariance: expected a row and a column from 0 to 2"):
+        POSITION.covariance(0, 3)
+    with pytest.raises(ValueError, match=r"Geodetic, plane: expected a hg.models.LocalPlane"):
+        hg.files.Geodetic([52.5, 13.4])
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from .bags.output import (
 )
 from .computed import (
     Covariance as Covariance,
+    Geodetic as Geodetic,
     Yaw as Yaw,
 )
 from .estimates.table import (

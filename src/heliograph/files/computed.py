@@ -1,10 +1,13 @@
 """Values of a message that are computed of several of its fields, or of one that may be absent."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from heliograph.models.local_plane import LocalPlane
+from heliograph.numerics.check import TINY, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
 
 SYMMETRIC = 1e-5  # of two deviations: what float32 may leave between two entries that are one
@@ -97,4 +100,144 @@ class ZeroIfAbsent:
         return value
 
 
-Computed = Yaw | Covariance | ZeroIfAbsent
+@readable
+@dataclass(frozen=True)
+class Geodetic:
+    """Latitude, longitude and height in a message, as a position on a local plane: what its values and covariances are.
+
+        fix = hg.files.Geodetic(hg.models.LocalPlane(52.5, 13.4, 34.0))
+        hg.files.json_field([fix.east, fix.north], node="gnss", output=["east", "north"])
+
+    `east`, `north`, `up` and `covariance(row, column)` are values in place of paths; NaN where a coordinate is missing.
+
+    Args:
+        plane: the plane, by its origin.
+        latitude: dotted path of the latitude (default "latitude").
+        longitude: dotted path of the longitude (default "longitude").
+        height: dotted path of the height above the ellipsoid (default "altitude"); None where there is none, and then
+            it is that of the origin.
+        degrees: degrees in one of the message's units of latitude and longitude: 1e-7 of u-blox and PX4 (default 1).
+        metres: metres in one of the message's units of height: 1e-3 of the same (default 1).
+
+    Raises:
+        ValueError: no plane, paths that are no texts, units that are not positive.
+    """
+
+    plane: LocalPlane
+    latitude: str = "latitude"
+    longitude: str = "longitude"
+    height: str | None = "altitude"
+    degrees: float = 1.0
+    metres: float = 1.0
+
+    def __post_init__(self) -> None:
+        instance("Geodetic, plane", self.plane, LocalPlane, "a hg.models.LocalPlane")
+        for name in ("latitude", "longitude", "height"):
+            path = getattr(self, name)
+            if not isinstance(path, str) and not (name == "height" and path is None):
+                raise fail(f"Geodetic, {name}", "a dotted path", show_value(path))
+        scalar("Geodetic, degrees", self.degrees, TINY)
+        scalar("Geodetic, metres", self.metres, TINY)
+
+    @property
+    def east(self) -> "PlaneCoordinate":
+        """Return metres east of the origin."""
+        return PlaneCoordinate(self, 0)
+
+    @property
+    def north(self) -> "PlaneCoordinate":
+        """Return metres north of the origin."""
+        return PlaneCoordinate(self, 1)
+
+    @property
+    def up(self) -> "PlaneCoordinate":
+        """Return metres over the origin's horizontal plane."""
+        return PlaneCoordinate(self, 2)
+
+    def covariance(
+        self,
+        row: int,
+        column: int | None = None,
+        path: str = "position_covariance",
+        kind: str | None = "position_covariance_type",
+    ) -> "PlaneCovariance":
+        """Return an entry of the position's covariance in the plane's axes, from one in east, north, up of the fix.
+
+        Args:
+            row: of the plane, 0 east, 1 north, 2 up.
+            column: likewise; that of the row, a variance, unless given.
+            path: dotted path of the list of 9 numbers, row by row (default that of NavSatFix).
+            kind: as that of `Covariance` (default that of NavSatFix); None where there is none.
+
+        Raises:
+            ValueError: a row or a column that is none of the plane.
+        """
+        places = row, row if column is None else column
+        if any(place not in (0, 1, 2) for place in places):
+            raise fail("Geodetic, covariance", "a row and a column from 0 to 2", show_value(places))
+        return PlaneCovariance(self, places, partial(Covariance, path, kind=kind))
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Return the paths of latitude, longitude, and height where there is one."""
+        return (self.latitude, self.longitude, *(() if self.height is None else (self.height,)))
+
+    def coordinates(self, latitude: Any, longitude: Any, *height: Any) -> tuple[Any, Any, Any]:
+        """Return degrees, degrees and metres of a message's numbers."""
+        above = np.asarray(height[0]) * self.metres if height else self.plane.height
+        return np.asarray(latitude) * self.degrees, np.asarray(longitude) * self.degrees, above
+
+
+@readable
+@dataclass(frozen=True)
+class PlaneCoordinate:
+    """East, north or up of a `Geodetic` position, by its number: a value in place of a path."""
+
+    position: Geodetic
+    axis: int
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Return the paths of the position."""
+        return self.position.parts
+
+    def of(self, *numbers: Any) -> Any:
+        """Return the coordinate in metres, of numbers or of arrays; NaN where one is missing."""
+        return self.position.plane.to_plane(*self.position.coordinates(*numbers))[..., self.axis]
+
+
+@readable
+@dataclass(frozen=True)
+class PlaneCovariance:
+    """Entry of the covariance of a `Geodetic` position, in the plane's axes: a value in place of a path.
+
+    `entry` makes the `Covariance` of a row and a column, in the axes of the position itself.
+    """
+
+    position: Geodetic
+    places: tuple[int, int]
+    entry: "partial[Covariance]"
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Return the paths of the position, and of all entries of its covariance."""
+        return (*self.position.parts, *(part for entry in self._entries for part in entry.parts))
+
+    @property
+    def _entries(self) -> list[Covariance]:
+        return [self.entry(row=row, column=column) for row in range(3) for column in range(3)]
+
+    def of(self, *numbers: Any) -> Any:
+        """Return the entry, of numbers or of arrays; NaN where the covariance or the position is unknown."""
+        begin = len(self.position.parts)
+        latitude, longitude, _ = self.position.coordinates(*numbers[:begin])
+        own = []
+        for entry in self._entries:
+            count = len(entry.parts)
+            own.append(entry.of(*numbers[begin : begin + count]))
+            begin += count
+        matrix = np.stack(np.broadcast_arrays(*own), axis=-1).reshape(*np.shape(own[0]), 3, 3)
+        return self.position.plane.turn_covariance(latitude, longitude, matrix)[..., self.places[0], self.places[1]]
+
+
+Computed = Yaw | Covariance | ZeroIfAbsent | PlaneCoordinate | PlaneCovariance

@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.files.availability import Available
-from heliograph.files.computed import Computed, Covariance, ZeroIfAbsent
+from heliograph.files.computed import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
 from heliograph.files.fields import TimeUnit, at, convert_name
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
@@ -180,8 +180,9 @@ def json_field(
     A count that is absent is 0, as JSON of protobuf has it; a message that has its count and no value measured nothing.
 
     Args:
-        path: dotted path of the value, or the `Yaw` of a quaternion, or several, which are then one measurement.
-            What is told of values (`hg.model.told`) stands after these, such as a `Covariance`.
+        path: dotted path of the value, or the `Yaw` of a quaternion or a coordinate of a `Geodetic` position, or
+            several, which are then one measurement. What is told of values (`hg.model.told`) stands after these, such
+            as a `Covariance`.
         node: name of a node of the network, or "inputs"; or the `Level` of the topic or the `Field` that names it.
         output: name of the output or input, one for each path; None for all of the node's, in their order.
         scale: factor, of all values but covariances, or of each. Shape () or (values,) (default 1).
@@ -231,7 +232,7 @@ def read_paths(value: object) -> tuple[str | Computed, ...]:
     """Return one path or several, checked."""
     items = [value] if isinstance(value, str | Computed) else value
     if not isinstance(items, Sequence) or not all(isinstance(path, str | Computed) for path in items):
-        expected = "a dotted path, hg.files.Yaw or Covariance, or a list of these"
+        expected = "a dotted path, hg.files.Yaw, Covariance or east of a Geodetic, or a list of these"
         raise fail("json_field, path", expected, show_value(value))
     return tuple(items)
 
@@ -285,4 +286,6 @@ def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], ne
     numbers = [float(scalar(f"json_field, {name}", single)) for single in values]
     if len(numbers) == count:
         return tuple(numbers)
-    return tuple(neutral if isinstance(path, Covariance | ZeroIfAbsent) else numbers[0] for path in paths)
+    return tuple(
+        neutral if isinstance(path, Covariance | PlaneCovariance | ZeroIfAbsent) else numbers[0] for path in paths
+    )

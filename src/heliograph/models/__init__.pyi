@@ -8,6 +8,9 @@ from .continuous_time import (
 from .runge_kutta import (
     runge_kutta_plant as runge_kutta_plant,
 )
+from .local_plane import (
+    LocalPlane as LocalPlane,
+)
 from .motion import (
     constant_acceleration as constant_acceleration,
     constant_velocity as constant_velocity,

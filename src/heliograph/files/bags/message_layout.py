@@ -10,6 +10,7 @@ from heliograph.files.computed import Computed
 from heliograph.files.event_table import NONE, EventTable
 from heliograph.files.json_field import Source
 from heliograph.files.sources import SECOND, Sources
+from heliograph.numerics.check import InputError
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -218,7 +219,8 @@ def _convert_columns(
     """Convert the fields of many messages of one source to readings: times, counts and values by output.
 
 
-    Raises LayoutError where a stamp or a count is none, which reading message by message then names.
+    Raises LayoutError where a stamp, a count or what a value is computed of is none, which reading message by message
+    then names.
     """
     none = np.full(len(rows), -1, dtype=np.int64)
     time = np.full(len(rows), NONE)
@@ -226,7 +228,10 @@ def _convert_columns(
     for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
         numbers = [columns[part].astype(np.float64) for part in _parts(path)]
         parts = [np.where(np.isfinite(n), n, np.nan) for n in numbers]
-        value = parts[0] if isinstance(path, str) else path.of(*parts)
+        try:
+            value = parts[0] if isinstance(path, str) else path.of(*parts)
+        except InputError:  # a number of one of them, such as a latitude beyond 90 degrees
+            raise LayoutError from None
         values[:, column] = np.where(np.isfinite(value), scale * value + offset, np.nan)
     # Stamps and counts have to be what a message alone is asked for: set, and whole numbers.
     if source.time is not None:
