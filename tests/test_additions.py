@@ -16,7 +16,7 @@ SOURCE = Path(heliograph.__file__).parent
 PAGE = SOURCE.parents[1] / "CONTRIBUTING.md"
 
 LAW = {
-    "random_affine/fading_law.py": ("", '''
+    "random_affine/laws/fading.py": ("", '''
 
 class Weibull(AbstractLaw):
     """Weibull fading, g = scale (-log u)^(1/shape) with u uniform."""

@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import textwrap
+from collections import Counter
 from functools import cache
 from graphlib import TopologicalSorter
 from importlib import import_module
@@ -14,6 +15,7 @@ import pytest
 import heliograph
 
 SOURCE = Path(heliograph.__file__).parent
+PACKAGES = SOURCE, SOURCE.parent / "straightline", SOURCE.parents[1] / "studies"
 # Later may import earlier, never the reverse.
 ORDER = [
     ["numerics"],
@@ -171,9 +173,14 @@ def test_no_public_function_is_without_a_docstring():
 
 def test_no_file_is_longer_than_four_hundred_lines():
     """One idea a file: what is longer has two."""
-    packages = SOURCE, SOURCE.parent / "straightline", SOURCE.parents[1] / "studies"
-    lengths = {path: len(path.read_text().splitlines()) for package in packages for path in package.rglob("*.py")}
+    lengths = {path: len(path.read_text().splitlines()) for package in PACKAGES for path in package.rglob("*.py")}
     assert lengths and not {str(path): length for path, length in lengths.items() if length > 400}
+
+
+def test_no_folder_has_more_than_twenty_files():
+    """What is in a folder is seen at a glance; more than that has groups, which are folders."""
+    counts = Counter(path.parent for package in PACKAGES for path in package.rglob("*.py"))
+    assert counts and not {str(folder): count for folder, count in counts.items() if count > 20}
 
 
 def test_the_library_knows_no_study():

@@ -21,13 +21,13 @@ from . import (
 from .numerics.check import (
     InputError as InputError,
 )
-from .random_affine.fading_law import (
+from .random_affine.laws.fading import (
     Rayleigh as Rayleigh,
 )
-from .random_affine.flips import (
+from .random_affine.words.flips import (
     decode_and_forward as decode_and_forward,
 )
-from .random_affine.law import (
+from .random_affine.laws.law import (
     Discrete as Discrete,
 )
 from .random_affine.noise import (
@@ -75,7 +75,7 @@ from .model.trigger import (
     SendOnPredictionError as SendOnPredictionError,
     StochasticTrigger as StochasticTrigger,
 )
-from .model.words import (
+from .model.words.encoder import (
     Words as Words,
 )
 from .filters.event.factory import (

@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.files.sources import Sources
+from heliograph.files.sources.sources import Sources
 from heliograph.serving import LineReader
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.storage.store import Store

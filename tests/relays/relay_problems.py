@@ -7,9 +7,9 @@ from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
-from heliograph.random_affine.fading_law import LogNormal
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.law import GivenMoments, bernoulli
+from heliograph.random_affine.laws.fading import LogNormal
+from heliograph.random_affine.laws.law import GivenMoments, bernoulli
 from heliograph.random_affine.noise import Gaussian
 from tests.oracles import successive_relays as oracle
 

@@ -10,7 +10,7 @@ from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
-from heliograph.random_affine.fading_law import Rayleigh
+from heliograph.random_affine.laws.fading import Rayleigh
 from heliograph.relays.bfgs import bfgs
 from heliograph.relays.design import given_design, local_error_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic import (

@@ -52,7 +52,7 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
     """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
     from heliograph.files.inspection import inspect_bag, inspect_file, inspect_log
     from heliograph.files.logs.log import is_log
-    from heliograph.files.message_files import LINES
+    from heliograph.files.messages.in_files import LINES
     from heliograph.files.text.text_file import kind_of
     from heliograph.report.progress import progress
 

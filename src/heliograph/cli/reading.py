@@ -138,8 +138,8 @@ def read_events(
     """Read the messages of a bag, a file or a store; None for rows of time."""
     from heliograph.files.bags.bag import is_bag
     from heliograph.files.logs.log import is_log
-    from heliograph.files.messages import is_mapped
-    from heliograph.files.messages import read_events as read_mapped
+    from heliograph.files.messages.to_events import is_mapped
+    from heliograph.files.messages.to_events import read_events as read_mapped
     from heliograph.numerics.check import fail
 
     sources = module.get("sources")

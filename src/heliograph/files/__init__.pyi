@@ -6,7 +6,7 @@ from .availability import (
 from .bags.output import (
     Pose as Pose,
 )
-from .computed import (
+from .sources.computed import (
     Covariance as Covariance,
     Geodetic as Geodetic,
     Yaw as Yaw,
@@ -23,7 +23,7 @@ from .fitted import (
 from .estimates.forecasts import (
     write_forecast as write_forecast,
 )
-from .json_field import (
+from .sources.json_field import (
     Count as Count,
     Field as Field,
     Level as Level,
@@ -34,11 +34,11 @@ from .json_field import (
 from .logs.log_sources import (
     LogSources as LogSources,
 )
-from .lorawan import (
+from .sources.lorawan import (
     chirpstack as chirpstack,
     the_things_stack as the_things_stack,
 )
-from .messages import (
+from .messages.to_events import (
     read_messages as read_messages,
 )
 from .network_file import (
@@ -49,7 +49,7 @@ from .recording import (
     read_recording as read_recording,
     write_recording as write_recording,
 )
-from .sources import (
+from .sources.sources import (
     Reading as Reading,
 )
 from .stores.tables import (

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.files.sources import Reading
+from heliograph.files.sources.sources import Reading
 from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.plant import GAP
 from heliograph.numerics.check import fail

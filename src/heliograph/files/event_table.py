@@ -15,7 +15,7 @@ from heliograph.files.event_columns import (
     number_within,
 )
 from heliograph.files.recording import Recording
-from heliograph.files.sources import Reading
+from heliograph.files.sources.sources import Reading
 from heliograph.learning.losses.delays import Delays, learn_delays
 from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
 from heliograph.model.plant import TIME_STEP

@@ -12,10 +12,15 @@ import numpy as np
 
 from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
-from heliograph.files.fields import TimeUnit, convert_time, decode_json, parse_arrival
 from heliograph.files.logs.log_sources import LogSources
 from heliograph.files.logs.reading import open_log
-from heliograph.files.message_files import decode_payload, is_message_file, message_name, read_message_file
+from heliograph.files.messages.in_files import (
+    decode_payload,
+    is_message_file,
+    message_name,
+    read_message_file,
+)
+from heliograph.files.sources.fields import TimeUnit, convert_time, decode_json, parse_arrival
 from heliograph.numerics.check import InputError, fail, show_error
 from heliograph.numerics.times.dates import UNITS, looks_like_date
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.files.table import TIME, Rows, columns_of, read_back_name, read_rows, write_table
 from heliograph.files.table_rows import Cells, KeptRows, keep_rows, order_rows
-from heliograph.model.inputs import find_time_step_fault
+from heliograph.model.checks.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable

@@ -15,8 +15,8 @@ from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis
 from heliograph.filters.vector import check_vector
+from heliograph.model.checks.inputs import check_time_step, do_inputs_spoil
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.inputs import check_time_step, do_inputs_spoil
 from heliograph.model.over_time import steps_covered
 from heliograph.model.premises.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles

@@ -12,10 +12,10 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import filter_in_chunks
+from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.row_times import common_dates, judge_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.inputs import check_inputs
 from heliograph.model.origin import KeptOrigin, Origin, last_input, usual_months, usual_spacing
-from heliograph.model.unequal_steps import common_dates, judge_dates
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_lost

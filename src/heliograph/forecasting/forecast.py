@@ -12,7 +12,7 @@ from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.forecasting.horizons import Ahead, Horizons, Inputs, ahead_of, check_ahead
 from heliograph.forecasting.outlook import Outlook, look_ahead, outlook_of, output_claim, prediction_of
 from heliograph.forecasting.prediction import Forecast
-from heliograph.model.enlarged import joint_sensor
+from heliograph.model.enlarged.joint import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
 from heliograph.model.origin import HasOrigin, Origin
 from heliograph.model.over_time import first

@@ -29,7 +29,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.monomials import exponents, symmetric_power
 from heliograph.random_affine.moments.push import Tabulated, products_of_monomials, push_known, push_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent

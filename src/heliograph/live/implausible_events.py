@@ -12,8 +12,8 @@ from heliograph.live.event import Known
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
 from heliograph.live.rows import BEFORE, HeldRow
+from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.estimate import Estimate
-from heliograph.model.faults import find_function_fault
 from heliograph.numerics.types import Float
 from heliograph.simulation.description.wide_angles import WideAngles
 from heliograph.simulation.network import Network

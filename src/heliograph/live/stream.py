@@ -16,9 +16,9 @@ from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_s
 from heliograph.live.stored.old_layout import can_read, describe_old_layout, relocate_parts, split_by_path
 from heliograph.live.stored.snapshot import Identity, check_same, pack, unpack, versions
 from heliograph.model.channel import Channel
+from heliograph.model.checks.faults import find_function_fault
+from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
-from heliograph.model.faults import find_function_fault
-from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.model.origin import Origin
 from heliograph.model.over_time import first

@@ -10,10 +10,12 @@ from .channel import (
     silent as silent,
     with_direct_link as with_direct_link,
 )
-from .enlarged import (
+from .enlarged.clocks import (
     Clock as Clock,
-    joint_sensor as joint_sensor,
     with_clocks as with_clocks,
+)
+from .enlarged.joint import (
+    joint_sensor as joint_sensor,
 )
 from .estimate import (
     Estimate as Estimate,
@@ -36,7 +38,7 @@ from .over_time import (
     steps_covered as steps_covered,
     OverTime as OverTime,
 )
-from .enlarged import (
+from .enlarged.past import (
     with_past as with_past,
 )
 from .relays import (
@@ -45,7 +47,7 @@ from .relays import (
 from .sensor import (
     AbstractSensor as AbstractSensor,
 )
-from .bias import (
+from .enlarged.bias import (
     with_bias as with_bias,
 )
 from .told import (

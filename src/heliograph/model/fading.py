@@ -14,7 +14,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.chain import Autoregression, MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import memories, replace_memories
 from heliograph.random_affine.modes import (
     Faded,

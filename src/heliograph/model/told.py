@@ -15,7 +15,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.law import AbstractLaw
+from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.told import FreshNumbers, FreshReading, GainTold, PilotedHop, Told, told_maps

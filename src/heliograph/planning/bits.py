@@ -9,15 +9,15 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
-from heliograph.model.words import Words
+from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.flips import Flips
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.words.flips import Flips
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.linear.linear import linear_filter
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged import join_links
+from heliograph.model.enlarged.joint import join_links
 from heliograph.model.over_time import OverTime, at, first, over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, fail, instance, table

@@ -19,12 +19,12 @@ from .moments.lift import (
     Lift as Lift,
     square as square,
 )
-from .fading_law import (
+from .laws.fading import (
     LogNormal as LogNormal,
     Nakagami as Nakagami,
     Rician as Rician,
 )
-from .law import (
+from .laws.law import (
     AbstractLaw as AbstractLaw,
     Constant as Constant,
     GivenMoments as GivenMoments,

@@ -19,7 +19,7 @@ from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.composite import DIRECT, AbstractWrapper
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.law import Discrete
+from heliograph.random_affine.laws.law import Discrete
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.monomials import Moments

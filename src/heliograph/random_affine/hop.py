@@ -11,7 +11,7 @@ from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.traced import equal_to_rounding, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise
-from heliograph.random_affine.law import AbstractLaw, Constant
+from heliograph.random_affine.laws.law import AbstractLaw, Constant
 from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, disturb_hop, noise_gain
 from heliograph.random_affine.moments.intervals import Interval

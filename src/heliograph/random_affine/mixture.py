@@ -14,7 +14,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, SameNoise, check
 from heliograph.random_affine.combine import AbstractCombination, Corners
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
-from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.laws.law import Constant, Discrete
 from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, mix_gains
 from heliograph.random_affine.moments.monomials import Moments, product_table

@@ -19,7 +19,7 @@ from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, S
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, AbstractWrapper
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import condition_on_states, memories, select_alike
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import Moments

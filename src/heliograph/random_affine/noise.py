@@ -15,7 +15,7 @@ from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.law import draw_index
+from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.components import (
     Branches,
     NoiseAtom,

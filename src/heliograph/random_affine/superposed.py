@@ -16,7 +16,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, Same
 from heliograph.random_affine.combine import AbstractCombination, Corners, Series, Stack
 from heliograph.random_affine.composite import list_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.moments.components import Component
 from heliograph.random_affine.moments.disturbed_gain import DisturbedGain

@@ -17,9 +17,9 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
 from heliograph.random_affine.chain import AbstractMemory, CertainChain, MarkovChain, Nodes, identify_memory
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
-from heliograph.random_affine.law import AbstractLaw, CertainDiscrete, Constant, Discrete
+from heliograph.random_affine.laws.law import AbstractLaw, CertainDiscrete, Constant, Discrete
+from heliograph.random_affine.laws.reading import check_density, gain_given_reading
 from heliograph.random_affine.noise import FACTOR_TOLERANCE, AbstractNoise, Matrix
-from heliograph.random_affine.reading import check_density, gain_given_reading
 
 T = TypeVar("T")
 Numbers = Float[jax.Array | np.ndarray, " told"]

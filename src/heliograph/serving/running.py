@@ -187,7 +187,7 @@ async def _watch_services(settings: ServiceSettings) -> AsyncIterator[Look]:
     if settings.page is None:
         yield lambda service: service
         return
-    from heliograph.files.sources import Sources
+    from heliograph.files.sources.sources import Sources
     from heliograph.serving.observation.page import parse_page_address, serve_page
     from heliograph.serving.observation.watch import watch_of
 

@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .transmission import (
+from .transmission.recorded_signal import (
     arrivals as arrivals,
 )
 from .centres.before_data import (
@@ -91,6 +91,6 @@ from .results.whiteness import (
     score_innovations as score_innovations,
     whitened_innovations as whitened_innovations,
 )
-from .transmission import (
+from .transmission.recorded_signal import (
     transmit as transmit,
 )

@@ -22,16 +22,16 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.told import name_received
 from heliograph.model.trigger import AbstractTrigger, Periodic
-from heliograph.model.word_route import FLAG, find_places
-from heliograph.model.words import Words
+from heliograph.model.words.encoder import Words
+from heliograph.model.words.route import FLAG, find_places
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value, table
 from heliograph.numerics.frozen import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
-from heliograph.random_affine.flips import Flips
 from heliograph.random_affine.modes import ModeOutput, OneStepLate
+from heliograph.random_affine.words.flips import Flips
 
 FUSED = "fused"  # the name under which results of several nodes stand
 NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"

@@ -11,9 +11,9 @@ from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import Recursion, scan_in_chunks
+from heliograph.model.checks.row_times import common_dates, warn_of_unequal_steps
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
-from heliograph.model.unequal_steps import common_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.times.row_times import check_times
@@ -33,9 +33,9 @@ from heliograph.simulation.plausible_step import (
     step_plausibly,
 )
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
-from heliograph.simulation.shared_dithers import refuse_shared_dithers
 from heliograph.simulation.smoothed import Smoother, add_truth, make_record, select_smoothed_part
 from heliograph.simulation.stepping import AllFilters, initial_states
+from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with

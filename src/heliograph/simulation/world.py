@@ -14,9 +14,14 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import condition_on_memories
 from heliograph.simulation.random_keys import INITIAL, PROCESS, WORLD, draw_key
-from heliograph.simulation.reception import AbstractMedium
-from heliograph.simulation.shared_fading import PLANT, memory_places, move_modes, start_modes
 from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.transmission.reception import AbstractMedium
+from heliograph.simulation.transmission.shared_fading import (
+    PLANT,
+    memory_places,
+    move_modes,
+    start_modes,
+)
 from straightline import present
 
 

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 import heliograph as hg
 
 pytest.importorskip("uvicorn")
-from heliograph.files.sources import Sources
+from heliograph.files.sources.sources import Sources
 from heliograph.live.plant import LinkCounts
 from heliograph.serving.observation.page import PageAddress, Tallies, parse_page_address, serve_page
 from heliograph.serving.observation.running_nis import RunningNis

@@ -10,10 +10,10 @@ import pytest
 import heliograph as hg
 from heliograph.numerics.keys import seed_key
 from heliograph.relays.design import local_error_design
-from heliograph.simulation.reception import make_reception
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
 from heliograph.simulation.runs.native import compile_runs
 from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.transmission.reception import make_reception
 from heliograph.simulation.world import World
 from straightline.nodes import Node, Unsupported
 from tests.relays.relay_problems import example

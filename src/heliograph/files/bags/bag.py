@@ -14,7 +14,7 @@ import numpy as np
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from heliograph.files.bags.message_layout import Decoder, RawMessage
 from heliograph.files.event_table import EventTable
-from heliograph.files.sources import Sources, Unread
+from heliograph.files.sources.sources import Sources, Unread
 from heliograph.numerics.check import InputError, fail, show_error
 
 if TYPE_CHECKING:

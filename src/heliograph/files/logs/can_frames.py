@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from heliograph.files.logs.log import DIGITS, Log, Wanted
 from heliograph.files.logs.log_sources import STAMP, LogSources
-from heliograph.files.message_files import FileMessage
+from heliograph.files.messages.in_files import FileMessage
 from heliograph.files.text.text_file import CutOffError
 from heliograph.numerics.check import InputError, fail, show_error
 

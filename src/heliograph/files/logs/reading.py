@@ -9,8 +9,8 @@ from heliograph.files.logs.log import MDF, ULOG, Log, Wanted
 from heliograph.files.logs.log_sources import STAMP, LogSources
 from heliograph.files.logs.mdf import open_mdf
 from heliograph.files.logs.ulog import open_ulog
-from heliograph.files.message_files import FileMessage
-from heliograph.files.sources import Sources
+from heliograph.files.messages.in_files import FileMessage
+from heliograph.files.sources.sources import Sources
 from heliograph.numerics.check import InputError, fail
 
 LISTED = 8  # names in one line

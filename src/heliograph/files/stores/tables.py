@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.files.estimates.table import estimate_columns
-from heliograph.files.message_files import FileMessage, convert_row
+from heliograph.files.messages.in_files import FileMessage, convert_row
 from heliograph.files.stores.address import INFLUX, StoreAddress, parse_store
 from heliograph.files.table import TIME, Rows, columns_of
 from heliograph.numerics.check import fail, instance, text

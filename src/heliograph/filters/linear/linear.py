@@ -30,7 +30,7 @@ from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
-from heliograph.model.words import Words
+from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetric
@@ -38,7 +38,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outliers import has_bounded_noise
-from heliograph.random_affine.rounded import find_rounded
+from heliograph.random_affine.words.rounded import find_rounded
 
 
 class LinearFilter(AbstractSizedFilter):

@@ -17,7 +17,7 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, Outcome
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.components import Component
 
 CERTAIN = 1e-14  # of the largest eigenvalue of a noise's correlations: below it a combination has no noise

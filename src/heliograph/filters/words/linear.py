@@ -23,14 +23,14 @@ from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_nois
 from heliograph.model.over_time import at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
-from heliograph.model.word_route import FLAG, about_centres, find_places
-from heliograph.model.words import Words
+from heliograph.model.words.encoder import Words
+from heliograph.model.words.route import FLAG, about_centres, find_places
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.rounded import Rounded, find_rounded
+from heliograph.random_affine.words.rounded import Rounded, find_rounded
 
 SEEN = 0.01  # share of the rms error that overload may change a claim by
 MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]

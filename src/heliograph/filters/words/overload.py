@@ -12,14 +12,14 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, steps_covered, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.model.words import Words
+from heliograph.model.words.encoder import Words
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.rounded import Rounded
+from heliograph.random_affine.words.rounded import Rounded
 
 STEPS = 500  # that are looked at, if the models do not end before
 MOST = 1e-3  # probability of an overload at a step that is not refused

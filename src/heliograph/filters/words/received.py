@@ -9,18 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.word_route import refuse_link
+from heliograph.model.words.route import refuse_link
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.erasure import Erasure
-from heliograph.random_affine.flips import Flips
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput, Modes
+from heliograph.random_affine.words.flips import Flips
 
 MOST = 64  # combinations of error rates
 

@@ -25,15 +25,15 @@ from heliograph.model.over_time import OverTime, at, at_each_step, first, unstac
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
-from heliograph.model.word_route import FLAG, about_centres, find_places
-from heliograph.model.words import Dither, Words
+from heliograph.model.words.encoder import Dither, Words
+from heliograph.model.words.route import FLAG, about_centres, find_places
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.rounded import LARGEST, Rounded, find_rounded
+from heliograph.random_affine.words.rounded import LARGEST, Rounded, find_rounded
 
 OFF = 1e-6  # steps by which a received number may miss a word
 

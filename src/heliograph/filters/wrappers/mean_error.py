@@ -17,9 +17,9 @@ from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.chain import AbstractMemory, MarkovChain
-from heliograph.random_affine.law import AbstractLaw
+from heliograph.random_affine.laws.law import AbstractLaw
+from heliograph.random_affine.laws.reading import gain_nodes, reading_nodes
 from heliograph.random_affine.noise import FiniteSupport
-from heliograph.random_affine.reading import gain_nodes, reading_nodes
 from heliograph.random_affine.told import FreshNumbers, FreshReading, told_maps
 
 MOST = 20_000  # combinations of numbers that are summed over

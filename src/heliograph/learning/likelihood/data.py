@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.model.inputs import check_inputs
-from heliograph.model.unequal_steps import judge_dates, warn_of_unequal_steps
+from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.row_times import judge_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.masked import fill_masked
 from heliograph.numerics.times.rows import check_rows

@@ -15,7 +15,7 @@ from heliograph.filters.likelihood_filter import likelihood_filter
 from heliograph.learning.description import Build, Description
 from heliograph.learning.likelihood.data import Data
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged import join_links
+from heliograph.model.enlarged.joint import join_links
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant

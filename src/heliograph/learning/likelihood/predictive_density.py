@@ -10,15 +10,15 @@ from scipy.special import logsumexp, ndtr
 
 from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
 from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.model.checks.row_times import judge_dates
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.model.unequal_steps import judge_dates
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.rows import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.law import AbstractLaw, Discrete
+from heliograph.random_affine.laws.law import AbstractLaw, Discrete
 from heliograph.random_affine.moments.components import Component
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond

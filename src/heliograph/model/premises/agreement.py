@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged import JointSensor, join_links, with_past
+from heliograph.model.enlarged.joint import JointSensor, join_links
+from heliograph.model.enlarged.past import with_past
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
 from heliograph.model.over_time import at, at_each_step, first, steps_covered, unstack
@@ -26,7 +27,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.law import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memory import drop_names
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise

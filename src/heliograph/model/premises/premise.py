@@ -16,7 +16,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.model.unknown_start import TAKEN_BY, UnknownStart
-from heliograph.model.words import Words
+from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
 

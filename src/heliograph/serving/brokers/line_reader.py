@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from heliograph.files.fields import decode_json
-from heliograph.files.message_files import FileMessage, convert_line, convert_object, flatten
-from heliograph.files.own_messages import OwnReader, is_own
+from heliograph.files.messages.in_files import FileMessage, convert_line, convert_object, flatten
+from heliograph.files.messages.own import OwnReader, is_own
+from heliograph.files.sources.fields import decode_json
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder

@@ -5,9 +5,9 @@ from collections.abc import Collection, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from heliograph.files.fields import decode_json, parse_arrival
-from heliograph.files.message_files import FileMessage, message_name
-from heliograph.files.sources import Reading, Sources, Unread
+from heliograph.files.messages.in_files import FileMessage, message_name
+from heliograph.files.sources.fields import decode_json, parse_arrival
+from heliograph.files.sources.sources import Reading, Sources, Unread
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.times.row_order import YEAR
 from heliograph.serving.brokers.transport import LOG

@@ -22,7 +22,12 @@ from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.uplinks import SentReports
-from heliograph.simulation.shared_fading import ChannelGroup, channel_groups, deliver, start
+from heliograph.simulation.transmission.shared_fading import (
+    ChannelGroup,
+    channel_groups,
+    deliver,
+    start,
+)
 
 Recorded = Mapping[str, SentReports | ArrayLike]
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from heliograph.filters.wrappers.told import ToldFilter
-from heliograph.model.bias import with_bias
+from heliograph.model.enlarged.bias import with_bias
 from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import AbstractSensor

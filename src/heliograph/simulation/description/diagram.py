@@ -16,7 +16,7 @@ from heliograph.random_affine.memory import memories
 from heliograph.simulation.claims import list_other_beliefs
 from heliograph.simulation.description.single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
-from heliograph.simulation.shared_fading import memory_places
+from heliograph.simulation.transmission.shared_fading import memory_places
 
 
 class DiagramLine(NamedTuple):

@@ -22,7 +22,6 @@ from heliograph.random_affine.memory import drop_identities
 from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.reception import make_reception
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import LANES, Progress, advance_in_chunks
@@ -30,6 +29,7 @@ from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.runs.native_lanes import Native, NativeLanes
 from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
 from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.transmission.reception import make_reception
 from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
 

@@ -8,10 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.availability import LastWords
-from heliograph.files.computed import Computed, ZeroIfAbsent
-from heliograph.files.fields import MissingFieldError, at, convert_number, convert_time, count, match_topic
-from heliograph.files.json_field import Field, Source
-from heliograph.files.several_senders import SeveralSenders
+from heliograph.files.sources.computed import Computed, ZeroIfAbsent
+from heliograph.files.sources.fields import (
+    MissingFieldError,
+    at,
+    convert_number,
+    convert_time,
+    count,
+    match_topic,
+)
+from heliograph.files.sources.json_field import Field, Source
+from heliograph.files.sources.several_senders import SeveralSenders
 from heliograph.live.event import INPUTS
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value

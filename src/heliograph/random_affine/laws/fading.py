@@ -10,7 +10,7 @@ from scipy import special
 from heliograph.numerics.check import scalar
 from heliograph.numerics.traced import library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.law import NATS, AbstractLaw, Scalar, Vector
+from heliograph.random_affine.laws.law import NATS, AbstractLaw, Scalar, Vector
 
 
 class Rayleigh(AbstractLaw):

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.checks.inputs import parts_in, plants_in
 from heliograph.model.estimate import Estimate
-from heliograph.model.inputs import parts_in, plants_in
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from heliograph.files.fields import decode_json, parse_number
+from heliograph.files.sources.fields import decode_json, parse_number
 from heliograph.files.text.csv_text import CsvRow, csv_rows, read_csv_header
 from heliograph.files.text.dialects import check_distinct
 from heliograph.files.text.text_file import is_text, kind_of, open_text, until_cut_off

@@ -11,16 +11,16 @@ import numpy as np
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.words import Reader, Words
+from heliograph.model.words.encoder import Reader, Words
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.composite import AbstractUniform
 from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
 from heliograph.random_affine.erasure import Erasure
-from heliograph.random_affine.flips import Flips
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.modes import ModeOutput
+from heliograph.random_affine.words.flips import Flips
 
 FLAG = -1  # in the place of a component: a number that is no word
 Places = tuple[int, ...]  # of words: the component that each carries

@@ -8,9 +8,9 @@ import numpy as np
 
 from heliograph.files.event_columns import counts_losses
 from heliograph.files.event_table import EventTable
-from heliograph.files.fields import convert_name
-from heliograph.files.message_files import FileMessage, read_parquet_names
-from heliograph.files.sources import Reading, Unread
+from heliograph.files.messages.in_files import FileMessage, read_parquet_names
+from heliograph.files.sources.fields import convert_name
+from heliograph.files.sources.sources import Reading, Unread
 from heliograph.files.text.csv_text import read_csv_header
 from heliograph.files.text.dialects import NO_VALUE
 from heliograph.files.text.text_file import CutOffError, kind_of

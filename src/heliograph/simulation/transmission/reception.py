@@ -19,8 +19,8 @@ from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor, without_output_names
 from heliograph.model.trigger import AbstractTrigger, Sender
-from heliograph.model.word_route import in_bits, reader_of
-from heliograph.model.words import Reader, Words
+from heliograph.model.words.encoder import Reader, Words
+from heliograph.model.words.route import in_bits, reader_of
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
@@ -29,7 +29,13 @@ from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.side_by_side import map_all
-from heliograph.simulation.shared_fading import deliver, memory_places, move_modes, start, start_modes
+from heliograph.simulation.transmission.shared_fading import (
+    deliver,
+    memory_places,
+    move_modes,
+    start,
+    start_modes,
+)
 
 ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
 

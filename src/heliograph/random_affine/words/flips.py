@@ -15,7 +15,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.composite import percent_in_words
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.noise import Gaussian
 

@@ -2,8 +2,17 @@
 
 from typing import NamedTuple
 
-from heliograph.files.computed import Computed, Yaw, ZeroIfAbsent
-from heliograph.files.json_field import Count, Name, Paths, Source, Texts, json_field, read_paths, read_texts
+from heliograph.files.sources.computed import Computed, Yaw, ZeroIfAbsent
+from heliograph.files.sources.json_field import (
+    Count,
+    Name,
+    Paths,
+    Source,
+    Texts,
+    json_field,
+    read_paths,
+    read_texts,
+)
 from heliograph.numerics.check import fail, show_value
 
 COUNT_BITS = 16  # of a frame

@@ -5,10 +5,9 @@ from pathlib import Path
 
 from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
-from heliograph.files.fields import parse_arrival
 from heliograph.files.logs.log import is_log
 from heliograph.files.logs.reading import read_log
-from heliograph.files.message_files import (
+from heliograph.files.messages.in_files import (
     TOPIC,
     FileMessage,
     decode_payload,
@@ -17,8 +16,9 @@ from heliograph.files.message_files import (
     read_message_file,
     table_has_topics,
 )
-from heliograph.files.own_messages import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
-from heliograph.files.sources import Sources, Unread
+from heliograph.files.messages.own import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
+from heliograph.files.sources.fields import parse_arrival
+from heliograph.files.sources.sources import Sources, Unread
 from heliograph.files.stores.address import is_store, parse_store
 from heliograph.files.stores.tables import StoreTable, ask_store
 from heliograph.files.text.text_file import CutOffError, kind_of

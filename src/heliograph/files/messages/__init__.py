@@ -1,0 +1,1 @@
+"""Messages in files, and the events they are read as."""

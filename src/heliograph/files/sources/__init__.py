@@ -1,0 +1,1 @@
+"""Which field of which message is which number of a network."""

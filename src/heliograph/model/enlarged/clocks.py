@@ -1,0 +1,157 @@
+"""Plants with offset and drift of the nodes' clocks as states, and the sensors whose values such clocks stamp."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.enlarged.bias import driven_by
+from heliograph.model.plant import AbstractPlant, LinearPlant, Plant
+from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
+from heliograph.numerics.check import array, fail, function, instance, scalar, table
+from heliograph.numerics.module import readable
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import ArrayLike, Float, rename
+from heliograph.random_affine.noise import AbstractNoise, Matrix
+
+Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it
+
+
+@readable
+class Clock(NamedTuple):
+    """A clock that shows t + offset at t; the offset grows by `drift` a unit of time, the drift wanders.
+
+    offset, drift: their standard deviations at the start; wander: variance that the drift gains at each step; delay:
+    mean of the offset at the start, by which stamps are late (`fit` learns it against a truth). The drift has mean 0.
+    """
+
+    offset: float
+    drift: float
+    wander: float = 0.0
+    delay: float = 0.0
+
+
+class Stamped(AbstractSensor):
+    """A sensor whose values are of the time that its clock shows: h(x(s - o)) = h(x) - o dh/dt to first order.
+
+    `offset` is the place of o among the states, `states` the number of those that the sensor measures.
+    """
+
+    base: AbstractSensor
+    noise: AbstractNoise
+    motion: Motion | None
+    states: int = eqx.field(static=True)
+    offset: int = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        """Return h(x) - o dh/dt; h(x) where the clock is right."""
+        state = jnp.asarray(x)[: self.states]
+        if self.motion is None:
+            return self.base.measure(state)
+        rate = jnp.asarray(self.motion(state) if callable(self.motion) else jnp.asarray(self.motion) @ state)
+        y, change = jax.jvp(self.base.measure, (state,), (rate,))
+        return jnp.asarray(y - x[self.offset] * change)
+
+
+def with_clocks(
+    plant: "AbstractPlant",
+    sensors: "Mapping[str, AbstractSensor]",
+    clocks: "Mapping[str, Clock]",
+    motion: "Motion | Float[ArrayLike, 'n n']",
+    dt: "Float[ArrayLike, ''] | str",
+) -> "tuple[LinearPlant | Plant, dict[str, LinearSensor | Stamped]]":
+    """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
+
+    A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The
+    sensor then measures the plant o before that time, h = y - o dy/dt. The new states are "NODE_offset" and
+    "NODE_drift".
+
+    Args:
+        plant: the plant, constant over time.
+        sensors: sensor of each node, by its name.
+        clocks: clock of each node that has one of its own.
+        motion: dx/dt, a function of x or its matrix (n, n).
+        dt: time of a step, over which o grows by dt drift, or the name of the input that says it; wandering over a
+            step of varying time is white noise in the drift, of variance wander dt, integrated exactly.
+
+    Raises:
+        ValueError: a clock whose node has no sensor, negative deviations, another input, wrong shapes.
+    """
+    instance("plant with clocks", plant, AbstractPlant, "a plant that does not vary")
+    sensors, clocks = table("sensors", sensors, "sensors of nodes"), table("clocks", clocks, "clocks of nodes")
+    n = len(plant.states)
+    step = _step(plant, dt)
+    if set(clocks) - set(sensors) or not clocks:
+        raise fail("clocks", f"those of some of the nodes {list(sensors)}", list(clocks))
+    for name, sensor in sensors.items():
+        check_sensor(instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary"), n)
+        sensor.refuse_inputs("a node with a clock")
+    moving = function("motion", motion, "x") if callable(motion) else array("motion", motion, (n, n))
+    places = {name: n + 2 * i for i, name in enumerate(clocks)}
+    larger = driven_by(plant, _make_clocks(clocks, step), np.zeros((n, 2 * len(clocks))))
+    return larger, {
+        name: _enlarge_sensor(sensor, moving, n, n + 2 * len(clocks), places.get(name))
+        for name, sensor in sensors.items()
+    }
+
+
+def _step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
+    """Return the time of a step, or the name of the plant's input that says it."""
+    if not isinstance(dt, str):
+        return scalar("time of a step", dt, 0.0)
+    if dt not in plant.inputs:
+        raise fail("dt", f"a number, or one of the inputs {list(plant.inputs)}", repr(dt))
+    return plant.inputs[plant.inputs.index(dt)]
+
+
+def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
+    """Return offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start."""
+    spread, wander, start_at, states = [], [], [], []
+    for name, clock in clocks.items():
+        instance(f"clock of {name!r}", clock, Clock, "a Clock")
+        start_at += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
+        clock_offset, drift, gain = (
+            scalar(f"{field} of the clock of {name!r}", getattr(clock, field), 0.0)
+            for field in ("offset", "drift", "wander")
+        )
+        spread += [clock_offset**2, drift**2]
+        wander.append(gain)
+        offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
+        states += [rename(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
+    center, start, strength = (library(x).asarray(library(x).stack(x)) for x in (start_at, spread, wander))
+    each, xp = np.eye(len(clocks)), library(start, strength)
+    start, strength = xp.diag(start), xp.diag(strength)
+    if not isinstance(dt, str):
+        noise = xp.kron(strength, np.diag([0.0, 1.0]))
+        return LinearPlant(np.kron(each, [[1.0, dt], [0.0, 1.0]]), noise, center, start, states=states)
+
+    def move(u: jax.Array) -> jax.Array:
+        return jnp.kron(each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
+
+    def gained(u: jax.Array) -> jax.Array:  # the integral of white noise in the drift, and of that in the offset
+        of_step = jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]])
+        return jnp.kron(jnp.asarray(strength), of_step)
+
+    return LinearPlant(move, gained, center, start, states=states, inputs=[dt])
+
+
+def _enlarge_sensor(
+    sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
+) -> LinearSensor | Stamped:
+    """Return the sensor of a state that has more components behind the plant's, which it does not see."""
+    if offset is None and isinstance(sensor, LinearSensor):
+        matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
+        return LinearSensor(matrix, sensor.noise, sensor.outputs, sensor.circular)
+    return Stamped(
+        base=sensor,
+        noise=sensor.noise,
+        motion=motion if offset is not None else None,
+        states=states,
+        offset=offset or 0,
+        outputs=sensor.outputs,
+        circular=sensor.circular,
+    )

@@ -1,0 +1,1 @@
+"""Words of finite length: their encoder, and channels of them."""

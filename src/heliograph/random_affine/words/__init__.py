@@ -1,0 +1,1 @@
+"""Words of bits on their way, and what rounding to them adds."""

@@ -1,0 +1,1 @@
+"""From the plant to the filters: sensors, channels, relays, and what several links share."""
