@@ -17,6 +17,7 @@ import heliograph as hg
 HELD = {  # arguments that an object holds otherwise than under their names
     "limits": lambda node: None if node.limits is None else np.stack([node.limits.low, node.limits.high], -1),
     "invalid": lambda node: None if node.limits is None else node.limits.invalid,
+    "stuck": lambda node: None if node.limits is None else node.limits.stuck,
     "chain": lambda modes: modes.memory,
     "drift": lambda faded: faded.memory,
     "weights": lambda mixture: mixture.choice.probabilities,

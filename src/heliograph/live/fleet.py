@@ -10,11 +10,12 @@ import numpy as np
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.leap import ARRIVAL, Leap, find_leap
 from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import PlantState, Withdrawn
+from heliograph.live.plant import PlantState, ScreenedEvent, Withdrawn
 from heliograph.live.pool import Pool, cut_into_legs, group_by_turn
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.sender_status import LossChain, SenderStatus, make_sender_status
 from heliograph.model.over_time import steps_covered
+from heliograph.model.stuck import Repeats
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
 from heliograph.simulation.node import Node
@@ -196,15 +197,22 @@ class Fleet:
             end = "" if self.end_step == np.inf else f" to {self.end_step:g}"
             raise fail(name, f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
 
-    def within(self, node: str, event: Known) -> tuple[Known, int, str]:
-        """Remove an event's values beyond the limits of its node; return how many these are, and which, in words."""
+    def screen(self, node: str, event: Known, plant: PlantState | None) -> ScreenedEvent:
+        """Remove an event's values beyond the limits of its node, and those that repeat for too long.
+
+        Readings repeat in the order in which they arrive; `plant` is None where it has not begun.
+        """
         if node not in self._limits:
-            return event, 0, ""
+            return ScreenedEvent(event)
         limits, values = self._limits[node], np.array(event.values)
-        if not (outside := limits.outside(values)).any():
-            return event, 0, ""
-        said = limits.why(values, self.network.nodes[node].received_names)
-        return event._replace(values=np.where(outside, nan, values).tolist()), int(outside.sum()), said
+        link = None if plant is None else plant.links.get(node)
+        screened = limits.screen(values[None], Repeats() if link is None else link.repeats)
+        outside, stuck = screened.outside[0], screened.stuck[0]
+        if not (outside | stuck).any():
+            return ScreenedEvent(event, repeats=screened.repeats)
+        said = limits.why(values, self.network.nodes[node].received_names, stuck)
+        left = event._replace(values=screened.values[0].tolist())
+        return ScreenedEvent(left, int(outside.sum()), int(stuck.sum()), said, screened.repeats)
 
     def take(
         self, plant: PlantState, event: Known, given: bool = False, wall: float | None = None, clock: str | None = None

@@ -9,8 +9,33 @@ from typing import NamedTuple, TypeAlias
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.leap import ARRIVAL, Leap, Moments, find_leap
 from heliograph.live.rows import HeldRow, Key, Rows
+from heliograph.model.stuck import Repeats
 
+NO_REPEATS = Repeats()
 GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
+
+
+class ScreenedEvent(NamedTuple):
+    """An event without the values that count as not arrived.
+
+    Args:
+        event: the event, NaN for these values.
+        dropped: how many are beyond the limits of the node, or codes.
+        stuck: how many repeat for longer than their noise allows.
+        why: which of either, in words.
+        repeats: runs of equal readings of the node that end with this event.
+    """
+
+    event: Known
+    dropped: int = 0
+    stuck: int = 0
+    why: str = ""
+    repeats: Repeats = NO_REPEATS
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether values were removed and none is left."""
+        return bool(self.why) and all(value != value for value in self.event.values)
 
 
 @dataclass
@@ -28,6 +53,8 @@ class LinkCounts:
         used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
         dropped: single values beyond the limits of the node.
         latest: time of the newest measurement that was used; -1 before the first.
+        stuck: single values that repeated for longer than their noise allows.
+        repeats: newest readings, and how many in a row are equal to them, of a node that watches for it.
     """
 
     first: int = -1
@@ -42,6 +69,20 @@ class LinkCounts:
     implausible: int = 0
     dropped: int = 0
     latest: float = -1.0
+    stuck: int = 0
+    repeats: Repeats = field(default_factory=Repeats)
+
+    def __post_init__(self) -> None:
+        """Take runs of equal readings as they were stored."""
+        newest, lengths = self.repeats
+        self.repeats = Repeats(tuple(newest), tuple(lengths))
+
+    def count_screened(self, screened: ScreenedEvent, verdict: Verdict) -> None:
+        """Count the values that count as not arrived, of an event that was no copy and of a time that could be used."""
+        if verdict in ("used", "implausible"):
+            self.dropped += screened.dropped
+            self.stuck += screened.stuck
+            self.repeats = screened.repeats
 
     def count(self, verdict: Verdict, sequence: int, time: float, period: int = 0) -> None:
         """Count one message. A late, implausible or future message was received too, so it fills a gap.

@@ -22,6 +22,7 @@ from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weake
 from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.model.origin import Origin
 from heliograph.model.over_time import first
+from heliograph.model.stuck import Repeats, StuckLike
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.check import fail
@@ -48,6 +49,8 @@ class Stream:
         limits: greatest and smallest plausible values, as of a `Node`; numbers beyond them count as not arrived, and
             `dropped` counts them by component. What is refused then depends on the state: the claim is nominal.
         invalid: codes for a missing value, as of a `Node`.
+        stuck: after how many equal readings in a row one counts as not arrived, as of a `Node`; `stuck` of the stream
+            counts them by component.
 
     A filter that was sure of a wrong start, behind a gate, leaves out all that comes: where BEYOND measurements in a
     row are further off than one in 10,000 should be, a warning says so, and `doubt` until one is not. An angle that is
@@ -57,12 +60,20 @@ class Stream:
         ValueError: no filter, or invalid limits.
     """
 
-    def __init__(self, filter: AbstractFilter, limits: LimitsLike = None, invalid: ArrayLike = ()):
+    def __init__(
+        self,
+        filter: AbstractFilter,
+        limits: LimitsLike = None,
+        invalid: ArrayLike = (),
+        stuck: StuckLike = None,
+    ):
         if not isinstance(filter, AbstractFilter):
             raise fail("stream", "a filter", type(filter).__name__)
-        self.filter = filter
-        self.limits = limits_of(filter.received, limits, invalid)
+        self.filter, world = filter, filter.premise
+        believed = (None, None) if world is None else (world.sensor, world.channel)
+        self.limits = limits_of(filter.received, limits, invalid, stuck, *believed)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
+        self.stuck, self._repeats = np.zeros(filter.received, dtype=np.int64), Repeats()
         self.steps, self._last, self._beyond = 0, -1, 0
         self._inputs = np.full(len(filter.inputs), np.nan)
         self._placed, self._angles = _place(filter), WideAngles(filter)
@@ -94,16 +105,16 @@ class Stream:
         """
         placed, k, stepper = self._placed, self.steps, self._stepper
         # Arrays of doubles of the right size pass at once; everything else is checked and converted.
-        z, outside = _as_doubles(measurement, placed.received), None
+        z, screened = _as_doubles(measurement, placed.received), None
         if z is None or self.limits is not None:
             z = np.asarray(self.filter.check_measurement(measurement))
         u = _as_doubles(inputs, placed.given)
         if u is None:
             u = np.asarray(self.filter.check_input(inputs))
         if self.limits is not None:
-            # Values beyond the limits count as not arrived.
-            outside = self.limits.outside(z)
-            z = np.where(outside, np.nan, z)
+            # Values beyond the limits, or repeated for too long, count as not arrived.
+            screened = self.limits.screen(z[None], self._repeats)
+            z = screened.values[0]
         if placed.horizon is not None and k >= placed.horizon:
             raise fail("step", f"one of the {placed.horizon} that the filter covers, counted from 0", k)
         # The step itself; a flagged one is examined.
@@ -112,8 +123,10 @@ class Stream:
         self.steps, self._inputs = k + 1, u
         if placed.values and not np.isnan(z[: placed.values]).all():
             self._last = k
-        if outside is not None:
-            self.dropped += outside
+        if screened is not None:
+            self.dropped += screened.outside[0]
+            self.stuck += screened.stuck[0]
+            self._repeats = screened.repeats
         nis, arrived = stepper.judgement[:2].tolist()
         if arrived and nis == nis:
             self._count_unexpected(nis > placed.rare[int(arrived)])
@@ -185,6 +198,8 @@ class Stream:
             "paths": list(self._placed.layout),
             "steps": self.steps,
             "dropped": self.dropped.tolist(),
+            "stuck": self.stuck.tolist(),
+            "repeats": self._repeats,
             "last": self._last,
             "beyond": self._beyond,
             "inputs": [None if value != value else value for value in self._inputs.tolist()],
@@ -200,8 +215,9 @@ class Stream:
         limits: LimitsLike = None,
         invalid: ArrayLike = (),
         accept_changes: bool = False,
+        stuck: StuckLike = None,
     ) -> "Stream":
-        """Restore a saved stream of the same filter; `limits` and `invalid` hold from here on.
+        """Restore a saved stream of the same filter; `limits`, `invalid` and `stuck` hold from here on.
 
         Args:
             filter: the filter of the stream.
@@ -210,14 +226,17 @@ class Stream:
             invalid: values that mean that nothing was measured, as for a new stream.
             accept_changes: go on with a filter of other numbers, or that another version saved, if its state has the
                 same parts; a covariance of a version before 0.3.0 becomes its factors.
+            stuck: after how many equal readings one counts as not arrived, as for a new stream.
 
         Raises:
             ValueError: no snapshot, or one of another filter or version.
         """
-        new, (head, arrays) = cls(filter, limits, invalid), unpack(data)
+        new, (head, arrays) = cls(filter, limits, invalid, stuck), unpack(data)
         mine, other = new._placed.identity, head.get("of", {})
         check_same("snapshot", mine, other, SAME, accept_changes)
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
+        new.stuck = np.array(head.get("stuck", np.zeros(filter.received)), dtype=np.int64)
+        new._repeats = Repeats(*map(tuple, head.get("repeats", ())))
         new._last, new._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
         held = head.get("inputs", [None] * len(filter.inputs))
         new._inputs = np.array([np.nan if value is None else value for value in held], dtype=float)

@@ -73,9 +73,9 @@ class Timeline:
     events of a time form one row, and a second measurement of a node at that time is a conflict; else every event is a
     row.
 
-    `counts` has the number of each verdict; `dropped` the number of single values beyond a node's limits, which counted
-    as not arrived; `reasons` says in words, by node, why the last implausible event was one; `forced` is the number of
-    rows that became final early.
+    `counts` has the number of each verdict; `dropped` the number of single values beyond a node's limits, and `stuck`
+    of those that repeat for too long, which counted as not arrived; `reasons` says in words, by node, why the last
+    implausible event was one; `forced` is the number of rows that became final early.
 
     Args:
         network: the network whose filters run.
@@ -148,6 +148,11 @@ class Timeline:
         """Return the number of single values beyond each node's limits."""
         return {name: self._plant.links.get(name, LinkCounts()).dropped for name in self.network.names}
 
+    @property
+    def stuck(self) -> dict[str, int]:
+        """Return the number of single values of each node that repeated for longer than its noise allows."""
+        return {name: self._plant.links.get(name, LinkCounts()).stuck for name in self.network.names}
+
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.
 
@@ -157,12 +162,12 @@ class Timeline:
             ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
                 is counted, and everything stays as it was.
         """
-        event, dropped, beyond = self._fleet.within(node, self._convert_event(node, sequence, time, values, arrival))
         plant, before = self._plant, self._plant.clock
+        screened = self._fleet.screen(node, self._convert_event(node, sequence, time, values, arrival), plant)
+        event = screened.event
         verdict = self._fleet.take(plant, event, arrival is not None)
         if verdict == "used":
-            nothing = dropped and np.isnan(event.values).all()
-            why = beyond if nothing else self._why_implausible(event, plant.changes[-1][0])
+            why = screened.why if screened.is_empty else self._why_implausible(event, plant.changes[-1][0])
             if why is not None:
                 # As if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
@@ -174,8 +179,7 @@ class Timeline:
                 self._finalise()
         link = plant.link(node)
         link.count(verdict, event.sequence, event.time)
-        if verdict in ("used", "implausible"):
-            link.dropped += dropped
+        link.count_screened(screened, verdict)
         return verdict
 
     def _why_implausible(self, event: Known, row: HeldRow) -> str | None:

@@ -1,10 +1,14 @@
-"""Limits of a sensor's range, and codes by which a sensor reports that it failed."""
+"""Limits of a sensor's range, codes by which a sensor reports that it failed, and readings that are stuck."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.channel import Channel
+from heliograph.model.sensor import AnySensor
+from heliograph.model.stuck import Repeats, StuckLike, count_repeats, stuck_counts
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, Float
@@ -13,22 +17,51 @@ ROUNDING = 4 * float(np.finfo(np.float64).eps)  # of a product and of the factor
 
 SINGLE = float(np.finfo(np.float32).eps) / 2  # of a number in single precision, relative
 
+FIRST = Repeats()  # before the first reading
+
 LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | Limits | None")
 
 
-def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":
-    """Return the limits of so many received numbers; those of another node as they are; None where there are none."""
-    codes = _read_numbers("invalid values", invalid)
+def limits_of(
+    received: int,
+    limits: LimitsLike,
+    invalid: ArrayLike,
+    stuck: StuckLike = None,
+    sensor: AnySensor | None = None,
+    channel: Channel | None = None,
+) -> "Limits | None":
+    """Return the limits of so many received numbers; those of another node as they are; None where there are none.
+
+    `stuck` of True is by the noise and resolution of the sensor, behind the channel.
+    """
+    codes, counts = _read_numbers("invalid values", invalid), stuck_counts(received, stuck, sensor, channel)
     if isinstance(limits, Limits):
-        if len(limits.low) != received or codes.size:
-            got = f"those of {len(limits.low)}" + " and further codes" * bool(codes.size)
-            raise fail("limits of another node", f"those of {received} received numbers, codes included", got)
+        if len(limits.low) != received or codes.size or counts is not None:
+            more = " and further codes" * bool(codes.size) + " and stuck=" * (counts is not None)
+            got = f"those of {len(limits.low)}{more}"
+            raise fail("limits of another node", f"those of {received} received numbers, codes and stuck included", got)
         return limits
-    return None if limits is None and codes.size == 0 else Limits(received, limits, invalid)
+    return None if limits is None and codes.size == 0 and counts is None else Limits(received, limits, invalid, counts)
+
+
+class Screened(NamedTuple):
+    """Readings without those that count as missing.
+
+    Args:
+        values: the readings (time, m), NaN where one counts as missing.
+        outside: True for each that is beyond its limits, or a code (time, m).
+        stuck: True for each that repeats for longer than its noise allows (time, m).
+        repeats: runs of equal readings that end with the last ones.
+    """
+
+    values: Float[np.ndarray, "time m"]
+    outside: Bool[np.ndarray, "time m"]
+    stuck: Bool[np.ndarray, "time m"]
+    repeats: Repeats
 
 
 class Limits(Module):
-    """Received numbers that count as missing: those below `low` or above `high`, and those equal to a code.
+    """Received numbers that count as missing: below `low` or above `high`, equal to a code, or repeated for too long.
 
     A number is equal to a code up to the rounding of a product, since sensors send whole numbers that are scaled, or if
     it is the code in single precision, in which many sensors send.
@@ -38,37 +71,66 @@ class Limits(Module):
         limits: lowest and highest valid number of each component; None for no limits. Stored as low and high (m,), with
             -inf and inf where there is none.
         invalid: codes (codes,) that are no measurements.
+        stuck: after how many equal readings in a row one counts as missing (m,), infinite for those that may repeat;
+            None where all may.
     """
 
     low: Float[np.ndarray, " m"]
     high: Float[np.ndarray, " m"]
     invalid: Float[np.ndarray, " codes"]
+    stuck: Float[np.ndarray, " m"] | None
 
-    def __init__(self, received: int, limits: LimitsLike = None, invalid: ArrayLike = ()):
+    def __init__(
+        self,
+        received: int,
+        limits: LimitsLike = None,
+        invalid: ArrayLike = (),
+        stuck: Float[np.ndarray, " m"] | None = None,
+    ):
         pairs = _read_intervals(limits, received)
         self.low, self.high = pairs[:, 0], pairs[:, 1]
         codes = _read_numbers("invalid values", invalid)
         if codes.ndim > 1 or not np.all(np.isfinite(codes)):
             raise fail("invalid values", "a finite number or several", show_value(invalid))
-        self.invalid = np.atleast_1d(codes)
+        self.invalid, self.stuck = np.atleast_1d(codes), stuck
 
     @property
     def bounded(self) -> bool:
-        """Whether a number may count as missing for its size, which tells of the state as a code does not."""
-        return bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
+        """Whether a number may count as missing for its value, which tells of the state as a code does not."""
+        limited = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
+        return limited or self.stuck is not None
+
+    def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> Screened:
+        """Return readings without those that count as missing, given the runs of equal ones before them, if any.
+
+        What is beyond limits or a code is no reading, and ends no run.
+        """
+        outside = self.outside(z)
+        values = np.where(outside, np.nan, z)
+        if self.stuck is None:
+            return Screened(values, outside, np.zeros_like(outside), before)
+        counts, repeats = count_repeats(values, before)
+        stuck = counts >= self.stuck
+        return Screened(np.where(stuck, np.nan, values), outside, stuck, repeats)
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
         """Return True for each number that counts as missing; NaN is not one of them."""
         return np.asarray((z < self.low) | (z > self.high) | is_code(z, self.invalid))
 
-    def why(self, z: Float[np.ndarray, " m"], names: Sequence[str]) -> str:
-        """Describe in words the components of a measurement that count as missing; "" if there are none."""
-        said = []
-        for i in np.flatnonzero(self.outside(z)).tolist():
+    def why(self, z: Float[np.ndarray, " m"], names: Sequence[str], stuck: Bool[np.ndarray, " m"] | None = None) -> str:
+        """Describe in words the components of a measurement that count as missing; "" if there are none.
+
+        `stuck`: which of them have repeated for too long; none by default.
+        """
+        said, outside = [], self.outside(z)
+        for i in np.flatnonzero(outside if stuck is None else outside | stuck).tolist():
             code = is_code(z[i], self.invalid)
-            said.append(
-                f"{names[i]} {z[i]:g} " + ("is a code" if code else f"is outside {self.low[i]:g} to {self.high[i]:g}")
-            )
+            if outside[i]:
+                why = "is a code" if code else f"is outside {self.low[i]:g} to {self.high[i]:g}"
+            else:
+                assert self.stuck is not None
+                why = f"is stuck: {self.stuck[i]:g} equal readings in a row or more"
+            said.append(f"{names[i]} {z[i]:g} {why}")
         return ", ".join(said)
 
 

@@ -106,9 +106,11 @@ class Health:
             if health.judged.held is not None and (health.node, health.filter) in trusted
         }
         return {
-            (health.node, health.judged.output): f"{name} is stuck, or has no noise: {health.judged.held}, where its "
-            "noise makes no run as long; what else is said of filters that use it may be due to that"
+            (health.node, health.judged.output): f"{name} is stuck, or has no noise: {held}, where its "
+            "noise makes no run as long; what else is said of filters that use it may be due to that. "
+            f"stuck={held.stuck} of its node refuses what repeats for longer"
             for name, health in stuck.items()
+            if (held := health.judged.held) is not None
         }
 
     def doubted(self) -> list[FilterHealth]:

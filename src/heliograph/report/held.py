@@ -3,10 +3,57 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import erf
 
+from heliograph.model.over_time import first
+from heliograph.model.stuck import delivers_as_sent, longest_by_chance
 from heliograph.numerics.types import Float
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 
 SELDOM = 1e-4  # expected number of runs as long, from which a longer one is no chance
+
+
+class NoiseLaw(NamedTuple):
+    """Gaussian branches of one received number's noise.
+
+    Args:
+        share: probability of each branch (branches,).
+        variance: variance of each (branches,).
+        total: variance of the whole.
+    """
+
+    share: Float[np.ndarray, " branches"]
+    variance: Float[np.ndarray, " branches"]
+    total: float
+
+
+NO_LAW = NoiseLaw(np.ones(1), np.zeros(1), 0.0)  # of which the claimed variance tells
+
+
+def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
+    """List the noise laws of what a node receives, of its sensor where that arrives as it was sent.
+
+    Args:
+        network: the network.
+        node: name of the node; of a filter of the centre, the nodes' numbers one after the other.
+    """
+    if node == Network.FUSED:
+        return [law for name in network.names for law in list_noise_laws(network, name)]
+    receiver = network.nodes[node]
+    unknown = [NO_LAW] * receiver.received
+    if not isinstance(receiver, Node):
+        return unknown
+    sensor, outputs = first(receiver.sensor), tuple(range(receiver.received))
+    if len(sensor.outputs) != receiver.received or not delivers_as_sent(first(receiver.channel), outputs):
+        return unknown
+    try:
+        log_share, mean, variance = (np.asarray(part) for part in sensor.noise.branches())
+    except ValueError:  # noise that depends on inputs
+        return unknown
+    share = np.exp(log_share)
+    total = np.sum(share * (variance + mean**2), axis=1) - np.sum(share * mean, axis=1) ** 2
+    return [NoiseLaw(*law) for law in zip(share, variance, total.tolist(), strict=True)]
 
 
 class HeldValue(NamedTuple):
@@ -17,12 +64,14 @@ class HeldValue(NamedTuple):
         first_row: row, from 0, of its first reading.
         readings: number of readings in the run.
         received: number of readings of the output in the whole recording.
+        stuck: after how many equal readings in a row `stuck=` of a node would refuse one, 1 in 10^9 by chance.
     """
 
     value: float
     first_row: int
     readings: int
     received: int
+    stuck: int
 
     def __str__(self) -> str:
         """One line, such as "400 equal values (3.2) from row 1200"."""
@@ -31,18 +80,23 @@ class HeldValue(NamedTuple):
         return f"{self.readings} equal values in a row ({self.value:g}) from row {self.first_row + 1}"
 
 
-def find_held_value(values: Float[np.ndarray, " time"], variance: Float[np.ndarray, " time"]) -> HeldValue | None:
+def find_held_value(
+    values: Float[np.ndarray, " time"], variance: Float[np.ndarray, " time"], law: NoiseLaw = NO_LAW
+) -> HeldValue | None:
     """Find the longest run of equal values, if chance makes one as long less than once in 10,000 recordings.
 
-    A reading of resolution q whose innovation has variance S equals the one before it with probability at most
-    q / sqrt(2 pi S): q times the greatest density. A run of n then begins at one of N readings with probability at
-    most N p^(n - 1). The resolution is the least difference of two values; where all values are equal, p = 1/2.
+    Of a reading of resolution q the innovation has variance S, of which q^2 / 12 may be that of rounding. It equals the
+    one before it with probability at most p = erf(q / sqrt(8 (S - q^2 / 12))), that of the q about the most probable
+    value; of noise with outliers that is the mean over its branches, each of variance S - r + r_j. A run of n then
+    begins at one of N readings with probability at most N p^(n - 1). The resolution is the least difference of two
+    values; where all values are equal, p = 1/2.
     A law may repeat a value by itself, as a link that is off gives 0 each time: p is at least the share of the value
     among the readings outside of the run, and the share of those that equal the one before.
 
     Args:
         values: what was received (time,), NaN where nothing arrived.
-        variance: claimed variance of the innovations (time,).
+        variance: claimed variance S of the innovations (time,).
+        law: of the noise, r, which is part of S; Gaussian by default.
     """
     rows = np.flatnonzero(~np.isnan(values) & (variance > 0))
     if len(rows) < 3:
@@ -55,16 +109,17 @@ def find_held_value(values: Float[np.ndarray, " time"], variance: Float[np.ndarr
     # The probability that chance repeats a value.
     levels = np.unique(came)
     resolution = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
-    density = 1 / np.sqrt(2 * np.pi * float(np.median(variance[rows])))
-    repeats = (
-        max(resolution * density, *_share_outside(came, starts[longest], lengths[longest])) if len(levels) > 1 else 0.5
-    )
+    spread = max(float(np.median(variance[rows])) - law.total, 0.0) + law.variance - resolution**2 / 12
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_law = float(law.share @ np.where(spread > 0, erf(resolution / np.sqrt(8 * np.abs(spread))), 1.0))
+    repeats = max(by_law, *_share_outside(came, starts[longest], lengths[longest])) if len(levels) > 1 else 0.5
     if repeats >= 1:
         return None
     expected = np.log(len(came)) + (int(lengths[longest]) - 1) * np.log(max(repeats, 1e-300))
     if lengths[longest] < 3 or expected > np.log(SELDOM):
         return None
-    return HeldValue(float(came[starts[longest]]), int(rows[starts[longest]]), int(lengths[longest]), len(came))
+    first, refused = int(starts[longest]), int(longest_by_chance(np.array(repeats)))
+    return HeldValue(float(came[first]), int(rows[first]), int(lengths[longest]), len(came), refused)
 
 
 def _share_outside(came: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:

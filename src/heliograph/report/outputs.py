@@ -14,7 +14,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.shares import round_to as round_to
-from heliograph.report.held import HeldValue, find_held_value
+from heliograph.report.held import NO_LAW, HeldValue, NoiseLaw, find_held_value, list_noise_laws
 from heliograph.report.medians import find_law_medians
 from heliograph.report.results import Json
 from heliograph.simulation.network import Network
@@ -175,7 +175,8 @@ def judge_outputs_of_filter(
     names = [name for name, is_judged in zip(listener.outputs, judges, strict=True) if is_judged]
     uncertain = Weighed(*(np.asarray(column)[:, judges] for column in innovations))
     received = listener.measurements[:, judges]
-    judged = judge_outputs(names, received, uncertain, medians[judges], weighed and listener.blames)
+    known = [law for law, is_judged in zip(list_noise_laws(network, listener.node), judges, strict=True) if is_judged]
+    judged = judge_outputs(names, received, uncertain, medians[judges], weighed and listener.blames, known)
     return [OutputHealth(listener.node, listener.name, weighed, output) for output in judged]
 
 
@@ -187,11 +188,17 @@ def _median_over_time(variance: np.ndarray) -> np.ndarray:
 
 
 def judge_outputs(
-    names: Sequence[str], received: np.ndarray, innovations: Weighed, medians: np.ndarray, blames: bool
+    names: Sequence[str],
+    received: np.ndarray,
+    innovations: Weighed,
+    medians: np.ndarray,
+    blames: bool,
+    laws: Sequence[NoiseLaw] | None = None,
 ) -> list[OutputJudgement]:
     """Judge each output by its innovations (time, m), and by the values that were received (time, m).
 
     `medians` (m,): of innovations under a law that is not symmetric. `blames`: whether weights tell of outliers.
+    `laws`: of each output's noise; None where they are not known.
     """
     summaries = [
         summary._replace(bias=summary.bias - m, bias_low=summary.bias_low - m, bias_high=summary.bias_high - m)
@@ -203,7 +210,13 @@ def judge_outputs(
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
         size = average_correlated(used[:, i]) if np.any(~np.isnan(used[:, i])) else (np.nan, np.nan)
         judged.append(
-            OutputJudgement(name, i in outliers, summary, *size, find_held_value(received[:, i], variance[:, i]))
+            OutputJudgement(
+                name,
+                i in outliers,
+                summary,
+                *size,
+                find_held_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i]),
+            )
         )
     return judged
 

@@ -114,8 +114,8 @@ class Using:
         brought = self._read_events(message, plant, wall)
         at, arrival, event, inputs = brought.at, brought.arrival, brought.event, brought.inputs
         # Values beyond limits do not count as received; an event of such values only is implausible.
-        event, dropped, beyond = self.fleet.within(message.node, event)
-        refused, why, spoilt = self._refused, beyond if beyond and np.isnan(event.values).all() else "", None
+        screened = self.fleet.screen(message.node, event, plant)
+        event, refused, why, spoilt = screened.event, self._refused, screened.why if screened.is_empty else "", None
         if refused:
             why = refused.get((number, event.node_index < 0)) or why
             spoilt = refused.get((number, True)) if inputs is not None else None
@@ -141,10 +141,9 @@ class Using:
             verdict = self._give_to_plant(number, plant, event, given, brought.clock, message.node)
         link = plant.link(message.node)
         link.count(verdict, message.sequence, at, self.fleet.periods.get(message.node, 0))
-        if dropped and verdict in ("used", "implausible"):
-            link.dropped += dropped
-        if beyond and verdict == "used":
-            notes.append(f"{beyond}; the rest is used")
+        link.count_screened(screened, verdict)
+        if screened.why and verdict == "used":
+            notes.append(f"{screened.why}; the rest is used")
         return plant, verdict, why, notes
 
     def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> Brought:

@@ -20,6 +20,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.stuck import StuckLike
 from heliograph.model.told import name_received
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.model.words.encoder import Words
@@ -89,6 +90,9 @@ class Node(Module):
             is no limit; or another node's `limits`, which hold its codes too. Recorded and live data outside count as
             not arrived, are counted and named. What is refused then depends on the state, so that claims are nominal.
         invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
+        stuck: after how many equal readings in a row one counts as not arrived, a number or one for each; True for
+            what the sensor's noise and resolution make less than once in 10^9 readings; None (default) where readings
+            may repeat. Counted and named, and claims are nominal, as with limits.
         trigger: when the sender transmits, such as `SendOnDelta(0.5)`; at each step by default. The filter for it is
             `event_filter`; all others take what was not sent for missing.
         encoder: `Words` as which the sender sends what it measures; the channel is then one of words, and behind what
@@ -97,8 +101,9 @@ class Node(Module):
     Raises:
         ValueError: a sensor and a channel that do not fit; a filter with another number of values than arrive,
             or flags of another step than those that do; another filter of the measurement next to one that is fed back;
-            limits that are none; a trigger that does not fit, or next to feedback or a channel that is late; words
-            that are amplified, or compared by a trigger with what a flipped bit or a dither lets the ends not share.
+            limits that are none; `stuck` of True without a resolution; a trigger that does not fit, or next to feedback
+            or a channel that is late; words that are amplified, or compared by a trigger with what a flipped bit or a
+            dither lets the ends not share.
     """
 
     sensor: AnySensor
@@ -119,6 +124,7 @@ class Node(Module):
         invalid: ArrayLike = (),
         trigger: "AbstractTrigger | None" = None,
         encoder: "Words | None" = None,
+        stuck: "StuckLike" = None,
     ):
         self.trigger, self.encoder = trigger, encoder
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
@@ -134,7 +140,7 @@ class Node(Module):
         self.received = int(first(channel).outputs) + known
         self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
-        self.limits = limits_of(self.received, limits, invalid)
+        self.limits = limits_of(self.received, limits, invalid, stuck, self.sensor, self.channel)
         # Side information of the right step; feedback to one filter alone.
         for name, filter in self.filters.items():
             check_flags(f"filter {name!r}", filter, [first(channel)])
@@ -148,7 +154,7 @@ class Node(Module):
 
     @property
     def chosen_by_value(self) -> bool:
-        """Whether what a filter uses depends on what was measured: by a rule of the sender, or by limits."""
+        """Whether what a filter uses depends on what was measured: by a sender's rule, by limits, by `stuck`."""
         return self.trigger is not None or (self.limits is not None and self.limits.bounded)
 
     @property

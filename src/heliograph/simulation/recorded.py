@@ -14,6 +14,7 @@ from heliograph.filters.chunks import Recursion, scan_in_chunks
 from heliograph.model.checks.row_times import common_dates, warn_of_unequal_steps
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP
+from heliograph.model.stuck import Repeats
 from heliograph.numerics.check import array, fail, instance, rank, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.times.row_times import check_times
@@ -153,13 +154,19 @@ def _find_clock(
 def _drop_beyond_limits(
     name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]
 ) -> Float[np.ndarray, "steps m"]:
-    """Drop measurements beyond their node's limits, and warn of them."""
-    if node.limits is None or not (outside := node.limits.outside(z)).any():
+    """Drop measurements beyond their node's limits, and those that are stuck, and warn of either."""
+    if node.limits is None:
         return z
-    row, count = int(np.argmax(outside.any(axis=1))), int(outside.sum())
-    came, said = int(np.count_nonzero(~np.isnan(z))), node.limits.why(z[row], node.received_names)
-    warnings.warn(f"node {name!r}: {count} of {came} values count as not arrived; row {row + 1}: {said}", stacklevel=3)
-    return np.where(outside, np.nan, z)
+    screened, came = node.limits.screen(z, Repeats()), int(np.count_nonzero(~np.isnan(z)))
+    nothing = np.zeros_like(screened.stuck[0])
+    for dropped, stuck in ((screened.outside, nothing), (screened.stuck, screened.stuck)):
+        if dropped.any():
+            row = int(np.argmax(dropped.any(axis=1)))
+            at_row = np.where(dropped[row], z[row], np.nan)
+            said = node.limits.why(at_row, node.received_names, np.broadcast_to(stuck, dropped.shape)[row])
+            counted = f"{int(dropped.sum())} of {came} values count as not arrived"
+            warnings.warn(f"node {name!r}: {counted}; row {row + 1}: {said}", stacklevel=3)
+    return screened.values
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:

@@ -97,13 +97,16 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
     what = "Values beyond a node's limits, or codes, which count as not arrived."
     dropped = CounterMetricFamily("heliograph_dropped", what, labels=["node"])
+    why = "Values that repeat for longer than their noise allows, which count as not arrived."
+    stuck = CounterMetricFamily("heliograph_stuck", why, labels=["node"])
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
             messages.add_metric([node, verdict], tally[verdict] or 0)
         if tally["lost"] is not None:
             lost.add_metric([node], tally["lost"])
         dropped.add_metric([node], tally["dropped"] or 0)
-    return messages, lost, dropped
+        stuck.add_metric([node], tally["stuck"] or 0)
+    return messages, lost, dropped, stuck
 
 
 def _collect_dead_senders(watch: Watch) -> Metric:

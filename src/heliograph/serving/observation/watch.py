@@ -42,6 +42,7 @@ COUNTED = {  # of a node's messages
     "future": "of a time that is not yet, refused; its clock is wrong",
     "implausible": "implausible and refused; the refused lines say why",
     "dropped": "beyond its limits, or codes, counted as not arrived",
+    "stuck": "equal for longer than its noise allows, counted as not arrived: it is stuck",
     "conflict": "came again with other values; the first stayed",
 }
 
@@ -352,7 +353,7 @@ def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
     results: dict[str, dict[str, int]] = {}
     for plant in plants:
         for node, link in plant.links.items():
-            tally = results.setdefault(node, dict.fromkeys((*VERDICTS, "lost", "dropped"), 0))
+            tally = results.setdefault(node, dict.fromkeys((*VERDICTS, "lost", "dropped", "stuck"), 0))
             for name in tally:
                 tally[name] += getattr(link, name)
     return results

@@ -1,0 +1,175 @@
+"""Readings that repeat: how many equal ones in a row a sensor's noise allows, and how many there have been."""
+
+from collections.abc import Sequence
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import erf
+from scipy.stats import t
+from typing_extensions import TypeAliasType
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import unstack
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.check import fail, is_whole, show_value
+from heliograph.numerics.types import ArrayLike, Float, Int
+from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
+from heliograph.random_affine.hop import AbstractHop
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.outliers import Contaminated, StudentT
+from heliograph.random_affine.words.rounded import Rounded
+
+SELDOM = 1e-9  # probability that a run as long begins at a reading by chance: one in a year at 32 Hz
+LEAST = 3  # equal readings: two may be one that was sent twice
+MOST = 10**6  # equal readings: a run as long is not waited for
+
+StuckLike = TypeAliasType("StuckLike", "bool | int | Sequence[bool | int | None] | ArrayLike | None")
+
+
+class Repeats(NamedTuple):
+    """Of each received number its newest reading, and how many in a row are equal to it; () before the first.
+
+    Args:
+        newest: newest readings (m,), NaN before the first.
+        lengths: of the runs of equal readings that end with them (m,).
+    """
+
+    newest: tuple[float, ...] = ()
+    lengths: tuple[int, ...] = ()
+
+
+def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[np.ndarray, "time m"], Repeats]:
+    """Count how many equal readings in a row end with each one; 0 where nothing arrived, which ends no run.
+
+    Args:
+        z: what was received (time, m), NaN where nothing arrived.
+        before: runs that end with the readings before these.
+    """
+    counts: Int[np.ndarray, "time m"] = np.zeros(z.shape, dtype=np.int64)
+    newest = list(before.newest or [np.nan] * z.shape[1])
+    lengths = list(before.lengths or [0] * z.shape[1])
+    for i in range(z.shape[1]):
+        rows = np.flatnonzero(~np.isnan(z[:, i]))
+        if len(rows) == 0:
+            continue
+        came, place = z[rows, i], np.arange(len(rows))
+        begins = came != np.concatenate([[newest[i]], came[:-1]])
+        # Place of the newest beginning; that of the run before these rows is before the first.
+        begun = np.maximum.accumulate(np.where(begins, place, -lengths[i]))
+        counts[rows, i] = place - begun + 1
+        newest[i], lengths[i] = float(came[-1]), int(counts[rows[-1], i])
+    return counts, Repeats(tuple(newest), tuple(lengths))
+
+
+def bound_equal_readings(noise: AbstractNoise) -> Float[np.ndarray, " outputs"]:
+    """Bound the probability that a reading equals the one before it, whatever the sensor measures, of each output.
+
+    A reading y = h(x) + v is reported as the nearest multiple of its resolution q, and equals the one before where v
+    lies in one certain interval of length q. Under a density that falls from its centre no interval of length q has a
+    larger probability than the one about the centre: erf(q / sqrt(8 r)) for Gaussian noise of variance r. That of a
+    mixture is at most the mean over its branches.
+
+    Raises:
+        ValueError: readings without a resolution, or noise that is not Gaussian, Student's or contaminated.
+    """
+    if isinstance(noise, Independent):
+        return np.concatenate([bound_equal_readings(part) for part in noise.parts])
+    if not isinstance(noise, Rounded):
+        raise fail("stuck", "a sensor with resolution=, or after how many equal readings", "no resolution")
+    source, step = noise.source, np.asarray(noise.step)
+    if isinstance(source, Independent):
+        ends = np.cumsum([part.dimension for part in source.parts])[:-1]
+        steps = np.split(step, ends)
+        return np.concatenate([_bound(part, q) for part, q in zip(source.parts, steps, strict=True)])
+    return _bound(source, step)
+
+
+def _bound(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) -> Float[np.ndarray, " outputs"]:
+    """Return the largest probability that one noise lies in an interval of a step, of each output."""
+    if isinstance(noise, StudentT):
+        scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
+        return np.asarray(1 - 2 * t.cdf(-step / (2 * scale), float(noise.degrees)))
+    if not isinstance(noise, Gaussian | Contaminated):
+        raise fail("stuck", "Gaussian, Student's or contaminated noise, or a number of readings", type(noise).__name__)
+    log_share, _, variance = (np.asarray(part) for part in noise.branches())
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.sum(np.exp(log_share) * erf(step[:, None] / np.sqrt(8 * variance)), axis=1))
+
+
+def longest_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:
+    """Return the least n of which a run of n equal readings begins at a reading with probability at most `seldom`.
+
+    Noise is independent from reading to reading, so that a run of n has probability at most p^(n - 1).
+
+    Args:
+        equal: bound p of the probability that a reading equals the one before.
+        seldom: the probability.
+    """
+    with np.errstate(divide="ignore"):
+        n = 1 + np.ceil(np.log(seldom) / np.log(np.clip(equal, 0.0, 1 - 1e-12)))
+    return np.asarray(np.maximum(n, LEAST))
+
+
+def stuck_counts(
+    received: int, stuck: StuckLike, sensor: AnySensor | None, channel: Channel | None
+) -> Float[np.ndarray, " received"] | None:
+    """Return after how many equal readings in a row each received number is that of a sensor that is stuck.
+
+    Args:
+        received: how many numbers are received.
+        stuck: True for what noise and resolution of the sensor make once in 10^9 readings, a whole number, None or
+            False for a number that may repeat; or one of these for each.
+        sensor: the sensor, of which True asks.
+        channel: its channel, which must deliver the outputs as they were sent.
+
+    Returns:
+        Counts (received,), infinite of a number that may repeat; None where all may.
+
+    Raises:
+        ValueError: another count of them, fewer than 2 readings, a sensor or a channel that does not say.
+    """
+    expected = f"True, a whole number of equal readings from 2 to {MOST:,}, None, or a list of {received} of these"
+    alone = stuck is None or isinstance(stuck, bool | np.bool_) or is_whole(stuck)
+    if not alone and not isinstance(stuck, Sequence | np.ndarray):
+        raise fail("stuck", expected, show_value(stuck))
+    several = [stuck] * received if alone else list(stuck)  # type: ignore[arg-type]
+    if isinstance(stuck, str) or len(several) != received:
+        raise fail("stuck", expected, show_value(stuck))
+    counts = np.full(received, np.inf)
+    for i, one in enumerate(several):
+        if one is None or (isinstance(one, bool | np.bool_) and not one):
+            continue
+        if isinstance(one, bool | np.bool_):
+            counts[i] = _count_by_law(received, sensor, channel)[i]
+        elif is_whole(one) and 2 <= one <= MOST:
+            counts[i] = one
+        else:
+            raise fail("stuck", expected, show_value(stuck))
+    return None if np.all(np.isinf(counts)) else counts
+
+
+def _count_by_law(received: int, sensor: AnySensor | None, channel: Channel | None) -> Float[np.ndarray, " received"]:
+    """Return the counts by the noise and resolution of a sensor, the largest of all its steps."""
+    steps = [step for step in unstack(sensor) if isinstance(step, AbstractSensor)]
+    if not steps or channel is None:
+        raise fail("stuck", "a number of equal readings, of what is received from no sensor", "True")
+    outputs = tuple(range(len(steps[0].outputs)))
+    for link in unstack(channel):
+        if received != len(outputs) or not delivers_as_sent(link, outputs):
+            raise fail("stuck", "a link that delivers readings as they are, or a number of equal readings", "True")
+    counts = np.max([longest_by_chance(bound_equal_readings(step.noise)) for step in steps], axis=0)
+    if np.any(counts > MOST):
+        longest = ceil(np.max(counts))
+        raise fail("stuck", f"noise that ends a run of equal readings before {MOST:,}", f"{longest:,}")
+    return np.asarray(counts)
+
+
+def delivers_as_sent(link: AbstractRandomAffine, outputs: tuple[int, ...]) -> bool:
+    """Ask whether a link loses outputs or delivers them as they are: no radio with a gain and noise of its own."""
+    if any(isinstance(hop, AbstractHop) and hop.transmits for hop in (link, *all_inner_maps(link))):
+        return False
+    try:
+        return link.carry_angles(outputs) == outputs  # which, too, have to arrive as they were sent
+    except ValueError:
+        return False
