@@ -28,7 +28,8 @@ class Compiled:
 
     `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
     it. Results have the same bits whatever the width and the number of cores. `operations` are those of a run,
-    `divisions` those of them that divide or take roots.
+    `divisions` those of them that divide or take roots. `common` says which results, leaf by leaf, are the same of all
+    runs: they follow from shared arguments alone.
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
@@ -37,7 +38,7 @@ class Compiled:
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
         self.code: Code = write_module(program, self.differs, width, features()[2])
-        self.width = self.code.width
+        self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
         self.blocks = Tiers(self.code.blocks, (width or narrow(self.width), self.width))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))

@@ -1,5 +1,6 @@
 """A long recording in chunks side by side: the sequential pass, to far less than a deviation."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -19,6 +20,8 @@ HOP = hg.hop(hg.Discrete([0.5, 1.2], [0.4, 0.6]), 0.1, dimension=2)
 Z = 0.1 * np.cumsum(RNG.normal(size=(ROWS, 2)), axis=0) + 0.5 * RNG.normal(size=(ROWS, 2))
 HOLES = np.where(RNG.random(Z.shape) < 0.2, np.nan, Z)
 HOLES[7_000:9_500] = np.nan  # an outage across a joint, in which nothing is forgotten
+FEW_HOLES = Z.copy()  # most chunks are complete
+FEW_HOLES[[20_000, 40_000], [1, 0]] = FEW_HOLES[7_000:9_500] = np.nan
 PUSHES = RNG.normal(size=(ROWS, 1))
 
 
@@ -58,11 +61,20 @@ def assert_same(of_chunks, of_rows):
     ("item", "z", "u"),
     [
         (hg.kalman_filter(WALK, PLACES), HOLES, None),
+        (hg.kalman_filter(WALK, PLACES), FEW_HOLES, None),
+        pytest.param(hg.kalman_filter(TURNING, BOTH), FEW_HOLES, PUSHES, marks=pytest.mark.slow),
         pytest.param(hg.linear_filter(TURNING, BOTH, HOP), HOLES, PUSHES, marks=pytest.mark.slow),
         pytest.param(hg.linear_filter(WALK, PLACES, hg.perfect(2)), Z, None, marks=pytest.mark.slow),
         pytest.param(hg.kalman_filter(CLOCKED, BOTH), HOLES, INTERVALS, marks=pytest.mark.slow),
     ],
-    ids=["missing", "random gain and inputs", "moments that grow for ever", "steps of their own"],
+    ids=[
+        "missing",
+        "few missing",
+        "few missing, and inputs",
+        "random gain and inputs",
+        "moments that grow for ever",
+        "steps of their own",
+    ],
 )
 def test_it_is_the_sequential_pass(monkeypatch, item, z, u):
     of_rows, likelihood = sequential(monkeypatch, item, z, u)
@@ -96,6 +108,15 @@ def test_means_far_from_zero_are_as_near_as_their_rounding():
     """Positions of a million metres known to a decimetre: eps of them is 2e-9 of a deviation, and enters the speeds."""
     far = Z + 1e6 + 100.0 * np.arange(ROWS)[:, None] * STEP
     assert in_chunks(hg.kalman_filter(WALK, PLACES), far) is not None
+
+
+def test_means_alone_move_where_rows_are_complete():
+    """Of 20 chunks the first, the three that lack rows, and the last, which is not full."""
+    item, u = hg.kalman_filter(WALK, PLACES), np.zeros((ROWS, 0))
+    rows = chunks.FilterRows(item, lambda filter, state, innovation, k: innovation.log_likelihood)
+    with jax.enable_x64(True):
+        begun = chunks.begin_chunks(rows, chunks.linear_start(item), (FEW_HOLES, u))
+    assert np.flatnonzero(~begun.covered).tolist() == [0, 3, 4, 9, 19]
 
 
 def test_few_rows_stay_sequential():

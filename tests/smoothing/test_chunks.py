@@ -15,6 +15,8 @@ PLACES = hg.LinearSensor(np.eye(2, 4), 0.25 * np.eye(2))
 TURNING = hg.LinearPlant([[0.99, 0.1], [-0.1, 0.97]], 0.01, [1.0, 1.0], 1.0, [[0.1], [0.0]])
 HOP = hg.hop(hg.Discrete([0.5, 1.2], [0.4, 0.6]), 0.1, dimension=2)
 Z = 0.1 * np.cumsum(RNG.normal(size=(ROWS, 2)), axis=0) + 0.5 * RNG.normal(size=(ROWS, 2))
+FEW_HOLES = Z.copy()  # most chunks are complete
+FEW_HOLES[[20_000, 33_000], [1, 0]] = FEW_HOLES[7_000:9_500] = np.nan
 Z[RNG.random(Z.shape) < 0.2] = np.nan
 Z[7_000:9_500] = np.nan  # an outage across a joint, in which neither what was nor what comes is forgotten
 PUSHES = RNG.normal(size=(ROWS, 1))
@@ -22,19 +24,20 @@ PUSHES = RNG.normal(size=(ROWS, 1))
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("item", "u"),
+    ("item", "z", "u"),
     [
-        (hg.kalman_filter(WALK, PLACES), None),
-        (hg.linear_filter(TURNING, hg.LinearSensor(np.eye(2), 0.1), HOP), PUSHES),
+        (hg.kalman_filter(WALK, PLACES), Z, None),
+        (hg.kalman_filter(WALK, PLACES), FEW_HOLES, None),
+        (hg.linear_filter(TURNING, hg.LinearSensor(np.eye(2), 0.1), HOP), Z, PUSHES),
     ],
-    ids=["Kalman", "random gain and inputs"],
+    ids=["Kalman", "few missing", "random gain and inputs"],
 )
-def test_it_is_the_sequential_smoother(monkeypatch, item, u):
+def test_it_is_the_sequential_smoother(monkeypatch, item, z, u):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # these data are not the plant's
-        of_chunks = hg.rts_smoother(item, Z, u)
+        of_chunks = hg.rts_smoother(item, z, u)
         monkeypatch.setattr(chunks, "CHUNKS", ROWS)
-        of_rows = hg.rts_smoother(item, Z, u)
+        of_rows = hg.rts_smoother(item, z, u)
     deviation = np.sqrt(np.diagonal(of_rows.covariances, axis1=1, axis2=2))
     assert np.max(np.abs(of_chunks.means - of_rows.means) / deviation) < 1e-10
     outer = deviation[:, :, None] * deviation[:, None, :]

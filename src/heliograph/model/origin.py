@@ -57,7 +57,10 @@ def last_input(u: np.ndarray) -> np.ndarray:
 
 def usual_spacing(time: np.ndarray) -> float:
     """Return the median time between rows, of dates in seconds; NaN of fewer than two."""
-    return float(np.median(seconds_between(np.asarray(time))[1:])) if len(time) > 1 else float("nan")
+    if len(time) < 2:
+        return float("nan")
+    steps = seconds_between(np.asarray(time))[1:]
+    return float(steps[0] if steps.min() == steps.max() else np.median(steps))
 
 
 def usual_months(time: np.ndarray) -> int:

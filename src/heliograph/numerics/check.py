@@ -113,6 +113,10 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
         raise fail(name, _describe_shape(shape, numbers.ndim), f"shape {numbers.shape}")
     if not isinstance(numbers, np.ndarray):  # traced
         return numbers
+    # The sum is finite only if all are, and takes a fifth of the time: only else is each number looked at.
+    with np.errstate(all="ignore"):
+        if np.isfinite(np.sum(numbers)):
+            return numbers
     wrong = np.isinf(numbers) if missing else ~np.isfinite(numbers)
     if np.any(wrong):
         got = f"{np.count_nonzero(wrong)} that are not finite"

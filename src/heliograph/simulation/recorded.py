@@ -10,7 +10,8 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
-from heliograph.filters.chunks import Recursion, scan_in_chunks
+from heliograph.filters.chunks import scan_in_chunks
+from heliograph.filters.recursion import Recursion
 from heliograph.model.checks.row_times import common_dates, warn_of_unequal_steps
 from heliograph.model.origin import Origin, last_input, usual_months, usual_spacing
 from heliograph.model.plant import TIME_STEP

@@ -8,7 +8,6 @@ else the earlier one is smoothed again from the latter. What a step leaves for t
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,21 +16,22 @@ from heliograph.engine.choice import choose_code
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.chunks import (
     Begun,
-    Recursion,
-    agree,
+    Which,
     begin_chunks,
-    linear_start,
     mend_chunks,
     replace_chunk,
-    scan_chunk,
-    select_state,
+    scan_chunks,
     take,
     take_windows,
 )
-from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis, gaussian_of
+from heliograph.filters.recursion import linear_start, scan_chunk
+from heliograph.filters.settled import Settled, are_complete
+from heliograph.filters.smoother_step import SmootherStep, gaussian_of
+from heliograph.filters.states import agree, select_state
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.smoothing.fixed_interval_lag_point import sum_blocks
+from heliograph.smoothing.settled import SmoothedChunk, SmootherRows, smooth_settled_chunks
 
 
 class SmoothedRows(NamedTuple):
@@ -39,32 +39,6 @@ class SmoothedRows(NamedTuple):
 
     estimate: Estimate
     sums: Float[np.ndarray, "5"]
-
-
-class SmootherRows(Recursion):
-    """A filter over rows, of each of which its smoother step is kept; `own`: rows of a chunk."""
-
-    filter: Any
-    own: int = eqx.field(static=True)
-
-    def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, SmootherStep]:
-        """Predict and correct."""
-        z, u = row
-        prior = self.filter.predict(state, u, k)
-        after, innovation = self.filter.correct(prior, z, k)
-        trace = StepTrace(state, prior, after, innovation, z, u, jnp.asarray(k))
-        return after, add_nis(self.filter.smoother_step(trace), innovation)
-
-
-class SmoothedChunk(NamedTuple):
-    """Results of a chunk: the filter's state behind it, the smoothed laws behind it and ahead of it, and its rows."""
-
-    end: PyTree
-    behind: Gaussian
-    ahead: Gaussian
-    estimate: Estimate
-    nis: jax.Array
-    received: jax.Array
 
 
 def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
@@ -111,7 +85,7 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
     windows = take_windows(rows, begun.first, own + ahead)
     ends = np.minimum(begun.first + own + ahead, total)
 
-    def smooth(states: PyTree, which: slice, later: Gaussian | None = None) -> SmoothedChunk | None:
+    def smooth(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
         first = begun.first[which]
         end = ends[which] if later is None else first + own
         laws = gaussian_of(states) if later is None else later
@@ -119,7 +93,12 @@ def _smooth_all(recursion: SmootherRows, begun: Begun, rows: PyTree) -> Smoothed
         choice = choose_code(smooth_chunk, arguments, [False, *[True] * 6])
         return None if choice.code is None else choice.results()
 
-    results = smooth(begun.states, slice(None))
+    def smooth_means(settled: Settled) -> SmoothedChunk | None:
+        return smooth_settled_chunks(recursion, settled, begun, windows)
+
+    complete = are_complete(windows) & (begun.first + own + ahead <= total)
+    begun = begun._replace(covered=begun.covered & complete)
+    results = scan_chunks(begun, smooth, smooth_means)
     if results is None:
         return None
     mend_chunks(smooth, begun.states, lambda results: results.end, results)

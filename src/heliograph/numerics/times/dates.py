@@ -141,6 +141,8 @@ SPANS = {"years": 365.25 * 86400, "months": 30.4375 * 86400, "days": 86400.0, "h
 def unequal_steps(time: np.ndarray) -> str:
     """Say that steps between times differ, "steps of 1 and 21 years"; "" where none is half as long again as usual."""
     steps = seconds_between(time)[1:]
+    if steps.size and 0 < steps.max() <= LONGER * steps.min():  # without a median, of which none is half as long again
+        return ""
     steps = steps[steps > 0]
     if not steps.size or steps.max() <= LONGER * np.median(steps):
         return ""

@@ -1,0 +1,70 @@
+"""Linear filters over the rows of a recording, as a recursion of a state of which data change the means alone."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.states import gaussians_of, select_state
+from heliograph.numerics.module import Module, unwritten
+from heliograph.numerics.types import Array, PyTree
+
+
+class Recursion(Module):
+    """Linear filters over rows (z, u): of their state, Gaussians and what no data change, only means depend on data."""
+
+    def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
+        """Return the state after row k, and what is kept of the row."""
+        raise unwritten(self, "step")
+
+    def predict(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> PyTree:
+        """Return the state after row k where none of its data arrived."""
+        missing = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), row[0])
+        return self.step(state, (missing, row[1]), k)[0]
+
+
+class FilterRows(Recursion):
+    """A filter over rows, and what is kept of each: output(filter, state, innovation, k)."""
+
+    filter: Any
+    output: Callable[..., PyTree] = eqx.field(static=True)
+
+    def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, PyTree]:
+        """Predict and correct."""
+        z, u = row
+        after, innovation = self.filter.correct(self.filter.predict(state, u, k), z, k)
+        return after, self.output(self.filter, after, innovation, k)
+
+
+def linear_start(filter: Any) -> PyTree | None:
+    """Return the state of a filter before any row; None of one of which more than the mean depends on data."""
+    start = jax.tree.map(np.asarray, filter.init()) if getattr(filter, "is_linear", False) else ()
+    return start if gaussians_of(start) else None
+
+
+def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
+    """Scan rows from number `first` on; from row `count` on, behind the end of the data, the state stays."""
+
+    def body(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
+        data, k = row
+        after, output = recursion.step(state, data, k)
+        return select_state(k < count, after, state), output
+
+    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))
+
+
+def end_of_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:
+    """Return the state after some rows alone."""
+
+    def body(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
+        return recursion.step(state, *row)[0], None
+
+    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))[0]
+
+
+def number_rows(rows: PyTree, first: Array) -> Array:
+    """Return the numbers of rows, from `first` on."""
+    return first + jnp.arange(len(jax.tree.leaves(rows)[0]))

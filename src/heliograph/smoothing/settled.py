@@ -1,0 +1,104 @@
+"""Chunks of complete rows smoothed where covariances stand still: means alone move, forwards and back.
+
+The pass back over the rows of a settled filter is a recursion as its pass ahead is: of the smoothed law, with the parts
+of a smoother step that depend on data as its rows. Its covariance settles too, some rows before the end.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import choose_code
+from heliograph.factors.gaussian import Gaussian
+from heliograph.filters.chunks import Begun, take
+from heliograph.filters.recursion import Recursion
+from heliograph.filters.settled import Settled, find_settled, scan_settled, step_settled
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, add_nis, gaussian_of
+from heliograph.filters.states import means_of, with_means
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.types import Array, PyTree
+
+
+class SmootherRows(Recursion):
+    """A filter over rows, of each of which its smoother step is kept; `own`: rows of a chunk."""
+
+    filter: Any
+    own: int = eqx.field(static=True)
+
+    def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, SmootherStep]:
+        """Predict and correct."""
+        z, u = row
+        prior = self.filter.predict(state, u, k)
+        after, innovation = self.filter.correct(prior, z, k)
+        trace = StepTrace(state, prior, after, innovation, z, u, jnp.asarray(k))
+        return after, add_nis(self.filter.smoother_step(trace), innovation)
+
+
+class SmoothedChunk(NamedTuple):
+    """Results of a chunk: the filter's state behind it, the smoothed laws behind it and ahead of it, and its rows."""
+
+    end: PyTree
+    behind: Gaussian
+    ahead: Gaussian
+    estimate: Estimate
+    nis: Array
+    received: Array
+
+
+class BackRows(Recursion):
+    """The smoothed law passed back over rows (parts of smoother steps that vary, nothing), with an estimate of each."""
+
+    settled: Settled
+
+    def step(self, law: Gaussian, row: tuple[list[Array], Array], k: Array) -> tuple[Gaussian, Estimate]:
+        """Smooth the state before a row from the law behind it, of which the row's estimate is."""
+        step = self.settled.row_of(row[0])
+        return step.back(law), step.estimate_from(law)
+
+
+def smooth_settled_chunks(
+    recursion: SmootherRows, settled: Settled, begun: Begun, windows: PyTree
+) -> SmoothedChunk | None:
+    """Smooth chunks, as if all were settled, by their rows and those behind them (chunks, rows, ...).
+
+    None where the smoothed law does not settle, or without native code.
+    """
+    back = BackRows(settled)
+    varying = [
+        np.asarray(leaf)[None] for leaf, v in zip(jax.tree.leaves(settled.outputs), settled.varies, strict=True) if v
+    ]
+    later = find_settled(back, settled.outputs.after, (varying, np.zeros((1, 0))), begun.lengths.ahead)
+    if later is None:
+        return None
+    arguments = recursion, back, later, means_of(begun.states), windows, begun.first
+    choice = choose_code(_smooth_settled, arguments, [False, False, False, True, True, True])
+    if choice.code is None:
+        return None
+    end, behind, ahead, estimates, nis = choice.results()
+    received = np.full(nis.shape, settled.outputs.received)
+    return SmoothedChunk(
+        settled.repeated(end), later.repeated(behind), later.repeated(ahead), later.rows_of(estimates), nis, received
+    )
+
+
+def _smooth_settled(
+    recursion: SmootherRows, back: BackRows, later: Settled, means: Sequence[Array], rows: PyTree, first: Array
+) -> tuple[PyTree, ...]:
+    """Smooth a settled chunk: means at its end, of the laws behind it and ahead, what varies of its estimates, NIS."""
+    own, settled = recursion.own, back.settled
+    after, steps = scan_settled(recursion, settled, means, take(rows, slice(own)), first)
+    last, behind = scan_settled(recursion, settled, after, take(rows, slice(own, None)), first + own)
+
+    def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+        law, estimate = step_settled(back, later.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))
+        return means_of(law), later.varying_of(estimate)
+
+    law = [gaussian_of(with_means(settled.state, last)).mean]
+    entered, _ = jax.lax.scan(pass_back, law, behind, reverse=True)
+    left, estimates = jax.lax.scan(pass_back, entered, steps, reverse=True)
+    nis = settled.row_of(steps).nis
+    return after, entered, left, estimates, jnp.broadcast_to(nis, (own,))
