@@ -39,9 +39,11 @@ class Accumulated:
         length = row_length(self.width, self.summed.batches)
         collected = sums = 0.0
         for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
+            if common:
+                continue
             if summed:
                 sums += 8.0 * buffer.size * length
-            elif not common:
+            else:
                 collected += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
         return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
 
@@ -74,9 +76,8 @@ class Accumulated:
         totals = iter(begun.total(sums))
         leaves: list[Any] = []
         for fixed, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
-            total = next(totals) if is_summed else None
             if fixed is None:
-                leaves.append(total if is_summed else np.concatenate(parts))
+                leaves.append(next(totals) if is_summed else np.concatenate(parts))
             else:  # all runs share it
                 counts = _counts(first, runs, self.summed.batches)
                 leaves.append(fixed[..., None] * counts if is_summed else np.broadcast_to(fixed, (runs, *fixed.shape)))
@@ -104,7 +105,7 @@ class Begun:
         self._machine = None if all(program.common) else program.blocks.machine(-(-runs // program.width))
 
     def zeros(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
-        """Return sums over no runs, of each summed result, as `add` and `total` take them.
+        """Return sums over no runs, of each summed result that runs do not share, as `add` and `total` take them.
 
         `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
         """
@@ -146,11 +147,13 @@ class Begun:
         return given
 
     def total(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
-        """Return the sums (..., batch) of several sums, of each summed result."""
+        """Return the sums (..., batch) of several sums, of each summed result that runs do not share."""
         return [fold_rows(_add_in_order(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
 
     def _outputs(self) -> list[tuple[Any, bool]]:
-        return list(zip(self.program.code.outputs, self.program.summed.outputs, strict=True))
+        """Return each output, and whether it is a sum over runs in memory: what all runs share is none."""
+        parts = zip(self.program.code.outputs, self.program.summed.outputs, self.program.common, strict=True)
+        return [(buffer, summed and not common) for buffer, summed, common in parts]
 
     def _pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
         position = self.program.summed.number

@@ -185,16 +185,26 @@ def code(network: hg.Network, seed: int = 0):
 def test_many_nodes_are_what_each_is_alone(monkeypatch):
     """A few at a time: each node's numbers are those of a network of its own."""
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
-    relay = hg.hop(hg.Rayleigh(0.8), 0.05)
-    nodes = {f"n{i}": hg.Node(POSITION, relay, {"linear": hg.linear_filter(LINEAR, POSITION, relay)}) for i in range(6)}
-    nodes["last"] = hg.Node(POSITION, hg.erasure(relay, 0.5), nodes["n0"].filters)
+    relay, worse = hg.hop(hg.Rayleigh(0.8), 0.05), hg.hop(hg.Rayleigh(0.7), 0.05)
+    erased = hg.erasure(relay, 0.5)
+
+    def node(i: int) -> hg.Node:
+        """Of two structures in turn, each with two filters alike, and with numbers of its own."""
+        sensor, link = hg.LinearSensor([[1.0, 0.1 * i]], 0.3), erased if i % 4 == 1 else relay
+        filters = {name: hg.linear_filter(LINEAR, sensor, of) for name, of in (("linear", relay), ("cautious", worse))}
+        return hg.Node(sensor, link, filters)
+
+    nodes = {f"n{i}": node(i) for i in range(8)}
     whole, sums = (hg.monte_carlo(hg.Network(LINEAR, nodes), HORIZON, 40, 2, keep) for keep in (None, hg.Statistics()))
     assert list(whole.measurements) == list(nodes) and list(sums) == list(nodes)
-    for name in ("n0", "n5", "last"):
+    for name in ("n0", "n5", "n6"):
         alone = hg.monte_carlo(hg.Network(LINEAR, {name: nodes[name]}), HORIZON, 40, 2)
         np.testing.assert_allclose(whole.measurements[name], alone.measurements[name], rtol=0, atol=1e-14)
         for f, estimate in alone.estimates[name].items():
             np.testing.assert_allclose(whole.estimates[name][f].mean, estimate.mean, rtol=0, atol=1e-13)
+            of_record = hg.simulation.error_statistics(alone, name, f)
+            np.testing.assert_allclose(sums[name][f].rmse(), of_record.rmse(), rtol=1e-13)
+            assert (sums[name][f].claim, whole.estimates[name][f].claim) == (of_record.claim, of_record.claim)
 
 
 def test_networks_of_one_structure_share_a_program():

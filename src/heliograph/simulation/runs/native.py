@@ -5,7 +5,6 @@ Their zeros and ones are known when the program is made, to save operations.
 """
 
 import os
-from collections.abc import Iterator
 from functools import lru_cache, partial
 from typing import Any
 
@@ -16,27 +15,23 @@ import numpy as np
 
 from heliograph.engine.choice import try_native
 from heliograph.engine.limits import BLOCK
-from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import drop_identities
 from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Node
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import LANES, Progress, advance_in_chunks
 from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.runs.native_lanes import Native, NativeLanes
+from heliograph.simulation.runs.node_parts import NODES, build_world, count_parts, is_apart, split_nodes
 from heliograph.simulation.smoothed import Recorded, SmoothedPart, Smoother, finish, reduce_run
 from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.transmission.reception import make_reception
 from heliograph.simulation.world import World
 from straightline import Unsupported, accumulate
 
 PROGRAMS = 64  # whose code is held at once
 PLAIN = (0.0, 1.0, -1.0)  # numbers that are known in a program,
 FEW = 64  # of arrays of so many numbers at most
-NODES = 4  # simulated by one program: the plant is simulated again for each so many nodes, which costs a tenth
 
 
 def compile_runs(
@@ -223,7 +218,7 @@ def simulate_natively(
     nodes that share nothing but the plant: they are simulated a few at a time.
     """
     # Smoothing, few nodes, or nodes that share something: one program.
-    whole = smoothing is not None or len(network.names) <= NODES or not _is_apart(network)
+    whole = smoothing is not None or len(network.names) <= NODES or not is_apart(network)
     if whole or type(reducer).joined is AbstractReducer.joined:
         code = try_native(lambda: code_of_network(network, inputs, key, reducer, runs, smoothing, precision=precision))
         return (
@@ -232,33 +227,19 @@ def simulate_natively(
             else finish(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
         )
     # Many independent nodes: one program for a few of them, with other numbers.
-    results, parts, memory = [], list(_parts(network)), list[list[np.ndarray]]()
-    for number, some in enumerate(parts):
-        make = partial(code_of_network, some, inputs, key, reducer, runs, parts=len(parts), precision=precision)
+    results, parts, memory = [], count_parts(network), list[list[np.ndarray]]()
+    for number, (some, world) in enumerate(split_nodes(network)):
+        make = partial(compile_runs, world, inputs, key, reducer, runs, parts=parts, precision=precision)
         code = try_native(make)
         if code is None:
             return None
 
         def shown(done: int, total: int) -> None:
             if progress is not None:
-                progress((number * total + done) // len(parts), total)  # noqa: B023
+                progress((number * total + done) // parts, total)  # noqa: B023
 
         results.append(finish(reducer, _run_chunks(code, first_run, runs, chunk, shown, memory), some, None))
     return reducer.joined(results, network)
-
-
-def _is_apart(network: Network) -> bool:
-    """Test whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory."""
-    nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
-    fused = network.fused or network.meshes
-    return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
-
-
-def _parts(network: Network) -> Iterator[Network]:
-    """Yield networks of a few nodes each, those of one structure together."""
-    for names in network.groups:
-        for start in range(0, len(names), NODES):
-            yield Network(network.plant, {name: network.nodes[name] for name in names[start : start + NODES]})
 
 
 def code_of_network(
@@ -268,13 +249,12 @@ def code_of_network(
     reducer: AbstractReducer[Any],
     runs: int,
     smoothing: SmoothedPart | None = None,
-    parts: int = 1,
     precision: Precision = "float64",
 ) -> Native:
     """Make the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
     filters = AllFilters(network, smoothing and smoothing.kinds)
-    world = World(drop_identities(network.plant), make_reception(network), filters)
-    return compile_runs(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts, precision)
+    later = smoothing and smoothing.smoother(filters)
+    return compile_runs(build_world(network, filters), inputs, key, reducer, runs, later, precision=precision)
 
 
 def _run_chunks(

@@ -62,8 +62,8 @@ class NativeLanes:
         leaves, common = [], []
         # Results that all runs share stand as of one run.
         for fixed, is_summed in zip(code.shared, code.summed, strict=True):
-            value = next(totals) if is_summed else None
-            leaves.append(value if fixed is None else to_double(fixed))
+            own = next(totals) if is_summed and fixed is None else None
+            leaves.append(own if fixed is None else to_double(fixed))
             common.append(fixed is not None)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
         return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)

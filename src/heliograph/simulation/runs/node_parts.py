@@ -1,0 +1,113 @@
+"""Networks of many nodes that share nothing but the plant, simulated a few nodes at a time."""
+
+from collections.abc import Iterator
+from dataclasses import fields
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from heliograph.model.over_time import first
+from heliograph.numerics.frozen import FrozenMapping
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+from heliograph.random_affine.memory import drop_identities
+from heliograph.simulation.index import Kind, places_of
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.transmission.reception import SeparateChannels, make_reception
+from heliograph.simulation.world import World
+
+M = TypeVar("M", bound=Module)
+
+NODES = 4  # simulated by one program: the plant is simulated again for each so many nodes, which costs a tenth
+
+
+def is_apart(network: Network) -> bool:
+    """Test whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory."""
+    nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
+    fused = network.fused or network.meshes
+    return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
+
+
+def build_world(network: Network, filters: AllFilters) -> World:
+    """Build the world of a network with these filters, with its numbers as they are when it is simulated."""
+    return World(drop_identities(network.plant), make_reception(network), filters)
+
+
+def count_parts(network: Network) -> int:
+    """Return how many parts `split_nodes` makes."""
+    return sum(-(-len(names) // NODES) for names in network.groups)
+
+
+def split_nodes(network: Network) -> Iterator[tuple[Network, World]]:
+    """Split a network whose nodes are apart: yield networks of a few nodes each, of one structure, and their worlds.
+
+    The nodes of a structure are stacked once, and a part takes its rows: to stack those of each part would take longer
+    than to simulate three hundred runs.
+    """
+    for names in network.groups:
+        alike = _select_nodes(network, names)
+        world = jax.tree.map(_on_host, build_world(alike, AllFilters(alike)))
+        for start in range(0, len(names), NODES):
+            some = slice(start, start + NODES)
+            yield _select_nodes(network, names[some]), _select_rows(world, some)
+
+
+def _on_host(leaf: PyTree) -> PyTree:
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
+
+
+def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
+    """Return the network of some nodes of one structure; the whole network is checked, and so are they."""
+    group = next(g for g, members in enumerate(network.groups) if names[0] in members)
+    kinds = tuple(Kind(0, kind.filters) for kind in network.kinds if kind.group == group)
+    size = network.nodes[names[0]].received
+    claimed = {(name, f): network.claimed[name, f] for name in names for f in network.nodes[name].filters}
+    return _with_fields(
+        network,
+        nodes={name: network.nodes[name] for name in names},
+        names=names,
+        groups=(names,),
+        kinds=kinds,
+        places=FrozenMapping(places_of((names,), kinds)),
+        rows=FrozenMapping({name: range(i * size, (i + 1) * size) for i, name in enumerate(names)}),
+        claimed=FrozenMapping(claimed),
+    )
+
+
+def _with_fields(module: M, **changed: object) -> M:
+    """Return a module with some fields changed whose constructor takes others and computes these."""
+    new = object.__new__(type(module))
+    for field in fields(module):
+        object.__setattr__(new, field.name, changed.get(field.name, getattr(module, field.name)))
+    return new
+
+
+def _select_rows(world: World, nodes: slice) -> World:
+    """Return the world of some nodes, all of one structure: their rows of all that is stacked."""
+    assert isinstance(world.medium, SeparateChannels)
+
+    def rows(leaf: PyTree) -> PyTree:
+        return leaf[nodes] if eqx.is_array(leaf) else leaf
+
+    medium = SeparateChannels(jax.tree.map(rows, world.medium.groups))
+    alike = tuple(_select_of_kind(stacked, nodes) for stacked in world.filters.alike)
+    return World(world.plant, medium, _with_fields(world.filters, alike=alike))
+
+
+def _select_of_kind(stacked: StackedFilters, nodes: slice) -> StackedFilters:
+    """Return the filters of some nodes; they are stacked filter by filter, node after node for each."""
+    count = len(range(*nodes.indices(stacked.nodes)))
+
+    def rows(leaf: PyTree) -> PyTree:
+        if not eqx.is_array(leaf):
+            return leaf
+        by_filter = leaf.reshape(stacked.count, stacked.nodes, *leaf.shape[1:])
+        return by_filter[:, nodes].reshape(stacked.count * count, *leaf.shape[1:])
+
+    filters = jax.tree.map(rows, stacked.filters)
+    return StackedFilters(filters, stacked.group, stacked.count, count, stacked.smooths, stacked.judges)
