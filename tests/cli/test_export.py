@@ -49,7 +49,7 @@ def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"filter": "awake"}, "--filter: expected one of the network's filters ['aware', 'trusting'], got 'awake'"),
+        ({"filter": "awake"}, "filter: expected one of the network's filters ['aware', 'trusting'], got 'awake'"),
         ({"out": "step.txt"}, "step.txt: expected a name that ends in .c"),
         ({"out": "no/step.c"}, "output folder no: expected an existing folder"),
         ({"out": "1.c"}, "expected a name that C takes for its functions, such as step.c, got '1'"),
@@ -61,8 +61,8 @@ def test_refusals(folder, capsys, more, words):
 
 def test_a_node_where_several_have_the_filter(folder, capsys):
     (folder / "net.py").write_text(NETWORK + TWICE)
-    refused(folder, capsys, arguments(), "--node: expected one of ['near', 'far'], which all have a filter 'aware'")
-    refused(folder, capsys, arguments("--node", "there"), "--node: expected one that has a filter 'aware'", "'there'")
+    refused(folder, capsys, arguments(), "node: expected one of ['near', 'far'], which all have a filter 'aware'")
+    refused(folder, capsys, arguments("--node", "there"), "node: expected one that has a filter 'aware'", "'there'")
     assert cli.main(arguments("--node", "far")) == 0
     assert "far/aware" in capsys.readouterr().out
 

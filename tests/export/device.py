@@ -20,8 +20,8 @@ needs_compiler = pytest.mark.skipif(
 class Device:
     """One filter as it runs on a device; `state` is its memory."""
 
-    def __init__(self, filter_, folder: Path, name: str = "step", precision: str = "double"):
-        self.exported = export_c(filter_, folder / f"{name}.c", precision)
+    def __init__(self, filter_, folder: Path, name: str = "step", precision: str = "double", of=None, node=None):
+        self.exported = export_c(filter_, folder / f"{name}.c", precision, name=of, node=node)
         library = folder / f"{name}_{precision}.so"
         command = [COMPILER, *FLAGS, "-shared", "-fPIC", self.exported.source.name, "-o", library.name, "-lm"]
         subprocess.run(command, cwd=folder, check=True)

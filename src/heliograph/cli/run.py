@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
-    from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
+    from heliograph.smoothing import FixedInterval, FixedLag
 
     Write = Callable[[Record, Path | StoreAddress], None]
     Horizons = int | list[float | np.timedelta64 | np.datetime64]
@@ -115,7 +115,7 @@ def run(
         _print_lines(list(dict.fromkeys(doubts)), [*_describe_results(written, place, report), *lines])
 
 
-def _parse_smoothing(word: str) -> "AbstractSmoothing | None":
+def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
     """Read the option: "all" for the fixed interval, a number for a lag, nothing for none."""
     from heliograph.numerics.check import fail
     from heliograph.smoothing import FixedInterval, FixedLag
@@ -299,7 +299,7 @@ def _choose_writer(data: "Measured", module: "Mapping[str, object]") -> "Write":
 
 
 def _filter_rows(
-    network: "Network", recording: "Recording", smooth: "AbstractSmoothing | None"
+    network: "Network", recording: "Recording", smooth: "FixedInterval | FixedLag | None"
 ) -> tuple["Record", list[str]]:
     """Filter rows; return the record, and what the filters doubted in lines."""
     with warnings.catch_warnings(record=True) as doubts:

@@ -19,6 +19,8 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, fail, instance, show_value
+from heliograph.simulation.centres.named_filter import find_filter_by_name
+from heliograph.simulation.network import Network
 
 PRECISIONS: dict[str, Real] = {"double": "double", "float": "float"}
 COMPILER = "cc"
@@ -36,7 +38,13 @@ class Exported(NamedTuple):
     state_bytes: int
 
 
-def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double") -> Exported:
+def export_c(
+    filter: AbstractFilter | Network,
+    path: str | Path,
+    precision: str = "double",
+    name: str | None = None,
+    node: str | None = None,
+) -> Exported:
     """Write one step of a filter as C99, for a device: `step.h` and `step.c` where `path` is "step.c".
 
     `step_start(state)` initialises; `step_step(state, z, u)` predicts over one step with the inputs u and corrects by
@@ -47,7 +55,7 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
     time contains its tables, and refuses a step past their end.
 
     Args:
-        filter: the filter.
+        filter: the filter; or a network, of which `name` says the filter.
         path: path of the source, which ends in .c; the header is written next to it.
         precision: "double", which agrees with `Stream` to rounding; "float", single precision, for filters that carry
             their covariance as factors L D L', whose variances stay positive, and schedules of gains (default
@@ -57,22 +65,34 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
         The two files, the number of each operation in a step, and the bytes of the state.
 
     Raises:
-        ValueError: no filter; a path that does not end in .c, is no name in C or cannot be written; random numbers, or
-            operations that C does not have, with the line they come from; single precision of another filter. Then
-            nothing is written.
+        ValueError: no filter; no filter of that name, or a fusion of finished estimates; a path that does not end in
+            .c, is no name in C or cannot be written; random numbers, or operations that C does not have, with the line
+            they come from; single precision of another filter. Then nothing is written.
 
     Source: Bierman, Factorization methods for discrete sequential estimation (1977).
     """
-    return export_named(filter, path, precision, None)
+    if isinstance(filter, Network):
+        named = find_filter_by_name(filter, "" if name is None else name, node)
+        return write_filter(named.filter, named.received, path, precision)
+    if name is not None or node is not None:
+        raise fail("export by name", "a network", show_value(filter))
+    what = "a filter, or a network and the name of its filter or fusion"
+    checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
+    return write_filter(checked, _name_received(checked), path, precision)
 
 
-def export_named(filter: object, path: str | Path, precision: str, received: Sequence[str] | None) -> Exported:
-    """Write as `export_c`, with names for the components of z; without names the sensor's, or z0, z1, ..."""
-    checked: AbstractFilter = instance("export", filter, AbstractFilter, "a filter")
+def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
+    """Return the sensor's outputs if the filter has a sensor and as many arrive, else z0, z1, ..."""
+    outputs: tuple[str, ...] = first(filter.sensor).outputs if hasattr(filter, "sensor") else ()
+    return outputs if len(outputs) == filter.received else tuple(f"z{i}" for i in range(filter.received))
+
+
+def write_filter(filter: AbstractFilter, received: Sequence[str], path: str | Path, precision: str) -> Exported:
+    """Write as `export_c`, with names for the components of z."""
     source = check_place(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
-    text = make_text(checked, source.stem, PRECISIONS[precision], received)
+    text = make_text(filter, received, source.stem, PRECISIONS[precision])
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -93,9 +113,8 @@ def check_place(path: str | Path) -> Path:
     return source
 
 
-def make_text(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
+def make_text(filter: AbstractFilter, received: Sequence[str], prefix: str, real: Real) -> CText:
     """Return the text of both files of a filter."""
-    names = name_received(filter) if received is None else received
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
@@ -103,7 +122,7 @@ def make_text(filter: AbstractFilter, prefix: str, real: Real, received: Sequenc
     try:
         with use_precision(np.float64 if real == "double" else np.float32):
             program = write_step_program(filter, real, prefix)
-        return write_c_text(program, Form(prefix, real, names, kind))
+        return write_c_text(program, Form(prefix, real, received, kind))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision
 
@@ -111,12 +130,6 @@ def make_text(filter: AbstractFilter, prefix: str, real: Real, received: Sequenc
 def carries_factors(filter: AbstractFilter) -> bool:
     """Return whether the state has variances of L D L', which stay positive in any precision, and no covariance."""
     return any(keystr(path).endswith(".variances") for path, _ in tree_flatten_with_path(filter.init())[0])
-
-
-def name_received(filter: AbstractFilter) -> Sequence[str]:
-    """Return the sensor's outputs if the filter has a sensor and as many arrive, else z0, z1, ..."""
-    outputs: tuple[str, ...] = first(filter.sensor).outputs if hasattr(filter, "sensor") else ()
-    return outputs if len(outputs) == filter.received else [f"z{i}" for i in range(filter.received)]
 
 
 class Cost(NamedTuple):

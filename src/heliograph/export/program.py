@@ -67,12 +67,11 @@ def write_step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepP
     def step(leaves: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, leaves), z, u, k)
         # Each component by itself, which is cheap: larger than expected, and beyond the bound of its own deviations.
-        differs = jnp.abs(innovation.value)
-        far = (
-            Judgement.find_far(innovation)
-            & (jnp.abs(z) > jnp.abs(z - innovation.value))
-            & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
-        )
+        # Of a filter whose innovation is of part of z, such as a neighbour's measurement, every far one counts.
+        far, differs = Judgement.find_far(innovation), jnp.abs(innovation.value)
+        if differs.shape == z.shape:
+            larger = jnp.abs(z) > jnp.abs(z - innovation.value)
+            far &= larger & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
         implausible = jnp.any(far) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, precision)
         return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]

@@ -191,7 +191,8 @@ def _compute_gain(
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
     """Return the estimate of x, with the covariance of its error or a bound on it."""
     x = take_leading(state.gaussian, n)
-    return x.mean, x.covariance if state.spill is None else _bound_sum(x.covariance, state.spill[:n, :n])
+    mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
+    return mean, covariance if state.spill is None else _bound_sum(covariance, state.spill[:n, :n])
 
 
 def _prepend_present(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:

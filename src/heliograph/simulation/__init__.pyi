@@ -64,6 +64,10 @@ from .centres.uplinks import (
     SentReports as SentReports,
     Uplink as Uplink,
 )
+from .centres.named_filter import (
+    NamedFilter as NamedFilter,
+    find_filter_by_name as find_filter_by_name,
+)
 from .centres.node_filter import (
     NodeFilter as NodeFilter,
     node_network as node_network,

@@ -26,6 +26,7 @@ from heliograph.simulation.centres.centre import (
     Centre,
     CentreFilter,
     CentreState,
+    claim_of_reports,
 )
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
 from heliograph.simulation.centres.fusions import Reporting, StackedFusions, centres_of, fusions_of, sources_of
@@ -337,7 +338,8 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
         name: of its fusion.
 
     Raises:
-        ValueError: no fusion of this name, or one by another rule.
+        ValueError: no fusion of this name, or one by another rule; nodes that lose measurements, since their reports
+            do not say which arrived.
 
     Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
     """
@@ -350,6 +352,8 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
         raise fail("fusion", f"one of {observation}, which receive reports", repr(name))
     # The nodes with that filter alone, for the moments of its errors.
     names = network.nodes_with(fusion.filter)
+    complete = {single: network.nodes[single].complete for single in names}
+    claim = claim_of_reports(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
     alone = Network(
         network.plant,
         {single: _keep_one_filter(network.nodes[single], fusion.filter) for single in network.names},
@@ -366,7 +370,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
         ages=uplinks.delay.shape[1],
         widest=max(uplinks.received),
         quantized=uplinks.quantizers is not None,
-        **make_sizes(network.claims()[FUSED][name], network, len(uplinks.rows)),
+        **make_sizes(claim, network, len(uplinks.rows)),
     )
 
 

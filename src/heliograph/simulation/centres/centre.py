@@ -289,7 +289,7 @@ def claim_of_reports(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[
     """
     lossy = [name for name, receives_all in complete.items() if not receives_all]
     if lossy:
-        raise fail(f"fusion by {rule} over uplinks", "nodes that lose no measurements, of which the centre would have "
+        raise fail(f"fusion by {rule} of reports", "nodes that lose no measurements, of which the centre would have "
                    "to know", f"losses at {lossy}")  # fmt: skip
     names = list(complete)
     channels = [link.channel for link in fusion.links(names) if link.channel is not None]

@@ -1,0 +1,98 @@
+"""A filter of a network by name: a node's, one of the centre, or one of a node between neighbours."""
+
+from dataclasses import dataclass
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.fusion.rules import Fusion
+from heliograph.numerics.check import fail, instance, text
+from heliograph.numerics.module import readable
+from heliograph.simulation.centres.node_filter import node_filter
+from heliograph.simulation.centres.uplinks import uplinks_of
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.stepping import centre_filter
+
+
+@readable
+@dataclass(frozen=True)
+class NamedFilter:
+    """A filter of a network, where it stands, and names of the numbers that it receives.
+
+    Args:
+        place: name of its node, "fused" of the centre.
+        filter: the filter, as it runs alone.
+        received: names of the components of its measurement.
+    """
+
+    place: str
+    filter: AbstractFilter
+    received: tuple[str, ...]
+
+
+def find_filter_by_name(network: Network, name: str, node: str | None = None) -> NamedFilter:
+    """Find a filter of a network by name, as it runs alone: of a node, of the centre, or of a node between neighbours.
+
+    A central filter receives all measurements. The centre of a fusion by `AllReports` receives reports, as
+    `centre_filter` says. A node between neighbours receives its own measurement, and then of each neighbour mean,
+    covariance and measurement. Other fusions weigh finished estimates: no filter computes them.
+
+    Args:
+        network: the network.
+        name: of its filter or fusion.
+        node: that has it, "fused" for the centre; None by default, which will do unless several have one of that name.
+
+    Raises:
+        ValueError: no network, no such name or place, a fusion of finished estimates.
+    """
+    claims = instance("network", network, Network, "a Network").claims()
+    places = [place for place, of_place in claims.items() if text("filter", name) in of_place]
+    if not places:
+        known = sorted({f for of_place in claims.values() for f in of_place})
+        raise fail("filter", f"one of the network's filters {known}", repr(name))
+    if node is None and len(places) > 1:
+        raise fail("node", f"one of {places}, which all have a filter {name!r}", "none")
+    if node is not None and node not in places:
+        raise fail("node", f"one that has a filter {name!r} {places}", repr(node))
+    place = places[0] if node is None else node
+    if place == FUSED:
+        return _find_at_centre(network, name)
+    if name in network.meshes:
+        return _find_between_neighbours(network, name, place)
+    filter = network.nodes[place].filters[name]
+    return NamedFilter(place, filter, network.nodes[place].received_names[: filter.received])
+
+
+def _find_at_centre(network: Network, name: str) -> NamedFilter:
+    """Return a central filter, or the filter of a fusion by reports."""
+    fused = network.fused[name]
+    if isinstance(fused, AbstractFilter):
+        names = [f"{node}_{part}" for node in network.names for part in network.nodes[node].received_names]
+        return NamedFilter(FUSED, fused, tuple(names[: fused.received]))
+    if not fused.rule.uses_reports:
+        rule = type(fused.rule).__name__
+        expected = "a central filter or a fusion by AllReports(), whose centre is a filter of what arrives"
+        instead = f"take {fused.filter!r} of the nodes, or fuse by AllReports()"
+        raise fail(f"filter {name!r}", expected, f"one by {rule}, which weighs finished estimates: {instead}")
+    return NamedFilter(FUSED, centre_filter(network, name), tuple(_name_reports(network, fused)))
+
+
+def _name_reports(network: Network, fusion: Fusion) -> list[str]:
+    """Return names of the reports' numbers, in the order in which the filter of the centre receives them."""
+    nodes = network.nodes_with(fusion.filter)
+    uplinks = uplinks_of(fusion, nodes, len(network.states))
+    names = []
+    for age in range(uplinks.delay.shape[1]):
+        late = f"_{age}_late" if age else ""
+        for node, link, size in zip(nodes, fusion.links(nodes), uplinks.received, strict=True):
+            parts = network.states if link.channel is None else [f"report{i}" for i in range(size)]
+            names += [f"{node}_{part}{late}" for part in parts]
+    return names
+
+
+def _find_between_neighbours(network: Network, name: str, node: str) -> NamedFilter:
+    """Return the filter of one node of a fusion between neighbours, which receives their messages."""
+    names = list(network.nodes[node].received_names)
+    for sender in (network.meshes[name].neighbours or {})[node]:
+        pairs = [f"{a}_{b}" for a in network.states for b in network.states]
+        parts = [f"mean_{s}" for s in network.states] + [f"covariance_{pair}" for pair in pairs]
+        names += [f"{sender}_{part}" for part in (*parts, *network.nodes[sender].received_names)]
+    return NamedFilter(node, node_filter(network, name, node), tuple(names))
