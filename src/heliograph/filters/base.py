@@ -26,10 +26,8 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
-__all__ = [
-    "AbstractFilter", "AbstractSizedFilter", "Step", "believes", "corrects", "estimates", "in_float64", "predicts",
-    "step_number",
-]  # fmt: skip
+__all__ = ["AbstractFilter", "AbstractSizedFilter", "Step", "believes", "corrects", "estimates", "in_float64",
+           "predicts", "step_number"]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
 
@@ -225,6 +223,10 @@ class AbstractFilter(Module):
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
         """Return the same filter for these inputs and complete data, with all that does not depend on z precomputed."""
+        return self
+
+    def given_record(self) -> "AbstractFilter":
+        """Return the same filter with covariances given its data: itself, but of a linear one behind random gains."""
         return self
 
     def with_past(self, steps: SmootherStep) -> "AbstractFilter":

@@ -23,8 +23,8 @@ def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float])
 def say_memory(name: str, test: MemoryTest) -> str:
     """Return the sentence on innovations that are correlated in time."""
     return (
-        f"{name} could know more: each of its innovations is correlated with the one before "
-        f"({test.correlation[0]:.2f}); "
+        f"{name} could know more: its innovations are correlated with those before ({test.correlation[0]:.2f} with the "
+        f"last, {test.predictable:.0%} of their variance follows from {len(test.correlation)}); "
         "links, sensors or the plant remember what the model forgets. Until that is a state of the model "
         "(hg.model.with_bias, hg.model.with_past, a link with memory), the size of innovations cannot tell how "
         "large the errors are"

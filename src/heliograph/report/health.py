@@ -17,6 +17,7 @@ from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.compared_nodes import compare_nodes
 from heliograph.report.constant_error import ConstantError, find_constant_error
 from heliograph.report.doubts import say_apart, say_memory, say_off, say_overconfident, say_underconfident
+from heliograph.report.expected_squares import compare_squares, expect_squares
 from heliograph.report.forecasts import Forecasts
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
@@ -30,7 +31,8 @@ FALSE = 0.001  # probability of a false warning by one kind of test, of all filt
 LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below which none is worth a warning
 PULLED = 0.25  # of the largest excess of a mean square over its claim: what is less goes with it
 MOST = 0.5  # share of what is too large, from which one constant error explains it
-LEAST_CORRELATION = 0.1  # below which memory is not worth a warning: it predicts 1 % of the variance
+TYPICAL = 1.25  # ratio of the mean squares of one run and of all, from which its innovations need not be white
+LEAST_SHARE = 0.01  # of the variance of innovations that those before predict, below which none is worth a warning
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class FilterHealth:
         trusted: whether the network relies on it (default True).
         declared: judgements of the variances that messages declare, one for each link that does.
         unit: of the plant's time (default "steps").
+        expected: mean square of the innovations in this run over that in all runs, by the claim (default 1).
     """
 
     node: str
@@ -56,6 +59,7 @@ class FilterHealth:
     trusted: bool = True
     declared: tuple[DeclaredJudgement, ...] = ()
     unit: str = "steps"
+    expected: float = 1.0
 
     @property
     def numbers(self) -> int:
@@ -182,10 +186,17 @@ class Health:
         )
 
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
-        """Ask whether innovations are correlated with those before, by more than a few numbers have by chance."""
-        by_chance = -ndtri(self._level() / 2) / np.sqrt(health.numbers) if health.numbers else 0.0
-        least = max(LEAST_CORRELATION, by_chance)
-        return test.p_value < self._level() and abs(test.correlation[0]) >= least
+        """Ask whether innovations tell of those after, by the last one or by several, and by more than chance does.
+
+        Of N numbers that know nothing of one another each lag seems to predict 1 / N of the variance.
+        """
+        if abs(np.log(health.expected)) > np.log(
+            TYPICAL
+        ):  # its gains suit the mean over all runs: here too large or small
+            return False
+        by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0
+        probability = 2 * min(test.p_value, test.p_value_of_all)  # two tests share the level
+        return probability < self._level() and test.predictable - by_chance >= LEAST_SHARE
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
         """Say of which outputs a filter that weighs left out most, as `heliograph.run` does."""
@@ -238,16 +249,19 @@ def examine(
     for listener in list_listeners(network, record):
         node, name, filter, z = listener[:4]
         advance(f"testing {node}/{name}")
-        white = test = None
+        white, test, expected = None, None, np.ones(1)
         if filter.claim != "none" and filter.received:
             white = whitened_innovations(z, filter, u)
             outputs += judge_outputs_of_filter(network, listener, record, u)
             test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
+            expected = expect_squares(filter, z, u)
+            test = test and _compare_size(test, white, expected)
         lost = np.any(record.estimates[node][name].claims == "none")
         claim = "none" if lost else filter.claim
         declared = () if test is None else judge_declared_links(filter, z, u)
         unit = _time_unit(record) if TIME_STEP in network.inputs else "steps"
-        filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit))
+        mean = float(np.nanmean(expected))
+        filters.append(FilterHealth(node, name, claim, white, test, listener.trusted, declared, unit, mean))
     others = tuple(belief.words for belief in network.beliefs())
     health = Health(
         record, list_arrivals(network, record.time, record.measurements), filters, outputs, network.shared, others
@@ -345,6 +359,19 @@ def _test_innovations(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):
         return None
     return MemoryTest.of(came, lags, claimed=True)
+
+
+def _compare_size(
+    test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
+) -> MemoryTest:
+    """The test with the size of innovations beside what this recording makes of the claim, where that is not 1."""
+    if np.all(expected == 1):
+        return test
+    there = ~np.isnan(white)
+    count = np.maximum(there.sum(axis=1), 1)
+    squares, means = (np.where(there, a, 0.0).sum(axis=1) / count for a in (white**2, expected))
+    power, error = compare_squares(np.where(there.any(axis=1), squares, np.nan), means)
+    return replace(test, power=power, power_error=error)
 
 
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:

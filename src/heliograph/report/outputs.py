@@ -14,6 +14,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.shares import round_to as round_to
+from heliograph.report.expected_squares import compare_squares, expect_squares
 from heliograph.report.held import NO_LAW, HeldValue, NoiseLaw, find_held_value, list_noise_laws
 from heliograph.report.medians import find_law_medians
 from heliograph.report.results import Json
@@ -175,8 +176,9 @@ def judge_outputs_of_filter(
     names = [name for name, is_judged in zip(listener.outputs, judges, strict=True) if is_judged]
     uncertain = Weighed(*(np.asarray(column)[:, judges] for column in innovations))
     received = listener.measurements[:, judges]
+    expected = expect_squares(listener.filter, listener.measurements, inputs)[:, judges]
     known = [law for law, is_judged in zip(list_noise_laws(network, listener.node), judges, strict=True) if is_judged]
-    judged = judge_outputs(names, received, uncertain, medians[judges], weighed and listener.blames, known)
+    judged = judge_outputs(names, received, uncertain, medians[judges], weighed and listener.blames, expected, known)
     return [OutputHealth(listener.node, listener.name, weighed, output) for output in judged]
 
 
@@ -193,11 +195,13 @@ def judge_outputs(
     innovations: Weighed,
     medians: np.ndarray,
     blames: bool,
+    expected: np.ndarray,
     laws: Sequence[NoiseLaw] | None = None,
 ) -> list[OutputJudgement]:
     """Judge each output by its innovations (time, m), and by the values that were received (time, m).
 
     `medians` (m,): of innovations under a law that is not symmetric. `blames`: whether weights tell of outliers.
+    `expected` (time, m): of the squares, as `expect_squares` returns them.
     `laws`: of each output's noise; None where they are not known.
     """
     summaries = [
@@ -208,7 +212,7 @@ def judge_outputs(
     used, variance = innovations.square_used(), np.asarray(innovations.variance)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
-        size = average_correlated(used[:, i]) if np.any(~np.isnan(used[:, i])) else (np.nan, np.nan)
+        size = compare_squares(used[:, i], expected[:, i])
         judged.append(
             OutputJudgement(
                 name,
@@ -244,7 +248,7 @@ class RecentOutputs:
             count = innovations.value.shape[1]
             names = list(self.names.get((node, name)) or [str(i + 1) for i in range(count)])
             unknown = np.full(innovations.value.shape, np.nan)  # what was received is not kept
-            judged = judge_outputs(names, unknown, innovations, np.zeros(count), True)
+            judged = judge_outputs(names, unknown, innovations, np.zeros(count), True, np.ones_like(unknown))
             results += [OutputHealth(node, name, True, output) for output in judged]
         return results
 

@@ -13,6 +13,7 @@ from heliograph.filters.gaussian.gaussian import correct_signal, describe_channe
 from heliograph.filters.gaussian.signal import Signal, signal_size_at_start
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
+from heliograph.filters.linear.given_record import LinearFilterOfRecord
 from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.modes.additive import additive_modal_filter, independent_terms
 from heliograph.filters.modes.modal import modal_filter
@@ -108,6 +109,12 @@ class LinearFilter(AbstractSizedFilter):
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
         return plan_filter(self, inputs)
+
+    def given_record(self) -> AbstractFilter:
+        """Return the same filter with covariances given its data where gains are random: else they are its own."""
+        if self.premise is None or self.premise.channel is None or first(self.premise.channel).has_known_gain:
+            return self
+        return LinearFilterOfRecord(filter=self, plant=self.plant, **make_sizes("nominal", self, self.received))
 
 
 def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Array) -> Signal:

@@ -29,6 +29,7 @@ class MemoryTest:
         correlation: at lags 1, 2, ... (lags,).
         standard_error: of the correlation (lags,).
         p_value: of lag 1 under the hypothesis of no memory.
+        p_value_of_all: of all lags together, which tell of an error that changes slowly: small at each lag, at many.
         predictable: the cost of memory: share of the innovations' variance that is predictable from earlier ones; 0 for
             the best linear filter.
         power: mean square of the innovations over the claimed one, 1 where the claim holds (NaN where no covariance is
@@ -39,6 +40,7 @@ class MemoryTest:
     correlation: Float[np.ndarray, " lags"]
     standard_error: Float[np.ndarray, " lags"]
     p_value: float
+    p_value_of_all: float
     predictable: float
     power: float
     power_error: float
@@ -67,15 +69,18 @@ class MemoryTest:
         size, size_error = average_correlated(_average_components(white**2))
         parts = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
         correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
-        # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
+        # Lag 1 by itself; all lags for the predictable share (Yule and Walker).
         p_value = (
             float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0]))
             if error[0] > 0
             else float(correlation[0] == 0)
         )
+        # All together: a sum of squares, where an error that few numbers tell is no less than that of independent ones.
+        sure = correlation / np.maximum(error, 1 / np.sqrt(np.count_nonzero(~np.isnan(white).all(axis=1))))
+        p_of_all = float(scipy.special.chdtrc(lags, np.sum(sure**2)))
         share = float(correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0])
         power = (size * unit * unit, size_error * unit * unit) if claimed else (np.nan, np.nan)
-        return MemoryTest(correlation, error, p_value, share, *power)
+        return MemoryTest(correlation, error, p_value, p_of_all, share, *power)
 
 
 def memory_test(

@@ -1,0 +1,37 @@
+"""How large the squared innovations of one recording are, beside what the filter's claim makes of that recording."""
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.shares import average_correlated
+from heliograph.numerics.types import Float
+
+
+def expect_squares(
+    filter: AbstractFilter, data: Float[np.ndarray, "steps m"], inputs: Float[np.ndarray, "steps inputs"]
+) -> Float[np.ndarray, "steps m"]:
+    """Return the mean square of each innovation given its recording, over its variance over all runs: 1 for most.
+
+    Behind random gains the two differ, as the state of this run differs from its mean over all runs.
+    """
+    given = filter.given_record()
+    if given is filter:
+        return np.ones(data.shape)
+    here, over_runs = (np.diagonal(one.run(data, inputs).innovation_covariances, axis1=1, axis2=2)
+                       for one in (given, filter))  # fmt: skip
+    return np.where(over_runs > 0, here / np.where(over_runs > 0, over_runs, 1.0), 1.0)
+
+
+def compare_squares(squares: Float[np.ndarray, " steps"], expected: Float[np.ndarray, " steps"]) -> tuple[float, float]:
+    """Return the sum of squares over what was expected of them, 1 where a claim holds, and its standard error.
+
+    Args:
+        squares: of innovations in units of their claim, NaN where none is.
+        expected: their means, as `expect_squares` returns them; 1 for most filters.
+    """
+    there = ~np.isnan(squares) & ~np.isnan(expected)
+    if not there.any() or not expected[there].any():
+        return np.nan, np.nan
+    mean = float(expected[there].mean())
+    size = float(squares[there].mean()) / mean
+    return size, average_correlated(np.where(there, squares - size * expected, np.nan))[1] / mean
