@@ -104,7 +104,7 @@ from .filters.linear.polynomial import (
 from .filters.gaussian.adaptive import (
     adaptive_filter as adaptive_filter,
 )
-from .filters.gaussian.robust import (
+from .filters.gaussian.robust_factory import (
     robust_filter as robust_filter,
 )
 from .linear.steady_state import (

@@ -101,6 +101,10 @@ class AbstractFilter(Module):
         """
         raise unwritten(self, "estimate")
 
+    def remark(self, state: PyTree) -> str:
+        """Say what happened to a state that its user should know, such as that a gate gave in; "" by default."""
+        return ""
+
     def step(self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0) -> tuple[PyTree, Estimate]:
         """Predict over step k with the input u, then correct with the measurement z.
 

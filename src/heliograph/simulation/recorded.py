@@ -23,6 +23,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.blame import refuse_centrally
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
+from heliograph.simulation.description.remarks import list_remarks
 from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -59,7 +60,7 @@ def run(
 ) -> "Record":
     """Run every filter of the network over recorded measurements.
 
-    Values beyond a node's limits, and those that are implausible for all filters of a node
+    Values beyond a node's limits, those that are stuck, and those that are implausible for all filters of a node
     (`heliograph.filters.plausibility`), count as not arrived; each is warned of, with its rows from 1.
     A value that the rule of its sender forbids is warned of and used. Filters that left out most of what arrived,
     such as one with a gate about a wrong start, are warned of.
@@ -123,7 +124,8 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
-    for line in (*warn_wide_in_rows(network, record), *_describe_left_out(network, record)):
+    said = *warn_wide_in_rows(network, record), *_describe_left_out(network, record), *list_remarks(network, state)
+    for line in said:
         warnings.warn(line, stacklevel=2)
     origin = _make_origin(network, record, state, u)
     return (record if true is None else add_truth(record, network.plant, true, smooth)).with_origin(origin)

@@ -12,7 +12,7 @@ from heliograph.filters.base import (
     Step,
     corrects,
 )
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, prior_of, second_moments_at_start
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
 from heliograph.filters.gaussian.scores import (
     AbstractWeights,
     PredictedMeasurement,
@@ -23,20 +23,15 @@ from heliograph.filters.gaussian.scores import (
     update_weighted,
 )
 from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
-from heliograph.filters.wrappers.told import takes_told
-from heliograph.model.channel import Channel, check_link, find_received_angles
+from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.robust_noise import ReceivedNoise
 from heliograph.model.estimate import Innovation
-from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
-from heliograph.model.premises.premise import believes
+from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles, nearest
-from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
+from heliograph.numerics.check import TINY, check_count, scalar
 from heliograph.numerics.density import log_density
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -94,15 +89,30 @@ class WoLF(AbstractWeights):
 
 
 class Gate(AbstractWeights):
-    """Chi-squared gate: w = 1 where d^2 <= c, else 0. It may lock a filter out after an outage.
+    """Chi-squared gate: w = 1 where d^2 <= c, else 0. It may lock a filter out after an outage, unless it gives in.
+
+    Args:
+        c: limit of the squared deviation d^2 (default 9).
+        after: how many refusals of a number in a row open the state for it; None for none.
+        seconds: for how long, where the plant has the input dt; None for none. Let it be so long that the other sensors
+            tell a wrong sensor from a wrong state (`heliograph.filters.gaussian.giving_in`).
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001).
     """
 
     c: Number
+    after: int | None = eqx.field(static=True)
+    seconds: float | None = eqx.field(static=True)
 
-    def __init__(self, c: "Float[ArrayLike, '']" = 9.0):
+    def __init__(self, c: "Float[ArrayLike, '']" = 9.0, after: int | None = None, seconds: float | None = None):
         self.c = scalar("limit of the gate", c, TINY)
+        self.after = None if after is None else check_count("after, of a gate", after)
+        self.seconds = None if seconds is None else float(scalar("seconds of a gate", seconds, TINY))
+
+    @property
+    def gives_in(self) -> bool:
+        """Whether it gives in at all."""
+        return self.after is not None or self.seconds is not None
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """Return 1 or 0."""
@@ -220,68 +230,3 @@ def _innovation_about_mean(
     both = present[:, None] & present[None]
     density = after.log_density if by_law else log_density(value, covariance, jnp.abs(z) + jnp.abs(expected))
     return Innovation(value, jnp.where(both, covariance, jnp.nan), density, after.weight)
-
-
-def _student_degrees_of(noise: ReceivedNoise) -> Vector:
-    """Return Student's degrees of each component.
-
-    Raises:
-        ValueError: noise of another law.
-    """
-    if not is_traced(noise.degrees) and np.isnan(noise.degrees).any():
-        raise fail("StudentVB", "noise of Student's law (StudentT) in each component", "another law")
-    degrees: Vector = noise.degrees
-    return degrees
-
-
-@believes
-@takes_told
-def robust_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    rule: "AbstractWeights | None" = None,
-    transform: "AbstractTransform | None" = None,
-    initial_mean: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
-) -> "RobustFilter":
-    """Filter whose estimate no single outlier can take far, for noise laws such as `StudentT` and `Contaminated`.
-
-    Without a rule, the score update: the exact posterior mean and covariance of each component, for a Gaussian prior
-    and the law's Gaussian branches. `rule` instead weighs each component before one joint update: `Huber(c)`,
-    `InverseMultiquadric(c)`, `WoLF(c)`, `Gate(c)` by its innovation, `StudentVB()` by variational Bayes. The noise that
-    is weighed is the sensor's, and the last hop's where its law has outliers. `transform` is `Cubature()` unless
-    given; linear parts need none.
-
-    Claim: "nominal"; in simulation the score update's covariance is right (NEES 0.95 to 1.05) where the law is true.
-
-    Args:
-        plant: linear or not; it may vary over time.
-        sensor: with the noise law whose outliers are weighed.
-        channel: between sensor and filter.
-        rule: weights by component (default: none, the score update).
-        transform: of moments, for a plant or sensor that is not linear (default `Cubature()`).
-        initial_mean: mean of x_0 (n,), by default the plant's.
-        initial_covariance: covariance of x_0 (n, n), by default the plant's.
-
-    Raises:
-        ValueError: parts that do not fit, components of the noise that are correlated (score and StudentVB) or mixed
-            by the channel, no noise to weigh, StudentVB of another law than Student's.
-    Source: Masreliez (1975) for the score; Duran-Martin et al., Outlier-robust Kalman filtering through generalised
-        Bayes (2024), for weights of one update.
-    """
-    start = check_plant(plant)
-    check_link(first(sensor), first(channel), len(start.states), moments=False)
-    if rule is not None:
-        instance("rule", rule, AbstractWeights, "one such as Huber(1.345), or None for the score update")
-    move = Cubature() if transform is None else transform
-    instance("transform", move, AbstractTransform, "one such as Cubature()")
-    mean, spread, _ = prior_of(start, initial_mean, initial_covariance)
-    plain, noise = separate_outlier_noise(sensor, without_memory(channel), rule is None or isinstance(rule, StudentVB))
-    if isinstance(rule, StudentVB):
-        rule = rule.of_law(_student_degrees_of(first(noise)))
-    return RobustFilter(
-        plant=plant, sensor=sensor, channel=plain, noise=noise, rule=rule, transform=move, initial_mean=mean,
-        initial_covariance=spread, received_angles=find_received_angles(plant, sensor, channel), claim="nominal",
-        states=start.states, inputs=start.inputs, received=first(channel).outputs,
-    )  # fmt: skip

@@ -1,0 +1,225 @@
+"""A gate that gives in: the state is opened where what it refused for long says that it is wrong, and others do not."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import Columns, join_columns
+from heliograph.factors.gaussian import Gaussian, from_columns
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    make_sizes,
+    predicts,
+)
+from heliograph.filters.gaussian.robust import Gate, RobustFilter
+from heliograph.filters.gaussian.scores import PredictedMeasurement
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import at
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.angle import nearest
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, Float
+
+CONTRADICTED = float(np.log(1000.0))  # the other numbers speak for the gated state 1000 to 1
+NEVER = -1.0  # step of the last giving in, before the first
+
+
+class WatchedBelief(NamedTuple):
+    """What a gate believes, and the rival state that believes what the gate refuses.
+
+    Args:
+        believed: the state of the gate.
+        rival: the state that was opened for each number that the gate refuses; `believed` while it refuses none.
+        refused: of each received number, how often in a row it was refused (m,).
+        elapsed: time since the first of these refusals; 0 of a plant without the input dt.
+        evidence: log likelihood of the numbers that are not refused, under the rival over that under the gate.
+        given_in: how often the gate has given in.
+        step: when it last did, -1 before.
+        moved: by how much each state moved then, from the gate's to the rival's (n,).
+    """
+
+    believed: Gaussian
+    rival: Gaussian
+    refused: Float[jax.Array, " m"]
+    elapsed: Float[jax.Array, ""]
+    evidence: Float[jax.Array, ""]
+    given_in: Float[jax.Array, ""]
+    step: Float[jax.Array, ""]
+    moved: Float[jax.Array, " n"]
+
+
+class GivingInFilter(AbstractSizedFilter):
+    """A gate that takes up its rival once it has refused a number for long, unless other numbers contradict.
+
+    From the first refusal on a rival is carried beside the state of the gate: it uses what the gate refuses. Let e be
+    the innovation of a refused number, t its noiseless value and V = Var t under the rival. Of all changes of the state
+    that explain e the most probable one is delta = Cov(x, t) e / V: it says which states, and how far. Where the gate
+    would refuse e under the rival too, the rival's covariance becomes P + n diag(delta^2) / min(c, 1), each of the n
+    states by itself, since how they were tied is as doubtful as where they were. What t is then wider by is at least
+    e^2 / min(c, 1) (the inequality of Cauchy and Schwarz), so that e^2 is at most c variances, and e is used.
+
+    Either the sensor is wrong or the state is. The numbers that are not refused tell: `evidence` sums their log density
+    under the rival less that under the gate, of each at most c / 2 off. If the rival is right, it falls to -log 1000
+    once in 1000 times at most (a ratio of likelihoods is a martingale); if the sensor is wrong, it falls the more the
+    longer the rival follows it. After `after` refusals in a row, or `seconds` of them, the gate gives in unless it has.
+
+    Args:
+        base: the gate.
+        after: number of refusals in a row; None for none.
+        seconds: time of refusals in a row; None for none.
+
+    Claim: "nominal".
+    Source: Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in
+        linear systems (1976), for a jump of the state that is tested beside the filter.
+    """
+
+    base: RobustFilter
+    after: int | None = eqx.field(static=True)
+    seconds: float | None = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of the gate."""
+        return self.base.angles_used()
+
+    @in_float64
+    def init(self) -> WatchedBelief:
+        """Return the belief before any data."""
+        start, zero = self.base.init(), jnp.zeros(())
+        return WatchedBelief(
+            start, start, jnp.zeros(self.received), zero, zero, zero, zero + NEVER, jnp.zeros(len(self.states))
+        )
+
+    @predicts
+    def predict(self, state: WatchedBelief, u: ArrayLike = (), k: Step = 0) -> WatchedBelief:
+        """Predict the gate's state and its rival over step k."""
+        elapsed = state.elapsed
+        if TIME_STEP in self.inputs:
+            passes = jnp.asarray(u, dtype=float)[self.inputs.index(TIME_STEP)]
+            elapsed = jnp.where(jnp.any(state.refused > 0), elapsed + passes, 0.0)
+        believed, rival = (self.base.predict(x, u, k) for x in (state.believed, state.rival))
+        return state._replace(believed=believed, rival=rival, elapsed=elapsed)
+
+    @corrects
+    def correct(self, state: WatchedBelief, z: ArrayLike, k: Step = 0) -> tuple[WatchedBelief, Innovation]:
+        """Correct the gate's state, and its rival with what the gate refused too; take that up if it is time."""
+        z = jnp.asarray(z)
+        arrived = ~jnp.isnan(z)
+        after, innovation = self.base.correct(state.believed, z, k)
+        left_out = arrived & (_weight_of(innovation) < 0.5)
+        refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
+        suspect = refused > 0
+        # The rival, opened where it would refuse what the gate does.
+        prior = _choose(jnp.any(state.refused > 0), state.rival, state.believed)
+        opened = self._open(prior, z, left_out, k)
+        rival, believing = self.base.correct(opened, z, k)
+        evidence = state.evidence + self._compare(believing, innovation, arrived & ~suspect)
+        # Given in: for long enough, and not contradicted.
+        gives_in = self._is_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
+        kept = jnp.any(suspect) & ~gives_in
+        chosen = _choose(gives_in, rival, after)
+        belief = WatchedBelief(
+            chosen,
+            _choose(kept, rival, chosen),
+            jnp.where(gives_in, 0.0, refused),
+            jnp.where(kept, state.elapsed, 0.0),
+            jnp.where(kept, evidence, 0.0),
+            state.given_in + gives_in,
+            jnp.where(gives_in, jnp.asarray(k, dtype=float), state.step),
+            jnp.where(gives_in, rival.mean - after.mean, state.moved),
+        )
+        return belief, _choose(gives_in, believing, innovation)
+
+    def _is_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
+        """Ask whether a number has been refused for long enough in a row."""
+        long = jnp.zeros((), dtype=bool)
+        if self.after is not None:
+            long = long | jnp.any(refused >= self.after)
+        if self.seconds is not None:
+            long = long | (jnp.any(refused > 1) & (elapsed >= self.seconds))
+        return long
+
+    def _open(self, prior: Gaussian, z: jax.Array, left_out: jax.Array, k: Step) -> Gaussian:
+        """Open a state for the numbers that were left out and that it would leave out too."""
+        predicted, _ = self.base.predict_received(prior, k)
+        noise, rule = at(self.base.noise, k), _gate_of(self.base)
+        # Innovation e, its variance S, and V = Var t of the state alone.
+        total = predicted.columns.diagonal + jnp.diagonal(jnp.asarray(noise.covariance))
+        e = nearest(z, predicted.signal, self.base.received_angles) - predicted.signal - noise.center
+        of_state = predicted.slopes**2 @ predicted.prior.variances
+        wants = left_out & (e**2 > rule.c * total) & (of_state > 0)
+        # delta of each number that is to be used, (n, m); each state by itself.
+        change = _most_probable_change(predicted, jnp.where(wants, e, 0.0), of_state)
+        n = len(self.states)
+        wider = Columns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
+        return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
+
+    def _compare(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
+        """Return the log density of the numbers that count under the rival less that under the gate."""
+
+        def log_density(innovation: Innovation) -> jax.Array:
+            variance = jnp.diagonal(jnp.asarray(innovation.covariance))
+            variance = jnp.where(counts, variance, 1.0)
+            squared = jnp.where(counts, jnp.asarray(innovation.value), 0.0) ** 2 / variance
+            return -(jnp.minimum(squared, _gate_of(self.base).c) + jnp.log(variance)) / 2
+
+        return jnp.sum(log_density(rival) - log_density(gate))
+
+    @estimates
+    def estimate(self, state: WatchedBelief) -> Estimate:
+        """Return the mean and covariance of the gate's state."""
+        return self.base.estimate(state.believed)
+
+    def remark(self, state: WatchedBelief) -> str:
+        """Say how often the gate has given in, when it last did, and which states moved how far then; "" if never."""
+        times = int(state.given_in)
+        if not times:
+            return ""
+        moved = ", ".join(f"{name} by {far:.3g}" for name, far in zip(self.states, state.moved.tolist(), strict=True))
+        often = "once" if times == 1 else f"{times} times"
+        return f"the gate gave in {often}, last in row {int(state.step) + 1}, and moved {moved}"
+
+
+def _most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
+    """Return Cov(x, t_i) e_i / V_i in column i (n, m)."""
+    prior = predicted.prior
+    with_t = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
+    return jnp.asarray(with_t * (e / jnp.where(of_state > 0, of_state, 1.0)))
+
+
+def _weight_of(innovation: Innovation) -> jax.Array:
+    return jnp.asarray(innovation.weight)
+
+
+def _gate_of(base: RobustFilter) -> Gate:
+    assert isinstance(base.rule, Gate)
+    return base.rule
+
+
+def _choose(first: jax.Array, one: Any, other: Any) -> Any:
+    """Return one tree of arrays where `first`, else the other."""
+    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
+
+
+def give_in(base: RobustFilter, rule: Gate) -> GivingInFilter:
+    """Return the gate that gives in as its rule says.
+
+    Args:
+        base: the gate.
+        rule: its rule.
+
+    Raises:
+        ValueError: seconds of a plant without the input dt.
+    """
+    if rule.seconds is not None and TIME_STEP not in base.inputs:
+        raise fail("seconds of a gate", f"a plant with the input {TIME_STEP!r}, or after= refusals", list(base.inputs))
+    return GivingInFilter(
+        base=base, after=rule.after, seconds=rule.seconds, **make_sizes("nominal", base, base.received)
+    )

@@ -1,0 +1,88 @@
+"""A robust filter of plant, sensor and channel: by the score of the noise law, or by a rule that weighs."""
+
+import numpy as np
+
+from heliograph.filters.gaussian.belief import prior_of
+from heliograph.filters.gaussian.giving_in import GivingInFilter, give_in
+from heliograph.filters.gaussian.robust import Gate, RobustFilter, StudentVB
+from heliograph.filters.gaussian.scores import AbstractWeights
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
+from heliograph.filters.wrappers.told import takes_told
+from heliograph.model.channel import Channel, check_link, find_received_angles
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.premises.premise import believes
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import ArrayLike
+
+
+def _student_degrees_of(noise: ReceivedNoise) -> Vector:
+    """Return Student's degrees of each component.
+
+    Raises:
+        ValueError: noise of another law.
+    """
+    if not is_traced(noise.degrees) and np.isnan(noise.degrees).any():
+        raise fail("StudentVB", "noise of Student's law (StudentT) in each component", "another law")
+    degrees: Vector = noise.degrees
+    return degrees
+
+
+@believes
+@takes_told
+def robust_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    rule: "AbstractWeights | None" = None,
+    transform: "AbstractTransform | None" = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+) -> "RobustFilter | GivingInFilter":
+    """Filter whose estimate no single outlier can take far, for noise laws such as `StudentT` and `Contaminated`.
+
+    Without a rule, the score update: the exact posterior mean and covariance of each component, for a Gaussian prior
+    and the law's Gaussian branches. `rule` instead weighs each component before one joint update: `Huber(c)`,
+    `InverseMultiquadric(c)`, `WoLF(c)`, `Gate(c)` by its innovation, `StudentVB()` by variational Bayes. The noise that
+    is weighed is the sensor's, and the last hop's where its law has outliers. `transform` is `Cubature()` unless
+    given; linear parts need none.
+
+    Claim: "nominal"; in simulation the score update's covariance is right (NEES 0.95 to 1.05) where the law is true.
+
+    Args:
+        plant: linear or not; it may vary over time.
+        sensor: with the noise law whose outliers are weighed.
+        channel: between sensor and filter.
+        rule: weights by component (default: none, the score update).
+        transform: of moments, for a plant or sensor that is not linear (default `Cubature()`).
+        initial_mean: mean of x_0 (n,), by default the plant's.
+        initial_covariance: covariance of x_0 (n, n), by default the plant's.
+
+    Raises:
+        ValueError: parts that do not fit, components of the noise that are correlated (score and StudentVB) or mixed
+            by the channel, no noise to weigh, StudentVB of another law than Student's.
+    Source: Masreliez (1975) for the score; Duran-Martin et al., Outlier-robust Kalman filtering through generalised
+        Bayes (2024), for weights of one update.
+    """
+    start = check_plant(plant)
+    check_link(first(sensor), first(channel), len(start.states), moments=False)
+    if rule is not None:
+        instance("rule", rule, AbstractWeights, "one such as Huber(1.345), or None for the score update")
+    move = Cubature() if transform is None else transform
+    instance("transform", move, AbstractTransform, "one such as Cubature()")
+    mean, spread, _ = prior_of(start, initial_mean, initial_covariance)
+    plain, noise = separate_outlier_noise(sensor, without_memory(channel), rule is None or isinstance(rule, StudentVB))
+    if isinstance(rule, StudentVB):
+        rule = rule.of_law(_student_degrees_of(first(noise)))
+    robust = RobustFilter(
+        plant=plant, sensor=sensor, channel=plain, noise=noise, rule=rule, transform=move, initial_mean=mean,
+        initial_covariance=spread, received_angles=find_received_angles(plant, sensor, channel), claim="nominal",
+        states=start.states, inputs=start.inputs, received=first(channel).outputs,
+    )  # fmt: skip
+    if isinstance(rule, Gate) and rule.gives_in:
+        return give_in(robust, rule)
+    return robust
