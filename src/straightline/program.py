@@ -4,6 +4,7 @@ Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 
 most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning (`fold_rows`).
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
@@ -207,24 +208,28 @@ def sort_items(items: Iterable[Any]) -> list[Any]:
 
 
 def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
-    """Return which nodes, buffers, loops and guards of these, in order, differ if these input buffers do."""
+    """Return which nodes, buffers, loops and guards of these differ if these input buffers do."""
 
     @cache
     def around(block: Block) -> list[Any]:
-        return [b.owner for b in block.inwards() if b.owner is not None]
+        """Return the statements around a block by which what is in it may differ: not loops of a known length."""
+        return [b.owner for b in block.inwards() if b.owner is not None and getattr(b.owner, "length", None) is None]
 
+    # What each makes differ directly.
+    followers: defaultdict[Any, list[Any]] = defaultdict(list)
+    for x in items:
+        for source in x.args if is_plain(x) else _list_sources(x, around):
+            followers[source].append(x)
+        if isinstance(x, Store):  # a store makes its buffer differ
+            followers[x].append(x.buffer.owner[0])
+    # From the inputs on.
     results: set[Any] = set(inputs)
-    left, count = items, 0
-    # A turn finds all but what differs by a later number, as in loops.
-    while len(results) > count:
-        count, before, left = len(results), left, []
-        for x in before:
-            if results.isdisjoint(x.args if is_plain(x) else _list_sources(x, around)):
+    left = list(results)
+    while left:
+        for x in followers.pop(left.pop(), ()):
+            if x not in results:
+                results.add(x)
                 left.append(x)
-                continue
-            results.add(x)
-            if isinstance(x, Store):  # a store makes its buffer differ
-                results.add(x.buffer.owner[0])
     return results
 
 
