@@ -262,3 +262,50 @@ def test_bare_words_for_no_number_cost_their_field_alone(text, expected):
 def test_a_doubled_field_is_refused(text):
     with pytest.raises(ValueError, match="m: expected distinct fields, got 'v' more than once"):
         decode_json(text, "m")
+
+
+def test_a_message_that_says_it_is_not_valid_is_refused_and_not_lost():
+    """By a flag, by a checksum's result, by a word of its own; its count is read, so that it counts as none lost."""
+    source = json_field("v", "garden", "in", sequence=hg.files.Count("n", bits=4), valid="crc_ok")
+    sources = Sources({"t": source}, NETWORK)
+    for flag, number in ((True, 14), (1, 15), (False, 0), ("yes", 1), (True, 2)):
+        (item,) = sources.read("t", {"v": 1.5, "n": number, "crc_ok": flag}, "m")
+        if isinstance(item, Unread):
+            assert item.counted.sequence == number and "m, field 'crc_ok': expected true or 1, of a mess" in str(
+                item.error
+            )
+        else:
+            assert flag in (True, 1) and item.values[0] == 1.5
+    worded = json_field("v", "garden", "in", valid={"state": ["ok", "warm"], "age": range(5)})
+    assert read(worded, {"v": 1, "state": "warm", "age": 4}).values[0] == 1
+    with pytest.raises(
+        ValueError, match=r"t, field 'state': expected one of \['ok', 'warm'\], of a message that can be"
+    ):
+        read(worded, {"v": 1, "state": "hot", "age": 4})
+    with pytest.raises(ValueError, match="json_field, valid: expected a dotted path, or a dictionary of paths"):
+        json_field("v", "garden", valid=3)
+
+
+@pytest.mark.parametrize("bits", [4, 8, 16])
+def test_a_count_of_another_modulus_is_refused(bits):
+    source = json_field("v", "garden", "in", sequence=hg.files.Count("n", bits=bits))
+    assert read(source, {"v": 1, "n": 2**bits - 1}).sequence == 2**bits - 1
+    expected = f"t, field 'n': expected a count below {2**bits}, got {2**bits}: of another modulus than bits={bits}"
+    with pytest.raises(ValueError, match=expected):
+        read(source, {"v": 1, "n": 2**bits})
+
+
+@pytest.mark.parametrize(("bits", "said"), [(4, []), (8, ["after 15, not after 255: bits=4"])])
+def test_a_count_that_begins_again_too_soon_or_stands_still_is_doubted(tmp_path, bits, said):
+    """Of 64 messages of a 4-bit count two are lost and five repeated; read as one of 8 bits it is said what it is."""
+    lines, counts = [], [k % 16 for k in range(64) if k not in (20, 21)]
+    counts[40:45] = [counts[40]] * 5
+    for k, number in enumerate(counts):
+        content = {"time": 1_790_000_000 + k, "v": 0.1 * k, "n": number}
+        lines.append(json.dumps({"topic": "t", "payload": content, "tst": 1_790_000_000 + k}))
+    (tmp_path / "log.jsonl").write_text("\n".join(lines))
+    sources = {"t": json_field("v", "garden", "in", time="time", sequence=hg.files.Count("n", bits=bits))}
+    events = hg.files.read_messages(tmp_path / "log.jsonl", NETWORK, sources)
+    notes = [note for note in events.notes if "count" in note]
+    assert len(notes) == 1 + len(said) and all(word in notes[0] for word in said)
+    assert "the count of 4 messages is that of the one before: repeated" in notes[-1]

@@ -77,6 +77,30 @@ class Columns:
         counts = np.array([count for _, count in self.unread], dtype=np.int64)
         return count_gaps(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
 
+    def doubt_count(self, name: str) -> list[str]:
+        """Say of a count that it begins at 0 again sooner than its bits say, or that it stands still.
+
+        It does so where it fell at least three times, each time from the largest number, which is 2^b - 1.
+        """
+        if not self.period or not len(self.time):
+            return []
+        time, _, sequence = self.arrays()
+        order = np.lexsort((sequence, time))
+        numbers, steps = sequence[order], np.diff(sequence[order])
+        top, falls, lines = int(numbers.max()), numbers[:-1][steps < 0], list[str]()
+        bits = (top + 1).bit_length() - 1
+        if top + 1 < self.period and top + 1 == 1 << bits and len(falls) >= 3 and np.all(falls == top):
+            lines.append(
+                f"{name}: the count begins at 0 again after {top}, not after {self.period - 1}: bits={bits}; until "
+                "then what is lost is counted wrongly"
+            )
+        stands = int(np.sum((steps == 0) & (np.diff(time[order]) > 0)))
+        if stands:
+            lines.append(
+                f"{name}: the count of {stands} messages is that of the one before: repeated, not measured anew"
+            )
+        return lines
+
     def list_lost_digits(self, name: str) -> list[str]:
         """Return a line where most stamps are those of other events, as of stamps that lost their digits; else none."""
         count, distinct = len(self.time), len(np.unique(np.array(self.time)))

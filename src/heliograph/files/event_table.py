@@ -167,7 +167,7 @@ class EventTable:
         every = [each for plant in self._plants.values() for each in plant.items()]
         for name, columns in every if self.dated or not self.steps else ():
             note, reason, count = columns.drop_unset(f"{source}, {name}")
-            self.notes += [note] * bool(note)
+            self.notes += [note] * bool(note) + columns.doubt_count(f"{source}, {name}")
             if reason:
                 self.refuse(InputError(reason), strict)
                 self.refused += count - 1

@@ -77,7 +77,8 @@ class Count:
 
     Args:
         path: dotted path of the count.
-        bits: its bits, if it begins at 0 again after 2^bits - 1; None if it does not.
+        bits: its bits, if it begins at 0 again after 2^bits - 1: 4 of a count modulo 16, 8 of one modulo 256, 16 of one
+            modulo 65,536; None if it does not. A message with a larger count is refused.
     """
 
     path: str
@@ -88,7 +89,16 @@ class Count:
         """Return after how many messages the count begins at 0 again; 0 if it does not."""
         return 0 if self.bits is None else 1 << self.bits
 
+    def check(self, number: int, name: str) -> int:
+        """Return a count of a message; refuse one of another modulus."""
+        if self.period and number >= self.period:
+            raise fail(name, f"a count below {self.period}", f"{number}: of another modulus than bits={self.bits}")
+        return number
 
+
+Real = TypeAliasType("Real", ArrayLike)
+Unit = TypeAliasType("Unit", TimeUnit)
+Step = TypeAliasType("Step", float | None)
 Name = TypeAliasType("Name", str | Level | Field)
 Path = TypeAliasType("Path", str | Computed)
 Paths = TypeAliasType("Paths", str | Computed | Sequence[str | Computed])
@@ -97,9 +107,10 @@ Time = TypeAliasType("Time", str | Stamp | None)
 Counted = TypeAliasType("Counted", str | Count | None)
 Plant = TypeAliasType("Plant", str | Level | Field | None)
 Condition = TypeAliasType("Condition", Mapping[str, object] | Available)
-Conditions = TypeAliasType("Conditions", Condition | Sequence[Condition] | None)
+Where = TypeAliasType("Where", Condition | Sequence[Condition] | None)
+Valid = TypeAliasType("Valid", str | Mapping[str, object] | None)
 Devices = TypeAliasType("Devices", tuple[Available, ...])
-Containers = TypeAliasType("Containers", dict[str, Container[object]])
+Allowed = TypeAliasType("Allowed", dict[str, Container[object]])
 Numbers = TypeAliasType("Numbers", tuple[float, ...])
 
 
@@ -122,6 +133,7 @@ class Source:
         step: seconds of a step where times are counted in steps; None where they are not.
         where: the values, or a container of them, that the field at each dotted path may have.
         available: conditions on what the device says of itself on another topic.
+        valid: the values that the field at each dotted path has where the message can be trusted.
         quoted: whether numbers may be texts.
     """
 
@@ -131,12 +143,13 @@ class Source:
     scale: "Numbers"
     offset: "Numbers"
     time: "Stamp | None"
-    time_unit: "TimeUnit"
+    time_unit: "Unit"
     sequence: "Count | None"
     plant: "Level | Field | None"
-    step: "float | None"
-    where: "Containers"
+    step: "Step"
+    where: "Allowed"
     available: "Devices"
+    valid: "Allowed"
     quoted: bool
 
     @property
@@ -144,7 +157,22 @@ class Source:
         """Return the dotted paths of all fields that a message needs."""
         values = [part for path in self.paths for part in ((path,) if isinstance(path, str) else path.parts)]
         given = (self.node, self.plant, self.time, self.sequence)
-        return [*values, *(part.path for part in given if isinstance(part, Field | Stamp | Count)), *self.where]
+        named = [part.path for part in given if isinstance(part, Field | Stamp | Count)]
+        return [*values, *named, *self.where, *self.valid]
+
+    def check_valid(self, message: object, where: str) -> None:
+        """Refuse a message whose flag does not say that it can be trusted.
+
+        Raises:
+            ValueError: a flag that does not, that is a text where a number is expected, or is not there.
+        """
+        for field, allowed in self.valid.items():
+            value = at(message, field, where)
+            if value not in allowed:
+                expected = "true or 1" if allowed == (True, 1) else f"one of {show_value(allowed)}"
+                raise fail(
+                    f"{where}, field {field!r}", f"{expected}, of a message that can be trusted", show_value(value)
+                )
 
 
 def json_field(
@@ -152,14 +180,15 @@ def json_field(
     node: "Name",
     output: "Texts" = None,
     *,
-    scale: "ArrayLike" = 1.0,
-    offset: "ArrayLike" = 0.0,
+    scale: "Real" = 1.0,
+    offset: "Real" = 0.0,
     time: "Time" = None,
-    time_unit: "TimeUnit" = "s",
+    time_unit: "Unit" = "s",
     sequence: "Counted" = None,
     plant: "Plant" = None,
-    step: float | None = None,
-    where: "Conditions" = None,
+    step: "Step" = None,
+    where: "Where" = None,
+    valid: "Valid" = None,
     quoted: bool = False,
 ) -> "Source":
     """Map a field of a topic's messages, or several, to a node's outputs or to inputs of the plant.
@@ -195,6 +224,9 @@ def json_field(
         where: for each dotted path the value that the field must have, or several (a list, a set, a range), for the
             message to be used, such as {"status": ["Good", "Uncertain"]}; or `Available`, for a topic on which the
             device says whether it is online; or a list of these. None for all messages.
+        valid: dotted path of a flag by which a message says that it can be trusted, such as that its checksum is
+            right: true or 1; or for each path the values that say so, as in `where`. Any other message is refused, by
+            its reason, and counts as none that was lost. None for no such flag.
         quoted: whether numbers in quotes are numbers too (default False: they are refused).
 
     Raises:
@@ -224,7 +256,7 @@ def json_field(
     return Source(
         paths, whose, outputs, factors, shifts, stamp, time_unit, count,
         None if of is None else _check_name("plant", of),
-        seconds, *_split_conditions(where), flag("json_field, quoted", quoted),
+        seconds, *_split_conditions(where), _read_valid(valid), flag("json_field, quoted", quoted),
     )  # fmt: skip
 
 
@@ -244,7 +276,7 @@ def _check_name(name: str, value: object) -> Any:
     return value
 
 
-def _split_conditions(where: object) -> tuple[Containers, tuple[Available, ...]]:
+def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
     """Return the conditions on fields, and those on what devices say of themselves."""
     several = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
     available = tuple(single for single in several if isinstance(single, Available))
@@ -264,6 +296,15 @@ def _split_conditions(where: object) -> tuple[Containers, tuple[Available, ...]]
             raise fail(f"json_field, where, {path!r}", "a value, or a list, set or range of them", show_value(allowed))
         values[path] = allowed
     return values, available
+
+
+def _read_valid(valid: object) -> Allowed:
+    """Return the values of each flag by which a message says that it can be trusted."""
+    if isinstance(valid, str):
+        return {valid: (True, 1)}
+    if not isinstance(valid, Mapping | None):
+        raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
+    return _split_conditions(valid)[0]
 
 
 def read_texts(name: str, value: object) -> tuple[str, ...]:

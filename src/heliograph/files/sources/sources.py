@@ -256,6 +256,7 @@ class Sources:
             return None
         if node not in places:
             raise fail(f"{where}, node", f"one of {', '.join(places)}", _near(node, places))
+        source.check_valid(message, where)
         sequence, missing = self._find_count(source, pattern, message, where)
         # Values; of a message that has its count they may be absent.
         values = np.full(len(self.names[node]), np.nan)
@@ -300,7 +301,8 @@ class Sources:
             self.absent.setdefault(key, str(error))
             return 0, True
         self.found.add(key)
-        return count(value, f"{where}, field {path!r}", source.quoted), False
+        name = f"{where}, field {path!r}"
+        return source.sequence.check(count(value, name, source.quoted), name), False
 
     def _check_sources(self, topic: object, items: object) -> list[Mapped]:
         """Check the sources of a topic, and look up where their values are in the measurement of each node."""
