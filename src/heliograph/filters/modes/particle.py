@@ -1,11 +1,13 @@
 """Rao-Blackwellised particle filter: particles for the modes of links with memory, each with a Gaussian state."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.factors.gaussian import Gaussian, from_covariance, moments_of_mixture
 from heliograph.filters.base import (
@@ -26,6 +28,8 @@ from heliograph.filters.modes.multiple_model import (
     replicate,
 )
 from heliograph.filters.modes.patterns import SideInformation
+from heliograph.filters.particles.building import build_partly_drawn
+from heliograph.filters.particles.partly_drawn import PartlyDrawnFilter
 from heliograph.filters.particles.resampling import (
     effective_number,
     fold_in_bits,
@@ -41,7 +45,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrap_angles
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.memory import memories
@@ -137,6 +141,9 @@ class ParticleFilter(AbstractSizedFilter):
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim)
 
 
+AnyParticleFilter = TypeAliasType("AnyParticleFilter", ParticleFilter | PartlyDrawnFilter | StateParticleFilter)
+
+
 @believes
 def particle_filter(
     plant: "AnyPlant",
@@ -148,15 +155,19 @@ def particle_filter(
     nodes: int = NODES,
     proposal: str = "optimal",
     resample: float = 0.5,
-) -> "ParticleFilter | StateParticleFilter":
-    """Particle filter: of the state, or behind links with memory of their modes (Rao-Blackwell).
+    drawn: "Sequence[str] | None" = None,
+) -> "AnyParticleFilter":
+    """Particle filter: of the state, of named states, or behind links with memory of their modes (Rao-Blackwell).
 
     Of the state: N points with weights, for any plant, and any sensor and link without memory whose noise has a
-    density: x_i is drawn from a proposal q, and its weight multiplied by p(z | x_i) p(x_i | before) / q(x_i). Of modes:
-    each particle draws a path of modes and carries the Gaussian filter of that path. Systematic resampling where the
-    effective number 1 / sum w_i^2 is below a share of N, of the state at the start of the next step, so that an
-    estimate has all weights. A row that no particle can explain is not used: its log-likelihood is -inf. Error of the
-    mixture's moments: in proportion to 1 / root of `particles`.
+    density: x_i is drawn from a proposal q, and its weight multiplied by p(z | x_i) p(x_i | before) / q(x_i). Of the
+    states named `drawn`: given these (and a mode) the others are Gaussian, exactly, and each particle carries their
+    Kalman filter; p is then the density with the others integrated out. Of a `markov_plant`, a `markov_sensor` and
+    links with them, each particle draws the joint mode too, from its law given z, all modes summed. Of links' modes
+    alone: each particle draws a path of modes and carries the Gaussian filter of that path. Systematic resampling
+    where the effective number 1 / sum w_i^2 is below a share of N, of the state at the start of the next step, so that
+    an estimate has all weights. A row that no particle can explain is not used: its log-likelihood is -inf. Error of
+    the mixture's moments: in proportion to 1 / root of `particles`.
 
     Args:
         plant: the plant, n states.
@@ -170,19 +181,25 @@ def particle_filter(
             particles without z where h is not linear or the gain random; "prior" draws it without z, and takes any
             law of the process noise.
         resample: of the state: share of N below which the effective number leads to resampling; 0.5 by default.
+        drawn: names of the states that are drawn, such as a heading; given them plant and sensor must be linear in
+            the others, angles drawn, and noises Gaussian. [] draws modes alone. By default all are drawn, and of
+            links' modes alone none.
 
     Claim: "nominal": with finitely many particles it approaches the truth from either side.
 
     Raises:
         ValueError: a count of particles below 1; as for `imm_filter`; of the state also a received number without
-            noise, gains that are not of finitely many values, a sensor that depends on inputs.
+            noise, gains that are not of finitely many values, a sensor that depends on inputs; with `drawn` also a
+            plant or sensor that is not seen to be linear given these states.
 
     Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
-        2001; Gordon, Salmond and Smith (1993) and Doucet, Godsill and Andrieu (2000) of the state.
+        2001; Gordon, Salmond and Smith (1993) and Doucet, Godsill and Andrieu (2000) of the state; Schoen, Gustafsson
+        and Nordlund, Marginalized particle filters for mixed linear/nonlinear state-space models (2005).
     """
-    for kind, model in (("plant", plant), ("sensor", sensor)):
-        if isinstance(model, ModalPlant | ModalSensor):
-            raise fail(kind, "one law (imm_filter and gpb2_filter take several)", f"a markov_{kind}")
+    of_modes = isinstance(plant, ModalPlant) or isinstance(sensor, ModalSensor)
+    if drawn is not None or of_modes:
+        count = MANY if particles is None else particles
+        return build_partly_drawn(plant, sensor, channel, count, seed, proposal, resample, drawn, nodes)
     if not memories(channel):
         count = MANY if particles is None else particles
         return build_state_particles(plant, sensor, channel, count, seed, proposal, resample)

@@ -9,9 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.columns import Columns, columns_of
 from heliograph.filters.particles.received_density import Atoms
+from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, nearest
+from heliograph.random_affine.noise import AbstractNoise
 
 SAFE = 0.1  # share of the proposal that is the prior: weights are then bounded, where h saturates too
 LOG_TURN = float(np.log(2 * np.pi))
@@ -69,3 +72,8 @@ def propose(
         return center + moved.root @ e, jnp.where(jnp.isfinite(log_q), log_prior - log_q, 0.0)
 
     return Proposed(*jax.vmap(one)(moved.center, draws, chosen))
+
+
+def noise_columns(plant: AbstractPlant, u: jax.Array) -> Columns:
+    """Return the factors of Cov w."""
+    return plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))

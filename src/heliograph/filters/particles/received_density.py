@@ -61,36 +61,47 @@ class Atoms(Module):
 
 
 class ReceivedDensity(Module):
-    """Atoms of what is received at one step, for each set of components that arrive together.
+    """Atoms of what is received at one step, in each mode, for each set of components that arrive together.
 
-    Shapes: present (A, m), chance (1, A), and the atoms' with a first axis A.
+    Shapes: present (A, m), chance (M, A), and the atoms' with first axes (M, A).
     """
 
     present: Bool[Array, "A m"]
-    chance: Float[Array, "1 A"]
+    chance: Float[Array, "M A"]
     atoms: Atoms
 
-    def given_arrivals(self, z: jax.Array) -> Atoms:
-        """Return the atoms of the smallest set in which all arrive that did."""
+    def given_arrivals(self, z: jax.Array) -> tuple[Atoms, jax.Array]:
+        """Return the atoms, and the chance (M,), of the smallest set in which all arrive that did, in each mode."""
         kind = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
-        chosen: Atoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[kind], self.atoms)
-        return chosen
+        chosen: Atoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, kind], self.atoms)
+        return chosen, jnp.asarray(self.chance)[:, kind]
 
 
-def find_received_density(sensor: AbstractSensor, channel: AbstractRandomAffine) -> ReceivedDensity:
-    """Return the density of z given h(x) behind a channel without memory.
+def find_received_density(
+    sensors: Sequence[AbstractSensor], channels: Sequence[AbstractRandomAffine]
+) -> ReceivedDensity:
+    """Return the density of z given h(x), for the sensor and the channel without memory of each mode.
 
     Raises:
         ValueError: gains not of finitely many values, noises not Gaussian; a received number, or a combination
             of several, without noise.
     """
-    outcomes = sorted(channel.list_outcomes(), key=lambda outcome: (sum(outcome.arrived), tuple(outcome.arrived)))
-    by_outcome = [_list_atoms(sensor, outcome) for outcome in outcomes]
-    most = max(len(atoms) for atoms in by_outcome)
-    padded = [_stack_atoms(atoms, most) for atoms in by_outcome]
-    present = np.array([outcome.arrived for outcome in outcomes], dtype=bool)
-    chance = np.array([[outcome.probability for outcome in outcomes]], dtype=float)
-    return ReceivedDensity(present, chance, jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
+    by_mode = [{tuple(outcome.arrived): outcome for outcome in channel.list_outcomes()} for channel in channels]
+    sets = sorted({arrived for outcomes in by_mode for arrived in outcomes}, key=lambda one: (sum(one), one))
+    # A set that cannot arrive in a mode has a chance of 0 there, and any atoms: those of another.
+    listed = [
+        [_list_atoms(sensor, outcomes.get(arrived, next(iter(outcomes.values())))) for arrived in sets]
+        for sensor, outcomes in zip(sensors, by_mode, strict=True)
+    ]
+    most = max(len(atoms) for of_mode in listed for atoms in of_mode)
+    padded = [[_stack_atoms(atoms, most) for atoms in of_mode] for of_mode in listed]
+    stacked = [jax.tree.map(lambda *leaves: np.stack(leaves), *of_mode) for of_mode in padded]
+    chance = [[outcomes[one].probability if one in outcomes else 0.0 for one in sets] for outcomes in by_mode]
+    return ReceivedDensity(
+        np.array(sets, dtype=bool),
+        np.array(chance, dtype=float),
+        jax.tree.map(lambda *leaves: np.stack(leaves), *stacked),
+    )
 
 
 def _list_atoms(sensor: AbstractSensor, outcome: Outcome) -> list[Component]:

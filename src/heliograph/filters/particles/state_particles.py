@@ -18,7 +18,7 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.filters.innovation import mixed_innovation
-from heliograph.filters.particles.proposal import Moved, propose
+from heliograph.filters.particles.proposal import Moved, noise_columns, propose
 from heliograph.filters.particles.received_density import Atoms, ReceivedDensity, find_received_density
 from heliograph.filters.particles.resampling import effective_number, fold_in_bits, resample_systematically
 from heliograph.model.channel import Channel, check_link, find_received_angles
@@ -120,7 +120,7 @@ class StateParticleFilter(AbstractSizedFilter):
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
         """
-        own = _noise_columns(plant, u)
+        own = noise_columns(plant, u)
         root, center = _root_of(own), center + plant.noise_mean()
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return Moved(center, root)
@@ -133,7 +133,7 @@ class StateParticleFilter(AbstractSizedFilter):
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
         """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z."""
         z, sensor = jnp.asarray(z), at(self.sensor, k)
-        atoms = at(self.density, k).given_arrivals(z)
+        atoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
         key = fold_in_bits(state.key, z)
         predicted = jax.vmap(sensor.measure)(state.position)
         position, correction = state.position, jnp.zeros(self.particles)
@@ -186,17 +186,12 @@ def _weighted(state: StateParticles, position: jax.Array, log_weight: jax.Array,
     return StateParticles(position, relative, position, jnp.zeros_like(state.root), key, state.moved)
 
 
-def _noise_columns(plant: AbstractPlant, u: jax.Array) -> Columns:
-    """Return the factors of Cov w."""
-    return plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-
-
 def _draw_noise(plant: AbstractPlant, key: jax.Array, u: jax.Array, count: int) -> jax.Array:
     """Draw w for each of so many particles, (count, n); Gaussian noise in one piece."""
     if not isinstance(plant.noise, Gaussian):
         return jax.vmap(lambda own: plant.sample_noise(own, u))(jax.random.split(key, count))
     draws = jax.random.normal(key, (count, len(plant.states)), dtype=float)
-    return plant.noise_mean() + draws @ _root_of(_noise_columns(plant, u)).T
+    return plant.noise_mean() + draws @ _root_of(noise_columns(plant, u)).T
 
 
 def _root_of(columns: Columns) -> jax.Array:
@@ -223,7 +218,7 @@ def build_state_particles(
     return StateParticleFilter(
         plant=plant,
         sensor=sensor,
-        density=restack([find_received_density(*step) for step in by_step], sensor, channel),
+        density=restack([find_received_density([s], [c]) for s, c in by_step], sensor, channel),
         resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
         particles=check_count("particles", particles),

@@ -1,0 +1,135 @@
+"""Whether a function written in JAX is affine in some of its arguments, given the others: read off its operations.
+
+Each number of the traced program has a degree: KNOWN, a constant; GIVEN, made of the other arguments alone; AFFINE, a
+sum of numbers that are given and of arguments times such; OTHER, whatever else, or what is not seen to be less.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+from heliograph.numerics.float64 import in_float64
+
+KNOWN, GIVEN, AFFINE, OTHER = -1, 0, 1, 2
+MOVES = ("reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
+         "split", "stack", "unstack")  # fmt: skip
+LOOKUPS = ("gather", "dynamic_slice")  # the first operand is moved, by indices
+CALLS = {"pjit": "jaxpr", "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
+
+
+class _Traced(NamedTuple):
+    """Degrees of an array's entries, and its value where all of them are known."""
+
+    degree: np.ndarray
+    value: Any = None
+
+    @property
+    def is_zero(self) -> np.ndarray:
+        """Which entries are known zeros."""
+        return np.zeros(self.degree.shape, bool) if self.value is None else np.asarray(self.value) == 0
+
+
+@in_float64
+def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequence[int], *rest: np.ndarray) -> bool:
+    """Return whether f(x, *rest) is seen to be affine in the entries of x at these places, whatever all others are.
+
+    Args:
+        function: f, in operations of jax.numpy.
+        x: a point (n,), by its shape.
+        places: of x, in which f is to be affine.
+        rest: further arguments, by their shapes.
+    """
+    program = jax.make_jaxpr(function)(x, *rest)
+    degree = np.full(x.shape, GIVEN)
+    degree[list(places)] = AFFINE
+    given = [_Traced(np.full(np.shape(other), GIVEN)) for other in rest]
+    return all(np.all(result.degree <= AFFINE) for result in _trace_degrees(program, [_Traced(degree), *given]))
+
+
+def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_Traced]) -> list[_Traced]:
+    """Return the degrees of a program's results, operation by operation."""
+    values = dict(zip(program.jaxpr.invars, arguments, strict=True))
+    values.update(zip(program.jaxpr.constvars, map(_constant, program.consts), strict=True))
+
+    def read(atom: Any) -> _Traced:
+        return _constant(atom.val) if isinstance(atom, core.Literal) else values[atom]
+
+    for equation in program.jaxpr.eqns:
+        inputs = [read(atom) for atom in equation.invars]
+        values.update(zip(equation.outvars, _degrees_of_operation(equation, inputs), strict=True))
+    return [read(atom) for atom in program.jaxpr.outvars]
+
+
+def _constant(value: Any) -> _Traced:
+    return _Traced(np.full(np.asarray(value).shape, KNOWN), value)
+
+
+def _degrees_of_operation(equation: Any, x: list[_Traced]) -> list[_Traced]:
+    """Return the degrees of the results of one operation."""
+    name, params = equation.primitive.name, equation.params
+    if name in CALLS:
+        inner = params[CALLS[name]]
+        return _trace_degrees(inner, x)
+    if all(one.value is not None for one in x):
+        values = equation.primitive.bind(*(jnp.asarray(one.value) for one in x), **params)
+        return [_constant(value) for value in (values if equation.primitive.multiple_results else [values])]
+    shapes = [out.aval.shape for out in equation.outvars]
+    if all(np.all(one.degree <= GIVEN) for one in x):
+        return [_Traced(np.full(shape, GIVEN)) for shape in shapes]
+    if name in MOVES or (name in LOOKUPS and all(one.value is not None for one in x[1:])):
+        moved = (
+            [one.degree for one in x[:1]] + [one.value for one in x[1:]]
+            if name in LOOKUPS
+            else [one.degree for one in x]
+        )
+        degrees = equation.primitive.bind(*(jnp.asarray(one) for one in moved), **params)
+        return [
+            _Traced(np.asarray(degree)) for degree in (degrees if equation.primitive.multiple_results else [degrees])
+        ]
+    return [_Traced(np.broadcast_to(_degree_of_arithmetic(name, params, x), shape)) for shape in shapes]
+
+
+def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_Traced]) -> Any:
+    """Return the degrees of a sum, a product, a choice; OTHER of what is not linear."""
+    match name:
+        case "add" | "add_any" | "sub":
+            return np.maximum(x[0].degree, x[1].degree)
+        case "neg" | "real":
+            return x[0].degree
+        case "convert_element_type" if np.dtype(params["new_dtype"]).kind == "f":
+            return x[0].degree
+        case "reduce_sum":
+            return np.max(x[0].degree, axis=tuple(params["axes"]), initial=KNOWN)
+        case "mul":
+            zero = x[0].is_zero | x[1].is_zero
+            return np.where(zero, GIVEN, _of_product(x[0].degree, x[1].degree))
+        case "div":
+            return np.where(x[1].degree <= GIVEN, x[0].degree, OTHER)
+        case "integer_pow" if params["y"] == 1:
+            return x[0].degree
+        case "select_n":
+            cases = np.max([one.degree for one in x[1:]], axis=0)
+            return np.where(x[0].degree <= GIVEN, cases, OTHER)
+        case "dot_general":
+            return _degree_of_contraction(x[0], x[1], params["dimension_numbers"])
+    return np.asarray(OTHER)
+
+
+def _of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.where(np.minimum(a, b) <= GIVEN, np.maximum(a, b), OTHER)
+
+
+def _degree_of_contraction(a: _Traced, b: _Traced, dimensions: Any) -> np.ndarray:
+    """Return the degrees of sums of products, in which a known zero takes its product away."""
+
+    def count(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.asarray(jax.lax.dot_general(one.astype(float), other.astype(float), dimensions))
+
+    affine = count(a.degree >= AFFINE, ~b.is_zero) + count(~a.is_zero, b.degree >= AFFINE)
+    other = count(a.degree >= OTHER, ~b.is_zero) + count(~a.is_zero, b.degree >= OTHER)
+    both = count(a.degree >= AFFINE, b.degree >= AFFINE)
+    return np.where(other + both > 0, OTHER, np.where(affine > 0, AFFINE, GIVEN))

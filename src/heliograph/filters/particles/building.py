@@ -1,0 +1,97 @@
+"""Particle filters of the state and of modes, made of what `particle_filter` takes, and what they refuse."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heliograph.filters.base import make_sizes
+from heliograph.filters.modes.models_by_mode import find_models
+from heliograph.filters.particles.affine import is_affine
+from heliograph.filters.particles.partly_drawn import PartlyDrawnFilter
+from heliograph.filters.particles.received_density import find_received_density
+from heliograph.model.channel import Channel, check_link, find_received_angles
+from heliograph.model.modes_of_motion import models_of
+from heliograph.model.over_time import first, list_steps, restack, steps_covered, unstack
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
+from heliograph.numerics.check import check_count, fail, instance, items, scalar
+from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.modes import joint_modes
+from heliograph.random_affine.noise import AbstractNoise, Gaussian
+
+
+def build_partly_drawn(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    particles: int,
+    seed: int,
+    proposal: str,
+    resample: float,
+    drawn: Sequence[str] | None,
+    nodes: int,
+) -> PartlyDrawnFilter:
+    """Return the particle filter that draws modes and the named states (None: all), the rest a Gaussian in each."""
+    start = models_of(instance("plant", first(plant), AbstractPlant, "a plant"))[0]
+    for senses in models_of(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
+        senses.refuse_inputs("particle_filter")
+        check_link(senses, first(channel), len(start.states), moments=False)
+    chosen = _places_of(start, drawn)
+    _check_linear_given(plant, sensor, chosen)
+    # One chain of the modes of plant, sensor and links; the density of z in each, at each step.
+    joint = joint_modes(first(channel), nodes, beside=(first(plant), first(sensor)))
+    which = find_models("sensor", sensor, [own for _, own in joint.beside])
+    steps = steps_covered((sensor, channel)) or 1
+    densities = []
+    for own, link in zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True):
+        maps = joint_modes(link, nodes, beside=(first(plant), first(sensor))).maps
+        densities.append(find_received_density([models_of(own)[i] for i in which], maps))
+    return PartlyDrawnFilter(
+        plant=drop_names(plant),
+        sensor=drop_names(sensor),
+        density=restack(densities, sensor, channel),
+        initial=joint.initial,
+        transition=joint.transition,
+        resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
+        observed_angles=find_received_angles(plant, sensor, channel),
+        plant_modes=find_models("plant", plant, [own for own, _ in joint.beside]),
+        sensor_modes=which,
+        order=(*chosen, *(i for i in range(len(start.states)) if i not in chosen)),
+        drawn=len(chosen),
+        particles=check_count("particles", particles),
+        optimal=proposal == "optimal",
+        seed=np.asarray(check_count("seed", seed, 0)),
+        **make_sizes("nominal", start, first(channel).outputs),
+    )
+
+
+def _places_of(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, ...]:
+    """Return the places of the drawn states, in the plant's order."""
+    if drawn is None:
+        return tuple(range(len(start.states)))
+    asked = [str(name) for name in items("drawn", drawn, "names of states")]
+    if not set(asked) <= set(start.states) or len(set(asked)) < len(asked):
+        raise fail("drawn", f"some of {list(start.states)}, each once", asked)
+    return tuple(i for i, name in enumerate(start.states) if name in asked)
+
+
+def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ...]) -> None:
+    """Raise ValueError unless, given the drawn states, the rest is Gaussian and moves and is measured linearly."""
+    for model in [one for step in unstack(plant) for one in models_of(step)]:
+        rest = [i for i in range(len(model.states)) if i not in drawn]
+        names = [model.states[i] for i in rest]
+        if isinstance(model.noise, AbstractNoise) and not isinstance(model.noise, Gaussian):
+            raise fail("particle_filter with drawn= or modes", "Gaussian process noise", type(model.noise).__name__)
+        if model.deviation is not None:
+            expected = "a Gaussian law of x_0 (a covariance)"
+            raise fail("particle_filter with drawn= or modes", expected, type(model.deviation).__name__)
+        if set(names) & set(model.circular):
+            raise fail("drawn", "all states that are angles", f"{sorted(set(names) & set(model.circular))} not drawn")
+        u = np.zeros(len(model.inputs))
+        if not isinstance(model, LinearPlant) and not is_affine(model.transition, model.initial_mean, rest, u):
+            expected = f"states given which the plant is linear in {names}, as its operations show (draw more)"
+            raise fail("drawn", expected, f"{[model.states[i] for i in drawn]}")
+        for sensing in [one for step in unstack(sensor) for one in models_of(step)]:
+            if not isinstance(sensing, LinearSensor) and not is_affine(sensing.measure, model.initial_mean, rest):
+                expected = f"states given which the sensor is linear in {names}, as its operations show (draw more)"
+                raise fail("drawn", expected, f"{[model.states[i] for i in drawn]}")

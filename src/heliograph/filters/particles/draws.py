@@ -1,0 +1,54 @@
+"""Draws of the leading states of a Gaussian: the law of the others given them, and the density of what was drawn."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.columns import UNITS, decorrelate, square_root, unit_of
+from heliograph.factors.gaussian import Gaussian
+
+LOG_TURN = float(np.log(2 * np.pi))
+
+
+def slopes_given(function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int) -> tuple[jax.Array, jax.Array]:
+    """Return f(mean), and the slopes (m, n) of f in xi of x = m + L xi, 0 in the first `drawn` entries: known ones."""
+
+    def of_rest(rest: jax.Array) -> jax.Array:
+        return function(jnp.concatenate([x.mean[:drawn], rest]))
+
+    rest = x.mean[drawn:]
+    slopes = jax.jacfwd(of_rest)(rest) @ x.root[drawn:, drawn:]
+    return of_rest(rest), jnp.pad(slopes, ((0, 0), (drawn, 0)))
+
+
+def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
+    """Return x given its leading states, which are drawn: their means plus L sqrt(d) times the draw (drawn,)."""
+    drawn = len(draw)
+    xi = square_root(x.variances[:drawn]) * draw
+    return x._replace(mean=x.mean + x.root[:, :drawn] @ xi, variances=x.variances.at[:drawn].set(0.0))
+
+
+def find_certain(x: Gaussian, d: jax.Array) -> jax.Array:
+    """Return which of the leading states, given those before them, have no variance but rounding's (drawn,)."""
+    drawn = len(d)
+    whole = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
+    certain: jax.Array = x.variances[:drawn] <= (UNITS * drawn * unit_of(d)) ** 2 * whole
+    return certain
+
+
+def condition_on_leading(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
+    """Return x given its leading states d (drawn,), and log N(d) of those that are not certain given others."""
+    drawn = len(d)
+    xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]
+    variances = jnp.where(certain, 1.0, x.variances[:drawn])
+    log_density = jnp.where(certain, 0.0, -(xi**2 / variances + jnp.log(variances) + LOG_TURN) / 2)
+    mean = (x.mean + x.root[:, :drawn] @ xi).at[:drawn].set(d)
+    given = x._replace(mean=mean, variances=x.variances.at[:drawn].set(0.0))
+    return given, jnp.sum(log_density)
+
+
+def draw_index(log_weight: jax.Array, uniform: jax.Array) -> jax.Array:
+    """Draw an index by each row of log weights (N, M), with a uniform number each (N,)."""
+    return jnp.sum(jnp.cumsum(jax.nn.softmax(log_weight, axis=1), axis=1)[:, :-1] <= uniform[:, None], axis=1)
