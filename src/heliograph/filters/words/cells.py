@@ -17,11 +17,38 @@ ROOT = np.sqrt(2 * np.pi)
 TABLE = 6  # bits of words whose cells are all summed
 REACH = 8.5  # deviations to each side, beyond which 2e-17 lies
 FINE = 0.25  # of a deviation: finer words are merged
-WINDOW = 72  # edges of words that are at least so wide, within the reach, and a few more
+BLOCK = 3  # bits of neighbouring words whose likelihoods are those of the bits above times one table
+WINDOW = 10  # blocks of words that are at least so wide within the reach, the first of which may begin a block earlier
 FAR = 30.0  # deviations from which on differences of tails have no digits
 NARROW = 1e-3  # of a deviation: the density is linear over a cell of this half width
 LEAST = 1e-3  # width, in deviations, of the dither by which edges are smoothed: less changes nothing
-MERGED = 134  # cells between an eighth and a quarter of a deviation within the reach
+MERGED = 18  # blocks of cells between an eighth and a quarter of a deviation within the reach
+CENTRE = 3.75  # of x = a / root 2, where c is 0
+POWERS = (
+    1.2375126308378275,
+    -0.14024059858554525,
+    0.0035854154854790257,
+    0.08227673848999506,
+    -0.10880393014244462,
+    0.09230432116428125,
+    -0.05869339857664934,
+    0.02836227737211114,
+    -0.009746579683265262,
+    0.0017556261651970652,
+    0.000293714378044958,
+    -0.00029015535246077655,
+    5.164652974177416e-05,
+    2.2387565714911816e-05,
+    -1.1438048033346894e-05,
+    -9.792625707303523e-07,
+    1.7419821586224816e-06,
+    -5.084465378687302e-08,
+    -2.4857126248016745e-07,
+    1.879082322370048e-08,
+    3.197926671666804e-08,
+    -1.9551358868985616e-09,
+    -2.623107347133476e-09,
+)  # of (1 + 2 x) e^(x^2) erfc x
 
 
 class Sums(NamedTuple):
@@ -65,33 +92,45 @@ class Steps(NamedTuple):
 Smooth = Callable[[jax.Array, jax.Array], Steps]
 
 
-def tail(a: jax.Array) -> jax.Array:
-    """Q(a) = P(t > a)."""
-    return jax.scipy.special.erfc(a / np.sqrt(2)) / 2
+def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q(a) = P(t > a) and phi(a) of a >= 0, with one exponential and one reciprocal; both to 5e-16 of themselves.
+
+    With x = a / root 2 and c = (x - K) / (x + K), (1 + 2 x) e^(x^2) erfc x is smooth in c from -1 to 1.
+
+    Source: Shepherd and Laframboise, Chebyshev approximation of (1 + 2 x) exp(x^2) erfc x (1981), in powers of c.
+    """
+    x = a * np.sqrt(0.5)
+    falling = jnp.exp(-x * x)
+    reciprocal = 1 / ((x + CENTRE) * (1 + 2 * x))
+    c = (x - CENTRE) * (1 + 2 * x) * reciprocal
+    ratio = jnp.full_like(a, POWERS[-1])
+    for power in POWERS[-2::-1]:
+        ratio = ratio * c + power
+    return ratio * ((x + CENTRE) * reciprocal) * (falling / 2), falling * (1 / ROOT)
 
 
-def normal_density(a: jax.Array) -> jax.Array:
-    """phi(a)."""
-    density: jax.Array = jnp.exp(-(a**2) / 2) / ROOT
-    return density
+def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q(a) and phi(a) of any a."""
+    q, density = tail_and_density(jnp.abs(a))
+    return jnp.where(a < 0, 1 - q, q), density
 
 
 def step_as_it_is(a: jax.Array, width: jax.Array) -> Steps:
     """No dither: Q, phi and a phi."""
-    density = normal_density(a)
-    return Steps(tail(a), density, a * density)
+    q, density = tail_and_density(a)
+    return Steps(q, density, a * density)
 
 
 def step_by_uniform(a: jax.Array, width: jax.Array) -> Steps:
     """A uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, of Q and of phi."""
     low, high = a - width / 2, a + width / 2
-    (q, p), (q_above, p_above) = ((tail(x), normal_density(x)) for x in (low, high))
+    (q, p), (q_above, p_above) = (signed_tail_and_density(x) for x in (low, high))
     return Steps((p - low * q - p_above + high * q_above) / width, (q - q_above) / width, (p - p_above) / width)
 
 
 def step_by_triangle(a: jax.Array, width: jax.Array) -> Steps:
     """A triangular dither: second differences of E((t - a)+)^2 / 2 = ((1 + a^2) Q - a phi)/2, of I and of Q."""
-    q, p = zip(*((tail(x), normal_density(x)) for x in (a - width, a, a + width)), strict=True)
+    q, p = zip(*(signed_tail_and_density(x) for x in (a - width, a, a + width)), strict=True)
     x = a - width, a, a + width
 
     def second_difference(values: list[jax.Array]) -> jax.Array:
@@ -132,18 +171,45 @@ def sum_all_cells(likelihood: jax.Array, grid: Grid, prior: Prior, dither: str) 
     return sum_by_edges(t, jnp.diff(likelihood), here, grid.step / prior.deviation, SMOOTH[dither])
 
 
+def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
+    """Return the likelihoods of words by their numbers, the products of those of their bits; 0 of what is no word.
+
+    Args:
+        pairs: likelihoods of a zero and a one of each bit, the lowest first, (bits, 2).
+        numbers: whole numbers from 0 (...,).
+    """
+    rest, likelihood = numbers, jnp.ones(numbers.shape)
+    for zero, one in pairs:
+        half = jnp.floor(rest / 2)
+        likelihood = likelihood * jnp.where(rest > 2 * half, one, zero)
+        rest = half
+    return jnp.where(rest > 0, 0.0, likelihood)
+
+
+def multiply_block_bits(pairs: jax.Array, first: jax.Array, blocks: int) -> tuple[jax.Array, jax.Array]:
+    """Return likelihoods of neighbouring words as those of the bits above a block (blocks,) times those in it (8,).
+
+    Args:
+        pairs: as of `multiply_bits`.
+        first: number of the first word, with which a block begins.
+        blocks: how many.
+    """
+    return multiply_bits(pairs[BLOCK:], first / 2**BLOCK + np.arange(blocks)), _tabulate(pairs[:BLOCK])
+
+
 def sum_window(
-    likelihood_of: Callable[[jax.Array], jax.Array], received: jax.Array, grid: Grid, prior: Prior, dither: str
+    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: Grid, prior: Prior, dither: str
 ) -> Sums:
-    """Sum over the words within the reach of the prior, and the one that was received."""
-    last = 2.0**grid.bits - 1
-    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / grid.step)
-    start = jnp.clip(start, 0.0, jnp.maximum(last - WINDOW, 0.0))
-    words = start + np.arange(WINDOW + 1)
-    likelihood = likelihood_of(words)
+    """Sum over the words within the reach of the prior, and the one that was received; arguments `change_by_bits`'."""
+    count = WINDOW * 2**BLOCK
+    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
+    start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
+    tables = [jnp.outer(*multiply_block_bits(pair, start, WINDOW)).ravel() for pair in pairs]
+    likelihood = weights @ jnp.stack(tables)
     sums = sum_all_cells(likelihood, Grid(grid.low + start * grid.step, grid.step, grid.bits), prior, dither)
-    outside = (received < start) | (received > start + WINDOW)
-    return sums.plus(sum_cell(likelihood_of(received[None])[0] * outside, received, grid, prior, dither))
+    outside = (received < start) | (received >= start + count)
+    own = weights @ jnp.stack([multiply_bits(pair, received) for pair in pairs])
+    return sums.plus(sum_cell(own * outside, received, grid, prior, dither))
 
 
 def sum_cell(likelihood: jax.Array, index: jax.Array, grid: Grid, prior: Prior, dither: str) -> Sums:
@@ -180,34 +246,56 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: Grid, prior: Prior) 
     mean = jnp.sum(jnp.where(low, 2.0**bits * ones, 0.0))
     variance = grid.step**2 * (jnp.sum(jnp.where(low, 4.0**bits * ones * (1 - ones), 0.0)) + 1 / 12)
     inner = jnp.prod(jnp.where(low, total, 1.0))
-    # Cells within the reach, and the one of the received word.
-    cells = 2.0**grid.bits / size
-    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * size))
-    start = jnp.clip(start, 0.0, jnp.maximum(cells - MERGED, 0.0))
-    number = start + np.arange(MERGED + 1)
+    # Each cell is a Gaussian times the prior's, wide s^2 together: mass e^(-away^2 / (2 wide)).
+    wide = 1 + variance / prior.deviation**2
+    width = size * grid.step / prior.deviation
+    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * size * 2**BLOCK)) * 2**BLOCK
+    start = jnp.maximum(start, 0.0)
+
+    def away_of(cell: jax.Array) -> jax.Array:
+        return (grid.low + (cell * size + mean) * grid.step - prior.mean) / prior.deviation
+
+    # Cells within the reach, by blocks: with a of a block's first, e^(-(a + j w)^2 / 2) is e^(-a^2 / 2) (e^(-a w))^j
+    # e^(-(j w)^2 / 2).
+    upper = _shift_bits(pairs, level)
+    outer, table = multiply_block_bits(upper, start, MERGED)
+    away, places = away_of(start + np.arange(MERGED) * 2.0**BLOCK), np.arange(2.0**BLOCK)
+    table = table * jnp.exp(-((places * width) ** 2) / (2 * wide))
+    ratio, powers = jnp.exp(-away * width / wide), [jnp.ones(MERGED)]
+    for _ in places[1:]:
+        powers.append(powers[-1] * ratio)
+    inside = jnp.stack(powers, axis=1) * table
+    moments = [outer * jnp.exp(-(away**2) / (2 * wide)) * (inside @ places**power) for power in range(3)]
+    sums = [jnp.sum(moments[0]), jnp.sum(away * moments[0] + width * moments[1])]
+    sums.append(jnp.sum(away**2 * moments[0] + 2 * width * away * moments[1] + width**2 * moments[2]))
+    # The cell of the received word, where it is none of them.
     home = jnp.floor(received / size)
-    number = number.at[MERGED].set(home)
-    counts = (number < cells).at[MERGED].set((home < start) | (home >= start + MERGED))
-    bit = jnp.mod(jnp.floor(number[:, None] * size / 2.0**bits), 2.0)
-    outer = jnp.prod(jnp.where(low, 1.0, jnp.where(bit > 0, pairs[:, 1], pairs[:, 0])), axis=1)
-    # A Gaussian times the prior's.
-    square = prior.deviation**2
-    away = (grid.low + (number * size + mean) * grid.step - prior.mean) / prior.deviation
-    wide = 1 + variance / square
-    mass = outer * jnp.exp(-(away**2) / (2 * wide)) * counts
+    own = multiply_bits(upper, home) * ((home < start) | (home >= start + MERGED * 2.0**BLOCK))
+    own = own * jnp.exp(-(away_of(home) ** 2) / (2 * wide))
+    whole, first, second = (total + own * away_of(home) ** power for power, total in enumerate(sums))
     scale = inner * grid.step / (prior.deviation * ROOT * jnp.sqrt(wide))
-    first, second = jnp.sum(mass * away) / wide, jnp.sum(mass * away**2) / wide**2
-    whole = jnp.sum(mass)
-    return Sums(scale * whole, scale * first, scale * (second + whole * (variance / square) / wide))
+    first, second = first / wide, second / wide**2
+    return Sums(scale * whole, scale * first, scale * (second + whole * (1 - 1 / wide)))
 
 
-def _sum_overloads(grid: Grid, prior: Prior, likelihood_of: Callable[[jax.Array], jax.Array]) -> Sums:
-    """Sum over y beyond both ends of the range."""
+def _shift_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
+    """Return the likelihoods of the bits from number `count` on (bits, 2), above the last ones of a sure zero."""
+    shifted, rest, step = pairs, count, 1
+    while step < len(pairs):
+        half = jnp.floor(rest / 2)
+        sure = jnp.tile(jnp.array([1.0, 0.0]), (step, 1))
+        shifted = jnp.where(rest > 2 * half, jnp.concatenate([shifted[step:], sure]), shifted)
+        rest, step = half, 2 * step
+    return shifted
+
+
+def _sum_overloads(pair: jax.Array, grid: Grid, prior: Prior) -> Sums:
+    """Sum over y beyond both ends of the range, where all bits are zeros or ones."""
     ends = jnp.array([0.0, 2.0**grid.bits - 1])
     outwards = jnp.array([-1.0, 1.0])
     t = (grid.low + (ends + outwards / 2) * grid.step - prior.mean) / prior.deviation
-    a, likelihood = t * outwards, likelihood_of(ends)
-    mass, density = likelihood * tail(a), likelihood * normal_density(a)
+    a, likelihood = t * outwards, jnp.prod(pair, axis=0)
+    mass, density = (likelihood * part for part in signed_tail_and_density(a))
     return Sums(jnp.sum(mass), jnp.sum(outwards * density), jnp.sum(mass + a * density))
 
 
@@ -281,23 +369,18 @@ def change_by_bits(
         dither: of the encoder.
     """
 
-    def likelihood_of(numbers: jax.Array) -> jax.Array:
-        bit = jnp.mod(jnp.floor(numbers[:, None] / 2.0 ** np.arange(grid.bits)), 2.0)
-        each = [jnp.prod(jnp.where(bit > 0, pair[:, 1], pair[:, 0]), axis=1) for pair in pairs]
-        return weights @ jnp.stack(each)
-
     if grid.bits <= TABLE:
         table = weights @ jnp.stack([_tabulate(pair) for pair in pairs])
         return change_by_sums(sum_all_cells(table, grid, prior, dither))
 
     def wide_words() -> Change:
-        return change_by_sums(sum_window(likelihood_of, received, grid, prior, dither))
+        return change_by_sums(sum_window(pairs, weights, received, grid, prior, dither))
 
     def fine_words() -> Change:
         wider, wide = widen(prior, grid, dither)
-        merged = _sum_overloads(grid, wider, likelihood_of)
+        merged = Sums(*jnp.zeros(3))
         for a, pair in enumerate(pairs):
-            sums = sum_merged(pair, received, grid, wider)
+            sums = sum_merged(pair, received, grid, wider).plus(_sum_overloads(pair, grid, wider))
             merged = merged.plus(Sums(*(weights[a] * one for one in sums)))
         return narrow(change_by_sums(merged), wide)
 
