@@ -198,7 +198,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
 
 
 def _errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
-    error, covariance = truth - jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
+    error, covariance = estimate.error(truth), jnp.asarray(estimate.covariance)
     variance = jnp.broadcast_to(jnp.diagonal(covariance, axis1=-2, axis2=-1), error.shape)
     nees = jnp.vectorize(squared_distance, signature="(n,n),(n)->()")(covariance, error)
     return {"error": error, "variance": variance, "nees_per_dimension": nees / len(truth)}

@@ -124,9 +124,11 @@ def claim_of(filter: AbstractFilter, real: Real) -> Claim:
 def _write_comment(program: StepProgram, form: Form) -> str:
     """Return the explanation for a reader of the header."""
     filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
-    # States that are angles say so.
+    # States that are angles or attitudes say so.
     circular = first(filter.plant).circular if hasattr(filter, "plant") else ()
-    units = [" (radians, from -pi to pi)" if name in circular else "" for name in filter.states]
+    notes = {filter.states.index(name): " (radians, from -pi to pi)" for name in circular}
+    notes |= dict.fromkeys(filter.attitude, " (of a rotation vector, radians; its errors are turns in the body's axes)")
+    units = [notes.get(i, "") for i in range(len(filter.states))]
     lines = [
         f"{prefix}.h: one step of {form.kind}.",
         f"Made by heliograph {heliograph.__version__}; do not edit.",

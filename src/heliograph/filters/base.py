@@ -65,8 +65,7 @@ class AbstractFilter(Module):
         states: names of the states that are estimated, n of them.
         inputs: names of the inputs that `predict` takes.
         received: length of the measurement z; 0 for a filter that uses none, and then z may have any length.
-        kept: the premise, as `believes` keeps it beside the numbers; none of a filter that does not say what it
-            believes.
+        kept: the premise, as `believes` keeps it beside the numbers; none of a filter that does not say it.
     """
 
     claim: eqx.AbstractVar[Claim]
@@ -244,6 +243,11 @@ class AbstractFilter(Module):
     def angles_used(self) -> FilterAngles | None:
         """Return which states and received numbers it takes for angles; None where it does not say."""
         return None
+
+    @property
+    def attitude(self) -> Angles:
+        """Places of attitudes among its states, which it turns where others add; none of most filters."""
+        return ()
 
     @property
     def premise(self) -> Premise | None:

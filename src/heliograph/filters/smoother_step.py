@@ -9,13 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.factors.changes import settle, unsettle
 from heliograph.factors.columns import Columns, decorrelate, join_columns, triangularise, unit_lower
 from heliograph.factors.gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.angle import Angles, wrap_angles
+from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+EVERY_LINE = Manifold()
 
 
 class StepTrace(NamedTuple):
@@ -61,9 +65,9 @@ class SmootherStep(Module):
     prediction with a white noise, whatever the correction. The plant's state is projection y + shift of the filter's
     state y, y itself without them. Stacked along time, and over runs, it describes a whole run of a filter.
 
-    claim: of estimates given later data too. angles: which of the plant's states are wrapped to between -pi and pi in
-    estimates; a backward pass never wraps them. nis: e' S^-1 e of the step's innovation, with mean `received`, the
-    number of components that arrived.
+    claim: of estimates given later data too. manifold: which of the plant's states are angles, wrapped to between -pi
+    and pi in estimates, but never by a backward pass, and which are attitudes, whose law is one of turns from the mean.
+    nis: e' S^-1 e of the step's innovation, with mean `received`, the number of components that arrived.
 
     Shapes: projection (n, N), shift (n,).
     """
@@ -75,7 +79,7 @@ class SmootherStep(Module):
     nis: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
     received: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
     claim: Claim = eqx.field(static=True, kw_only=True)
-    angles: Angles = eqx.field(static=True, default=(), kw_only=True)
+    manifold: Manifold = eqx.field(static=True, default=EVERY_LINE, kw_only=True)
 
     @property
     def mean(self) -> Float[Array, "*time N"]:
@@ -89,13 +93,25 @@ class SmootherStep(Module):
         return covariance
 
     @property
+    def angles(self) -> Angles:
+        """Places of angles among the plant's states."""
+        return self.manifold.angles
+
+    @property
     def end(self) -> Any:
         """The law after the step, from which a pass back starts."""
         return self.after
 
     def back(self, later: Gaussian) -> Gaussian:
         """Smooth the state before the step from the state after it, both given the same later data (one RTS step)."""
-        return rts_step(self.before, later)
+        before, ahead = self.before.left.mean, self.before.ahead
+        return settle(self.manifold, before, rts_step(self.before, unsettle(self.manifold, ahead, later)))
+
+    def mean_back(self, later: jax.Array) -> jax.Array:
+        """Return the mean of the state before the step from that of the state after it, as `back` does."""
+        before = self.before
+        mean = before.mean_given(self.manifold.unsettle(before.ahead, later))
+        return jnp.asarray(self.manifold.settle(before.left.mean, mean))
 
     def start(self) -> EarlierState:
         """Return the state after this step as an earlier state that is yet to be carried ahead."""
@@ -114,7 +130,17 @@ class SmootherStep(Module):
         after = EarlierState(
             point.mean, point.through(before.gain), before.lower, triangularise(join_columns(point.noise, noise))
         )
-        return after._replace(mean=point.mean + after.through((self.after.mean - before.ahead)[:, None])[:, 0])
+        change = self.manifold.unsettle(before.ahead, self.after.mean) - before.ahead
+        after = after._replace(mean=point.mean + after.through(change[:, None])[:, 0])
+        # Of attitudes: errors about the mean after the step, in place of changes from that before the measurement.
+        reset = self.manifold.reset(change)
+        if reset is None:
+            return after
+        return after._replace(link=after.through(jnp.linalg.inv(reset)), lower=jnp.zeros_like(after.lower))
+
+    def settle(self, law: Gaussian) -> Gaussian:
+        """Return the law of this step's state, its mean on the group, from one of changes from the mean after it."""
+        return settle(self.manifold, self.after.mean, law)
 
     def reached(self, point: EarlierState) -> Gaussian:
         """Return the mean and covariance of an earlier state given all data up to this step."""
@@ -132,7 +158,8 @@ class SmootherStep(Module):
         if self.projection is not None:
             mean, columns = self.projection @ mean, columns.through(self.projection)
         mean = mean if self.shift is None else mean + self.shift
-        return Estimate(wrap_angles(mean, self.angles), columns.covariance, self.claim)
+        mean = wrap_angles(mean, self.angles)
+        return Estimate(mean, columns.covariance, self.claim, attitude=self.manifold.rotations)
 
 
 def gaussian_of(state: PyTree) -> Any:
@@ -149,7 +176,7 @@ def smoother_step_of(
     step: StepTrace,
     moved: tuple[Array, Columns],
     claim: Claim,
-    angles: Angles = (),
+    manifold: Manifold = EVERY_LINE,
     projection: Array | None = None,
 ) -> SmootherStep:
     """Build the smoother step from the Gaussians that a filter's states hold.
@@ -158,7 +185,7 @@ def smoother_step_of(
         step: with the states around it; m + L xi is that before it.
         moved: slopes (N, N) and noise (N, columns) of the move x+ = E x+ + slopes xi + w from x = m + L xi.
         claim: of smoothed estimates.
-        angles: places of angles among the plant's states.
+        manifold: which of the plant's states are angles and attitudes.
         projection: from the filter's state to the plant's (n, N).
     """
     slopes, noise = moved
@@ -167,7 +194,7 @@ def smoother_step_of(
         after,
         condition_on_next_state(before, jnp.asarray(slopes), prior.mean, noise),
         claim=claim,
-        angles=angles,
+        manifold=manifold,
         projection=None if projection is None else jnp.asarray(projection),
     )
 

@@ -15,6 +15,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array
 
@@ -91,9 +92,8 @@ def _draw_starts(target: Target, draws: int, generator: np.random.Generator) -> 
     part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    drawn: np.ndarray = means[part] + np.einsum(
-        "dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1]))
-    )
+    changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
+    drawn: np.ndarray = Manifold((), filter.attitude).settle(means[part], means[part] + changes)
     return drawn
 
 
@@ -110,7 +110,7 @@ def _draw_from_starts(
             u_k, k = row
             moving, measuring = jax.random.split(jax.random.fold_in(key, k))
             now = at(plant, k)
-            x = wrap_angles(now.transition(x, u_k) + now.sample_noise(moving, u_k), now.angles)
+            x = now.plus(now.transition(x, u_k), now.sample_noise(moving, u_k))
             if sensor is None:
                 return x, (x, jnp.zeros(0))
             eye = at(sensor, k).under(now.inputs, u_k)

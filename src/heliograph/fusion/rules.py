@@ -25,7 +25,7 @@ from heliograph.fusion.report_link import ReportLink, ReportLinks, check_reports
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import first, stack, stacked
-from heliograph.model.plant import AnyPlant, angles_among
+from heliograph.model.plant import AnyPlant, manifold_among
 from heliograph.numerics.angle import nearest, wrap_angles
 from heliograph.numerics.check import (
     array,
@@ -120,7 +120,9 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
     rule.check(len(estimates))
     # Angles within half a turn of those of the first estimate.
     means = np.stack([np.asarray(fill_masked(e.mean)) for e in estimates], axis=-2)
-    which = angles_among(angles, means.shape[-1])
+    which, attitude = manifold_among(angles, means.shape[-1])
+    if attitude or any(estimate.attitude for estimate in estimates):
+        raise fail("fusion", "estimates without attitudes", [estimate.attitude or attitude for estimate in estimates])
     means = nearest(means, means[..., :1, :], which)
     # The rule, over all leading axes; the claim from those of the inputs.
     covariances = np.stack([np.asarray(fill_masked(e.covariance)) for e in estimates], axis=-3)

@@ -12,6 +12,7 @@ from heliograph.h_infinity.system import GrowthSystem
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.premises.premise import WITHOUT_ATTITUDE
 from heliograph.model.sensor import AnySensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.float64 import in_float64
@@ -107,7 +108,8 @@ def h_infinity_filter(
         smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
         raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
     # Sizes of plant, sensor and design agree.
-    instance("plant", first(plant), AbstractPlant, "a plant")
+    if instance("plant", first(plant), AbstractPlant, "a plant").attitude:
+        raise fail("plant of an H-infinity filter", WITHOUT_ATTITUDE, list(first(plant).attitude))
     start, inputs = first(plant), system.output.shape[1]
     n = len(start.states)
     if n != system.states or design.gains.shape != (system.steps, n, system.received):

@@ -86,9 +86,9 @@ def _integrate_parts(
         state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in parts:
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
-            a = jax.jacfwd(plant.transition)(state, u)
+            a, moved = jax.jacfwd(plant.moves(u, state))(state), plant.transition(state, u)
             state, matrix, spread = (
-                plant.transition(state, u) + plant.noise_mean(),
+                plant.manifold.settle(moved, moved + plant.noise_mean()),
                 a @ matrix,
                 a @ spread @ a.T + plant.noise_covariance(u),
             )

@@ -125,6 +125,6 @@ def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Map
 
 def _stack_estimates(parts: Sequence[Estimate], how: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
     """Join estimates of several times by `how`, `np.stack` or `np.concatenate`, with the weakest of their claims."""
-    names = ("mean", "covariance", *(["modes"] if parts[0].modes is not None else []))
-    mean, covariance, *modes = (how([np.asarray(getattr(e, name)) for e in parts]) for name in names)
-    return Estimate(mean, covariance, parts[0].claim, *modes)
+    mean, covariance = (how([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
+    modes = None if parts[0].modes is None else how([np.asarray(e.modes) for e in parts])
+    return Estimate(mean, covariance, parts[0].claim, modes, parts[0].attitude)

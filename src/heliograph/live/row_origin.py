@@ -6,6 +6,7 @@ from heliograph.live.fleet import Fleet
 from heliograph.live.network_program import NetworkProgram
 from heliograph.model.estimate import Estimate, lower_unsound_claim
 from heliograph.model.origin import Origin
+from heliograph.model.over_time import first
 
 
 def make_row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
@@ -26,11 +27,12 @@ def make_row_origin(fleet: Fleet, slot: int, time: float) -> Origin:
 
 def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
     """Arrange the outputs of a row, or of rows, by node and filter."""
-    n = len(program.network.states)
+    n, attitude = len(program.network.states), first(program.network.plant).manifold.rotations
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}
     for place in program.places:
         mean = outputs[..., place.mean : place.mean + n]
         covariance = outputs[..., place.covariance : place.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
         modes = place.probabilities(outputs)
-        estimates[place.node][place.filter] = lower_unsound_claim(Estimate(mean, covariance, place.claim, modes))
+        estimate = Estimate(mean, covariance, place.claim, modes, attitude=attitude)
+        estimates[place.node][place.filter] = lower_unsound_claim(estimate)
     return estimates

@@ -322,7 +322,7 @@ class _Placed:
         with jax.enable_x64(True):
             modes = jax.eval_shape(filter.estimate, self._start).modes
         self.estimate: PyTree = jax.tree.structure(
-            JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, modes, 0.0, 0)
+            JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, modes, filter.attitude, 0.0, 0)
         )
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 

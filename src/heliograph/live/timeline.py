@@ -371,7 +371,14 @@ class Timeline:
                 reason = 0.0 if place.judgement is None else float(outputs[place.judgement.reason])
                 refused = Judgement.describe(reason, nis) if reason > 0 else ""
                 estimates[place.node][place.filter] = JudgedEstimate(
-                    estimate.mean, estimate.covariance, estimate.claim, estimate.modes, nis, received, refused
+                    estimate.mean,
+                    estimate.covariance,
+                    estimate.claim,
+                    estimate.modes,
+                    estimate.attitude,
+                    nis,
+                    received,
+                    refused,
                 )
         return estimates
 

@@ -9,11 +9,13 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.modes_of_motion import models_of
 from heliograph.model.over_time import OverTime, at_each_step, first, unstack
-from heliograph.model.plant import AnyPlant, check_turns
+from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.model.told import KnownGain, Pilot, build_with_told, stack_with_told, tell_gain
+from heliograph.model.turns import check_turns
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
+from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps
@@ -347,7 +349,7 @@ def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -
     start = first(plant)
     senses = first(sensor).typical(start.inputs)
     for model in models_of(senses):
-        check_turns("sensor of a plant", model.measure, start.initial_mean, start.angles, senses.angles)
+        check_turns("sensor of a plant", model.measure, start.initial_mean, start.manifold, Manifold(senses.angles))
     steps = unstack(channel) if senses.circular else [first(channel)]
     results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
     if len(results) > 1:

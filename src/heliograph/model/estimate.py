@@ -1,13 +1,14 @@
 """An estimate and what its covariance claims to be; an innovation and how likely the filter finds it."""
 
 from dataclasses import replace
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, show_value, standard_deviations
 from heliograph.numerics.linalg import find_lost
+from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.outliers import has_bounded_noise
@@ -31,16 +32,28 @@ class Estimate(Module):
     modes: probabilities of the present mode (..., M), of a filter that weighs modes; None of all others. Chains of
     plant, sensor and links are one joint chain, in this order, the first slowest (`joint_modes`).
 
+    attitude: places of the states that are the rotation vectors of attitudes, three of each. Their errors, of which the
+    covariance is, are turns in the estimated axes, `error`.
+
     Shapes: mean (..., n), covariance (..., n, n).
     """
 
-    mean: Float[Array, "... n"]
-    covariance: Float[Array, "... n n"]
+    mean: "Float[Array, '... n']"
+    covariance: "Float[Array, '... n n']"
     claim: Claim = eqx.field(static=True)
     modes: "Array | None" = None
+    attitude: tuple[int, ...] = eqx.field(static=True, default=(), repr=False)
 
     def __check_init__(self) -> None:
         check_claim(self.claim)
+
+    def error(self, truth: Float[Array, "... n"]) -> Any:
+        """Return truth - mean (..., n), of attitudes the turn from the estimated to the true one, in radians.
+
+        Args:
+            truth: true states (..., n); angles within half a turn of the estimated ones.
+        """
+        return Manifold((), self.attitude).difference(truth, self.mean)
 
     @property
     def claims(self) -> np.ndarray:

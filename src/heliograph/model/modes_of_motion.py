@@ -45,6 +45,8 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
         self.memory = instance("memory", memory, MarkovChain, "a MarkovChain")
         self.models = _check_models("models of a plant", models, AbstractPlant)
         start = self.models[0]
+        if start.attitude:
+            raise fail("models of a plant", "ones without an attitude", list(start.attitude))
         self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
         self.deviation, self.states, self.inputs, self.circular = (
             start.deviation, start.states, start.inputs, start.circular,

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.choice import compute_once
 from heliograph.model.over_time import OverTime, first
+from heliograph.model.turns import check_turns
 from heliograph.model.unknown_start import DiffuseStart
-from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continue_angles, nearest, wrap_angles
-from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, show_error
-from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.angle import Angles, angles_at, angles_named
+from heliograph.numerics.check import array, covariance, fail, function, instance, items, name_list, names, show_error
 from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import as_real, is_traced, trace_shape
+from heliograph.numerics.traced import as_real, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
     AbstractNoise,
@@ -61,7 +61,6 @@ def matrix_of(matrix: object, u: jax.Array) -> jax.Array:
     return matrix(u) if isinstance(matrix, OfInputs) else jnp.asarray(matrix)
 
 
-SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
 A = TypeVar("A", jax.Array, np.ndarray)
 TransitionFunction = TypeAliasType("TransitionFunction", Callable[[jax.Array, jax.Array], ArrayLike])  # f(x, u)
 NoiseFunction = TypeAliasType("NoiseFunction", Callable[[jax.Array], ArrayLike])  # Cov w (n, n) of the input u
@@ -72,7 +71,8 @@ class AbstractPlant(Module):
     """A system x+ = f(x, u) + w with w independent over time; x_0 has `initial_mean` and `initial_covariance`.
 
     x_0 is Gaussian unless `deviation` holds the law of x_0 - initial_mean up to a constant. States that are `circular`
-    are angles in radians: x and x with a full turn more in one of them are the same state.
+    are angles in radians: x and x with a full turn more in one of them are the same state. Three states that are an
+    `attitude` are a rotation vector: changes of it, noises and covariances are turns in its own axes, in radians.
     """
 
     noise: eqx.AbstractVar[AbstractNoise | NoiseFunction]
@@ -82,23 +82,42 @@ class AbstractPlant(Module):
     states: eqx.AbstractVar[tuple[str, ...]]
     inputs: eqx.AbstractVar[tuple[str, ...]]
     circular: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    attitude: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
 
     @property
     def angles(self) -> Angles:
         """Indices of the states that are angles."""
         return tuple(self.states.index(name) for name in self.circular)
 
+    @property
+    def manifold(self) -> Manifold:
+        """Which states are angles and attitudes: what a change of a state, and a difference of two, is."""
+        return Manifold(self.angles, tuple(self.states.index(name) for name in self.attitude))
+
     def difference(self, x: A, other: A) -> A:
-        """Return x - other of states (..., n), angles between -pi and pi."""
-        return wrap_angles(x - other, self.angles)
+        """Return the change from `other` to x, states (..., n): x - other, angles between -pi and pi, turns."""
+        change: A = self.manifold.difference(x, other)
+        return change
+
+    def plus(self, x: A, change: A) -> A:
+        """Return the state x (..., n) changed: x + change, angles between -pi and pi, attitudes turned."""
+        changed: A = self.manifold.plus(x, change)
+        return changed
 
     def near(self, x: A, other: Array) -> A:
         """The same state x (..., n), its angles within half a turn of those of `other`: so they can be averaged."""
-        return nearest(x, other, self.angles)
+        return self.manifold.near(x, other)
 
-    def moves(self, u: jax.Array, center: jax.Array) -> Callable[[jax.Array], jax.Array]:
-        """Return x -> f(x, u) with angles continued from those at `center`, as moments are made of it."""
-        return continue_angles(lambda x: self.transition(x, u), center, self.angles, self.angles)
+    def moves(
+        self, u: jax.Array, center: jax.Array, middle: jax.Array | None = None
+    ) -> Callable[[jax.Array], jax.Array]:
+        """Return x -> f(x, u) as moments are made of it, about `center` and the state `middle` after the step.
+
+        Angles are continued from those at `center`; changes of attitudes from `center` become changes from `middle`,
+        f(center, u) unless given, added to it.
+        """
+        moved: Callable[[jax.Array], jax.Array] = self.manifold.moved(lambda x: self.transition(x, u), center, middle)
+        return moved
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return f(x, u): shapes (n,), (inputs,) -> (n,)."""
@@ -126,10 +145,14 @@ class AbstractPlant(Module):
 
     def sample_initial(self, key: jax.Array) -> jax.Array:
         """Draw x_0."""
+        mean = jnp.asarray(self.initial_mean)
         if self.deviation is not None:
-            return jnp.asarray(self.initial_mean) - self.deviation.mean + self.deviation.sample(key)
-        draw = jax.random.normal(key, self.initial_mean.shape, dtype=float)
-        return jnp.asarray(self.initial_mean) + cholesky(jnp.asarray(self.initial_covariance)) @ draw
+            x = mean - self.deviation.mean + self.deviation.sample(key)
+        else:
+            draw = jax.random.normal(key, self.initial_mean.shape, dtype=float)
+            x = mean + cholesky(jnp.asarray(self.initial_covariance)) @ draw
+        drawn: jax.Array = self.manifold.settle(mean, x)
+        return drawn
 
 
 class JointNoise(Module):
@@ -171,9 +194,13 @@ class Plant(AbstractPlant):
     `states` and `inputs` are names, or a mapping of names to units: {"position": "m"}. `circular` names the states that
     are angles, in radians; f must not mind a full turn more in one of them.
 
+    `attitude` names three states that are the rotation vector of an attitude, R = exp [r]x from body to world, or three
+    for each of several, at most pi long: f returns it turned, `hg.models.turn_attitude(r, rate * dt)`, since a rotation
+    has no sum. Its entries of covariances, and of w, are turns in the body's axes, in radians: the error state.
+
     Raises:
         ValueError: a transition that does not return a state, covariances that are none, numbers that are not finite,
-            circular states that are none or that a full turn changes.
+            circular states or attitudes that are none or that a full turn changes.
     """
 
     function: Callable[[jax.Array, jax.Array], ArrayLike]
@@ -193,6 +220,7 @@ class Plant(AbstractPlant):
         states: Names | None = None,
         inputs: Names = (),
         circular: Sequence[str] = (),
+        attitude: Sequence[str] = (),
     ):
         self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _read_initial(initial_mean, initial_covariance)
@@ -207,7 +235,8 @@ class Plant(AbstractPlant):
         else:
             self.noise = as_noise("process noise", noise, n)
         self.circular = _circular(self.states, circular)
-        check_turns("plant", self.transition, self.initial_mean, self.angles, self.angles, u)
+        self.attitude = _read_attitude(self.states, attitude, self.circular)
+        check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return f(x, u)."""
@@ -273,7 +302,7 @@ class LinearPlant(AbstractPlant):
         self.noise = noise if callable(noise) else as_noise("process noise", noise, n)
         self.circular = _circular(self.states, circular)
         u = np.zeros(len(self.inputs))
-        check_turns("plant", self.transition, self.initial_mean, self.angles, self.angles, u)
+        check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def _matrix(self, name: str, value: ArrayLike | MatrixFunction, shape: tuple[int, int]) -> Any:
         if not callable(value):
@@ -298,39 +327,14 @@ def _circular(states: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ..
     return tuple(states[i] for i in angles_named("circular states", circular, states))
 
 
-def check_turns(
-    name: str,
-    function: Callable[..., jax.Array],
-    center: Vector,
-    given: Angles,
-    angles: Angles,
-    *rest: np.ndarray,
-) -> None:
-    """Raise ValueError where a full turn of a given angle changes f(center) by more than turns of the angles found.
-
-    `rest` are further arguments of the function. What depends on a traced number has no value to judge: it was judged
-    where its numbers were known.
-    """
-    if not given or is_traced(center):
-        return
-    points = np.stack([center, *(np.asarray(center) + TURN * np.eye(len(center))[list(given)])])
-    try:
-        start, *turned = compute_once(_values_at, _values_by_xla, (function, points, rest))
-    except jax.errors.TracerArrayConversionError:  # the function holds a traced number
-        return
-    for i, value in zip(given, turned, strict=True):
-        change = wrap_angles(value - start, angles)
-        if np.any(np.abs(change) > SAME * (1 + np.abs(start))):
-            raise fail(f"{name} with circular states", "one that a full turn does not change",
-                       f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
-
-
-def _values_at(function: Callable[..., jax.Array], points: jax.Array, rest: tuple[jax.Array, ...]) -> jax.Array:
-    """Return f(x) at each of some points x."""
-    return jnp.stack([jnp.asarray(function(point, *rest)) for point in points])
-
-
-_values_by_xla = quickly_compiled(_values_at)
+def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of rotation vectors, three after three, in their order."""
+    given = [str(name) for name in items("attitude", attitude, "names")]
+    wrong = len(given) % 3 or len(set(given)) < len(given) or not set(given) <= set(states) - set(circular)
+    if wrong:
+        expected = f"three of {[name for name in states if name not in circular]} for each attitude, each once"
+        raise fail("attitude", expected, given)
+    return tuple(given)
 
 
 def _read_initial(
@@ -353,14 +357,14 @@ def _read_initial(
 AnyPlant = TypeAliasType("AnyPlant", AbstractPlant | OverTime)  # an OverTime holds one plant per step
 
 
-def angles_among(angles: "Sequence[int] | AnyPlant", states: int) -> Angles:
-    """Return which of so many states are angles, from their places or from the plant whose states they are."""
+def manifold_among(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
+    """Return which of so many states are angles, from their places, or also attitudes, from the plant they are of."""
     plant = first(angles)
     if not isinstance(plant, AbstractPlant):
-        return angles_at(angles, states)
+        return Manifold(angles_at(angles, states))
     if len(plant.states) != states:
         raise fail("angles", f"those of a plant of {states} states", f"one of {list(plant.states)}")
-    return plant.angles
+    return plant.manifold
 
 
 def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:

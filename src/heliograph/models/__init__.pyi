@@ -1,5 +1,11 @@
 """Public names of the room; the package loads them when first used."""
 
+from .attitude import (
+    from_quaternion as from_quaternion,
+    rotation_matrix as rotation_matrix,
+    to_quaternion as to_quaternion,
+    turn_attitude as turn_attitude,
+)
 from .continuous_time import (
     Discretized as Discretized,
     continuous_plant as continuous_plant,

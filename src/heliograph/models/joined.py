@@ -94,8 +94,9 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     noises = [plant.noise for plant in parts if isinstance(plant.noise, AbstractNoise)]
     noise = Independent(noises) if len(noises) == len(parts) else JointNoise(tuple(parts), places)
     circular = [name for plant in parts for name in plant.circular]
+    attitude = [name for plant in parts for name in plant.attitude]
     if not all(isinstance(plant, LinearPlant) for plant in parts):
-        return Plant(SideBySide(tuple(parts), places), noise, center, start, states, inputs, circular)
+        return Plant(SideBySide(tuple(parts), places), noise, center, start, states, inputs, circular, attitude)
     matrix, driven = _matrices(parts, places, len(inputs))
     return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular)
 

@@ -214,7 +214,7 @@ def _average_draws(
             moves, *draws = jax.random.split(jax.random.fold_in(rest, k), 1 + len(sensors))
             # The state moves, then every sensor measures it.
             now = at(plant, k)
-            x = now.transition(x, u) + now.sample_noise(moves, u)
+            x = now.plus(now.transition(x, u), now.sample_noise(moves, u))
             moments = {}
             for draw, (name, sensor) in zip(draws, sensors.items(), strict=True):
                 here = at(sensor, k)

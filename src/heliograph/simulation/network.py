@@ -50,7 +50,7 @@ from heliograph.simulation.node import (
     check_filters,
     check_flags,
     check_received,
-    check_sizes,
+    check_states,
     check_type,
 )
 
@@ -156,7 +156,7 @@ class Network(Module):
             if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
                 check_type(f"node {name!r}", node, kind)
             for label, element in node.filters.items():
-                check_sizes(f"filter {label!r} of node {name!r}", element, self.states, self.inputs)
+                check_states(f"filter {label!r} of node {name!r}", element, self)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -173,12 +173,12 @@ class Network(Module):
     def _check_fused(self) -> None:
         """Raise unless each fusion fits its nodes, and each central filter all that is received."""
         for name, fusion in self.fused.items():
+            check_states(f"fused {name!r}", fusion, self)
             if isinstance(fusion, Fusion):
                 fusion.check(self.nodes_with(fusion.filter), len(self.states))
             else:
                 check_type(f"fused {name!r}", fusion, AbstractFilter)
                 check_received(f"fused {name!r}", fusion, sum(node.received for node in self.nodes.values()))
-                check_sizes(f"fused {name!r}", fusion, self.states, self.inputs)
                 links = [first(node.channel) for node in self.nodes.values() if isinstance(node, Node)]
                 check_flags(f"fused {name!r}", fusion, links)
                 check_angles(f"fused {name!r}", fusion, self)

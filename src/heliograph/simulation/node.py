@@ -352,11 +352,18 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
         )
 
 
-def check_sizes(name: str, filter: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
-    """Refuse a filter of other numbers of states and inputs than the plant has."""
-    for what, single, theirs in (("states", states, filter.states), ("inputs", inputs, filter.inputs)):
-        if len(single) != len(theirs):
-            raise fail(name, f"the plant's {len(single)} {what} {list(single)}", f"{len(theirs)} {list(theirs)}")
+def check_states(name: str, filter: object, network: HasNodes) -> None:
+    """Refuse a filter of other numbers of states and inputs than the plant, or a fusion too that turns no attitudes."""
+    plant = first(network.plant)
+    if isinstance(filter, AbstractFilter):
+        for what, single, theirs in (("states", plant.states, filter.states), ("inputs", plant.inputs, filter.inputs)):
+            if len(single) != len(theirs):
+                raise fail(name, f"the plant's {len(single)} {what} {list(single)}", f"{len(theirs)} {list(theirs)}")
+    # Attitudes are turned where others are added.
+    attitudes = plant.manifold.rotations, getattr(filter, "attitude", ())
+    if attitudes[0] != attitudes[1]:
+        expected, got = ([network.states[i] for i in places] for places in attitudes)
+        raise fail(name, f"a filter of all that is received, whose attitudes are the plant's, {expected}", got)
 
 
 def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import condition_on_memories
@@ -48,7 +47,7 @@ class World(Module):
         """Step to k with the input u: next state, and truth (n,), measurements and estimates."""
         (x, medium, states, edges, modes), (k, u) = carry, row
         plant = condition_on_memories(at(self.plant, k), modes)
-        x = wrap_angles(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
+        x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
         z = tuple(present(values) if whole else values for values, whole in zip(z, self.filters.complete, strict=True))
         drawn: dict[str, PyTree] = {name: link.uplinks.draw(key, k) for name, link in self.filters.reporting.items()}

@@ -89,7 +89,7 @@ def sweep_means(steps: SmootherStep) -> jax.Array:
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
         previous, step = pair
-        mean = step.before.mean_given(later)
+        mean = step.mean_back(later)
         return mean, _plant_mean(previous, mean)
 
     last = take_step(steps, -1)
@@ -126,7 +126,7 @@ def carry_ahead(steps: SmootherStep, step: int) -> Estimate:
 
     def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
         after = later_step.ahead(point)
-        return after, start.estimate_from(later_step.reached(after))
+        return after, start.estimate_from(start.settle(later_step.reached(after)))
 
     _, later = jax.lax.scan(body, start.start(), take_steps(steps, slice(step + 1, None)))
     whole: Estimate = jax.tree.map(

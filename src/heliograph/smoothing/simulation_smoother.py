@@ -67,12 +67,13 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
         previous, step, key = pair
-        left = step.before.left
-        x = _draw_gaussian(left._replace(mean=step.before.mean_given(later)), key)
+        left, manifold = step.before.left, step.manifold
+        mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
+        x = manifold.settle(left.mean, _draw_gaussian(left._replace(mean=mean), key))
         return x, _plant_state(previous, x)
 
     last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))
-    end = _draw_gaussian(last.after, keys[-1])
+    end = last.manifold.settle(last.after.mean, _draw_gaussian(last.after, keys[-1]))
     pairs = take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None)), keys[:-1]
     _, earlier = jax.lax.scan(body, end, pairs, reverse=True)
     return jnp.concatenate([earlier, _plant_state(last, end)[None]])

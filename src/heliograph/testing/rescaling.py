@@ -154,7 +154,7 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
             for given, by in ((plant.matrix, s), (plant.input_matrix, u))
         )
         return LinearPlant(matrix, noise, center, law, entry, **names)
-    return Plant(InUnits(plant.transition, s, (s, u)), noise, center, law, **names)
+    return Plant(InUnits(plant.transition, s, (s, u)), noise, center, law, **names, attitude=plant.attitude)
 
 
 def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:

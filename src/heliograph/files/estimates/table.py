@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.files.table import TIME, write_table
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.numerics.check import fail, instance, show_value
+from heliograph.numerics.rotation import quaternion_of
 from heliograph.numerics.types import units_in
 from heliograph.simulation.results.record import Record
 
@@ -80,6 +81,10 @@ def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Est
             columns.append(
                 (make_header(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
             )
+    # Attitudes as unit quaternions too.
+    for i in range(0, len(estimate.attitude), 3):
+        quaternions = quaternion_of(mean[:, list(estimate.attitude[i : i + 3])])
+        columns += [(f"{states[estimate.attitude[i]]}.q{part}", quaternions[:, j]) for j, part in enumerate("wxyz")]
     # Covariances of two states have the product of their units.
     if estimate.claim != "none":
         for i, a in enumerate(states):

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from heliograph.factors.changes import settle
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
@@ -58,6 +59,12 @@ class GaussianFilter(AbstractBeliefFilter):
     linear: bool = eqx.field(static=True)
     observed_angles: Angles = eqx.field(static=True)
 
+    @property
+    def attitude(self) -> Angles:
+        """Return the places of the plant's attitudes, which it turns."""
+        places: Angles = first(self.plant).manifold.rotations
+        return places
+
     def angles_used(self) -> FilterAngles:
         """Return the angles of its plant, and those that its channel delivers."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
@@ -98,7 +105,8 @@ class GaussianFilter(AbstractBeliefFilter):
         """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
         channel, signal = at(self.channel, k), self.predict_signal(state, k)
         unknown = signal.about_mean() if self.linear else signal
-        return correct_signal(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
+        after, innovation = correct_signal(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)
+        return settle(at(self.plant, k).manifold, state.mean, after), innovation
 
     @property
     def is_linear(self) -> bool:
@@ -168,7 +176,7 @@ def _make_gaussian_filter(
     described = describe_channel_moments(channel, update)
     pairs = zip(unstack(channel), unstack(described), strict=True)
     # The Kalman filter is exact: linear, no random gain, no angle.
-    on_line = not start.circular and not first(sensor).circular
+    on_line = not start.circular and not first(sensor).circular  # an attitude has no linear plant
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     claim = update.claim(uncertain=False) if linear and trusted and not prior_given else "nominal"
     claim = lower_by_noise(claim, plant, sensor, channel)

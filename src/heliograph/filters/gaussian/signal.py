@@ -89,7 +89,8 @@ def signal_of(
     if isinstance(sensor, LinearSensor):
         image = linear_image(sensor.matrix, sensor.measure(prior.mean), prior)
     else:
-        image = transform.image(continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles), prior)
+        measure = continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles)
+        image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
     mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
     second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
     size = signal_size_at_start(sensor, start) if isinstance(sensor, LinearSensor) else jnp.diagonal(second)

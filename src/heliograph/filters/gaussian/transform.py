@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from itertools import product
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,8 +33,11 @@ class Transformed(NamedTuple):
 class AbstractTransform(Module):
     """Rule that propagates a mean and a covariance through a function; every rule is exact for affine functions.
 
-    A rule of your own gives `apply`; those of the library give `image`, from which `apply` follows.
+    A rule of your own gives `apply`; those of the library give `image`, from which `apply` follows. `keeps_center`: of
+    its class, whether the mean of f(x) is f(mean) always.
     """
+
+    keeps_center: ClassVar[bool] = False
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Return the moments of function(x) for x with mean (n,) and covariance (n, n)."""
@@ -89,7 +92,12 @@ def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> t
 
 
 class Linearization(AbstractTransform):
-    """First-order expansion at the mean: f(m), J P J', P J' with the Jacobian by automatic differentiation."""
+    """First-order expansion at the mean: f(m), J P J', P J' with the Jacobian by automatic differentiation.
+
+    It `keeps_center`: the mean is f(m).
+    """
+
+    keeps_center: ClassVar[bool] = True
 
     def image(self, function: Function, x: Gaussian) -> Image:
         """Evaluate f and its Jacobian at the mean."""

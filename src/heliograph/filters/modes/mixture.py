@@ -156,7 +156,7 @@ class MixtureFilter(AbstractSizedFilter):
             plant.transition_matrix(u) @ step.before.gaussian.root,
             process_noise(plant, u, second_moments_at_start(self.plant)),
         )
-        return smoother_step_of(step, moved, "nominal", plant.angles)
+        return smoother_step_of(step, moved, "nominal", plant.manifold)
 
 
 def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:

@@ -210,7 +210,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the step of smoothing by pairs of modes, with the moments of the whole mixture around the update."""
-        plants, modes, angles = models_of(at(self.plant, step.k)), len(self.initial), first(self.plant).angles
+        plants, modes = models_of(at(self.plant, step.k)), len(self.initial)
         law = self._law_of(step.after)
         known, pairs, weights, ways = self._describe_pairs(step, law)
         whole = step.map_states(_merge_mixture)
@@ -218,8 +218,9 @@ class MultipleModelFilter(AbstractSizedFilter):
         if len(plants) == 1:
             moments = smoother_step_by_transform(self, whole, first(self.plant)).before
         return ModalSmootherStep(
-            whole.after, moments, claim=self.claim, angles=angles, law=law, known=known, ways=ways,
-            pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), pairs), weights=weights,
+            whole.after, moments, claim=self.claim, manifold=first(self.plant).manifold, law=law, known=known,
+            ways=ways, pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), pairs),
+            weights=weights,
         )  # fmt: skip
 
     def _law_of(self, state: ModalBeliefs) -> ModalLaw:

@@ -27,6 +27,7 @@ from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believing
 from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -87,6 +88,11 @@ class FilterOfInputs(AbstractSizedFilter):
         """Return the smoother step of the filter of the sensor under the inputs of this step."""
         filter = self._filter_under(jnp.asarray(step.u), step.k)
         return filter.smoother_step(step.map_states(lambda state: state.base))
+
+    @property
+    def attitude(self) -> Angles:
+        """Return the places of attitudes among the states of the filter within."""
+        return self.base.attitude
 
     def angles_used(self) -> FilterAngles | None:
         """Return the angles of the filter within."""

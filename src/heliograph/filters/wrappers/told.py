@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from functools import wraps
 from typing import ParamSpec, TypeVar, cast
 
@@ -28,6 +29,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believing
 from heliograph.model.sensor import AnySensor
 from heliograph.model.told import take_apart
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library
@@ -120,6 +122,11 @@ class ToldFilter(AbstractSizedFilter):
         filter, _ = self._filter_given(numbers, step.k)
         return filter.smoother_step(step._replace(z=values))
 
+    @property
+    def attitude(self) -> Angles:
+        """Return the places of attitudes among the states of the filter within."""
+        return self.base.attitude
+
     def angles_used(self) -> FilterAngles | None:
         """Return the angles of the filter within, at their rows; what is told is none."""
         angles = self.base.angles_used()
@@ -161,7 +168,7 @@ class ToldFilter(AbstractSizedFilter):
         )
 
     def _claim(self, estimate: Estimate) -> Estimate:
-        return Estimate(estimate.mean, estimate.covariance, self.claim)
+        return replace(estimate, claim=self.claim)
 
     def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Values and numbers of a message; no value where a number is missing without which it means nothing."""

@@ -139,7 +139,9 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
     noise = Independent(noises) if len(noises) == 2 else JointNoise(models, (every, places))
     if not isinstance(plant, LinearPlant):
         move = Driven(plant, bias, coupling, places)
-        return Plant(move, noise, center, start, states, plant.inputs, circular)
+        if np.any(np.asarray(coupling)[list(plant.manifold.rotations)]):
+            raise fail("bias of a plant", "a coupling of 0 to attitudes, which have no sum", list(plant.attitude))
+        return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude)
     matrix, driven = _stack_blocks(plant, bias, coupling, np.eye(len(plant.inputs))[list(places)])
     return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs, circular)
 

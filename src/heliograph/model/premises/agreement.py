@@ -129,7 +129,7 @@ def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
         return True
     if any(isinstance(plant.initial_covariance, UnknownStart) or isinstance(plant, ModalPlant) for plant in (a, b)):
         return False  # of these, only the same is the same
-    sizes = [(len(plant.states), len(plant.inputs), plant.angles) for plant in (a, b)]
+    sizes = [(len(plant.states), len(plant.inputs), plant.manifold) for plant in (a, b)]
     if sizes[0] != sizes[1] or not equal_to_rounding(a.initial_mean, b.initial_mean):
         return False
     if order != MEAN_AND_COVARIANCE and not same(a.deviation, b.deviation):

@@ -20,6 +20,7 @@ from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
 
+WITHOUT_ATTITUDE = "no attitude (hg.extended_filter, unscented_filter and cubature_filter know them)"
 MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim rests on
 
 
@@ -101,6 +102,9 @@ def believing(made: B, premise: Premise | None) -> B:
     unknown = premise is not None and isinstance(first(premise.plant).initial_covariance, UnknownStart)
     if unknown and not getattr(made, "takes_unknown_start", False):
         raise fail("initial covariance", TAKEN_BY, "hg.diffuse")
+    attitude = () if premise is None else first(premise.plant).attitude
+    if attitude and not getattr(made, "attitude", ()):
+        raise fail(f"plant of a {type(made).__name__}", WITHOUT_ATTITUDE, list(attitude))
     twin = copy(made)
     object.__setattr__(twin, "kept", Kept(premise))
     return twin

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.model.plant import AnyPlant, angles_among
+from heliograph.model.plant import AnyPlant, manifold_among
 from heliograph.model.sensor import AnySensor, angles_of_outputs
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
@@ -68,7 +68,7 @@ def nees(
         mean: estimates, NaN where there is none.
         covariance: what is claimed of their errors, one (n, n) for all steps or one a step.
         angles: which states are angles in radians, whose errors are between -pi and pi: by place, or the plant whose
-            states they are; none by default.
+            states they are, whose attitudes err by turns then; none by default.
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite, angles that are no places in the state.
@@ -79,7 +79,7 @@ def nees(
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
     return _normalise_square(
-        wrap_angles(x - m, angles_among(angles, x.shape[-1])), _broadcast_to_steps(covariance, x), x
+        manifold_among(angles, x.shape[-1]).difference(x, m), _broadcast_to_steps(covariance, x), x
     )
 
 

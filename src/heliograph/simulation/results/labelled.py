@@ -77,8 +77,10 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
         if quantity in COVARIANCE:
             covariance = value.reshape(*lead, len(states), len(states))
             moments = values[node, name, "mean"], covariance
-            modes = values.get((node, name, MODES))
-            estimates.setdefault(node, {})[name] = Estimate(*moments, COVARIANCE[quantity], modes)
+            modes, order = values.get((node, name, MODES)), [frame.columns[i][4] for i in columns[node, name, "mean"]]
+            attitude = tuple(order.index(str(i)) for i in range(len(order) - order.count("")))
+            estimate = Estimate(*moments, COVARIANCE[quantity], modes, attitude=attitude)
+            estimates.setdefault(node, {})[name] = estimate
         elif quantity == SENT[0]:
             uplinks.setdefault(name, []).append(node)
     return {
@@ -106,7 +108,11 @@ def _keep_labels(columns: Sequence[Column]) -> Any:
 
 def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
-    results: dict[Column, np.ndarray] = {(node, name, "mean", s, ""): mean[..., i] for i, s in enumerate(states)}
+    # Of an attitude's numbers, which one: "0", "1", "2" of the first, and so on.
+    order = {place: str(i) for i, place in enumerate(estimate.attitude)}
+    results: dict[Column, np.ndarray] = {
+        (node, name, "mean", s, order.get(i, "")): mean[..., i] for i, s in enumerate(states)
+    }
     for i, state in enumerate(states):
         for j, other in enumerate(states):
             results[node, name, f"covariance ({estimate.claim})", state, other] = covariance[..., i, j]
@@ -156,6 +162,7 @@ FIELDS = {
     "mean": Field("... node filter state", "estimate of the state"),
     "covariance": Field("... node filter state other", "covariance of the error as the filter claims it"),
     "modes": Field("... node filter mode", "probability of each mode, NaN of a filter that weighs fewer or none"),
+    "attitude": Field("state", "place among the numbers of attitudes, three of each rotation vector; -1 if it is none"),
     "claim": Field(
         "node filter",
         "what the claimed covariance is: exact, upper, nominal or none; empty where there is no such filter",
@@ -262,6 +269,13 @@ class FilterLabels:
             claims[position] = claim
         return claims
 
+    def attitudes(self) -> dict[str, np.ndarray]:
+        """Return which states are the rotation vectors of attitudes; nothing where none are."""
+        places = next((places for _, places in self.place(lambda result: result.attitude) if places), ())
+        order = np.full(len(self.states), -1, dtype=np.int64)
+        order[list(places)] = np.arange(len(places))
+        return {"attitude": order} if places else {}
+
     def sent(self) -> dict[str, np.ndarray]:
         """Return the fields of the quantizers, by fusion and sender, with integers and booleans as they are."""
         if not self.uplinks:
@@ -318,6 +332,14 @@ def each_filter(
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
         values = {name: field[(*(slice(None),) * places[name], i, j)].copy() for name, field in fields.items()}
         yield nodes[i], filters[j], cast(Claim, str(claim[i, j])), values
+
+
+def read_estimate(dataset: "xr.Dataset", claim: Claim, values: Mapping[str, np.ndarray]) -> Estimate:
+    """Return the estimate of a filter of a dataset, from its values by field."""
+    order = read_values(dataset, "attitude", []) if "attitude" in dataset else np.zeros(0, dtype=np.int64)
+    attitude = tuple(int(i) for i in np.argsort(order, kind="stable") if order[i] >= 0)
+    modes = without_padding(values.get("modes"))
+    return Estimate(values["mean"], values["covariance"], claim, modes, attitude=attitude)
 
 
 def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":

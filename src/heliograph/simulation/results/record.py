@@ -28,13 +28,13 @@ from heliograph.simulation.results.labelled import (
     each_filter,
     modes_of,
     names_of,
+    read_estimate,
     read_modes,
     read_units,
     read_uplinks,
     read_values,
     record_fields,
     record_frame,
-    without_padding,
 )
 from heliograph.simulation.results.plots import (
     check_run,
@@ -147,7 +147,7 @@ class Record(Saved):
         )
 
     def errors(self, node: str, name: str) -> np.ndarray:
-        """Return x - xhat of one filter of one node.
+        """Return x - xhat of one filter of one node, of attitudes the turn from the estimated to the true one.
 
         Raises:
             ValueError: a recording has no truth, or there is no such filter.
@@ -155,7 +155,7 @@ class Record(Saved):
         self.check_filter(node, name)
         if self.truth is None:
             raise fail("errors", "a record with the true state", "a recording without it")
-        errors: np.ndarray = self.truth - np.asarray(self.estimates[node][name].mean)
+        errors: np.ndarray = np.asarray(self.estimates[node][name].error(self.truth))
         return errors
 
     def check_filter(self, node: str, name: str) -> None:
@@ -185,12 +185,12 @@ class Record(Saved):
         Raises:
             ValueError: a recording has no truth, or there is no such filter.
         """
-        errors, estimate = self.errors(node, name), self.estimates[node][name]
+        errors, estimate, truth = self.errors(node, name), self.estimates[node][name], np.asarray(self.truth)
         sound = is_sound(estimate)[..., None]
         if estimate.claim == "none":
             return np.full(errors.shape[:-1], np.nan)
         claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
-        return nees(np.asarray(self.truth), np.where(sound, np.asarray(estimate.mean), np.nan), claimed)
+        return nees(truth, np.where(sound, truth - errors, np.nan), claimed)
 
     def outputs(self, node: str, name: str) -> tuple[InnovationSummary, ...]:
         """Summarise the innovations of a filter that weighs, one output after the other.
@@ -230,6 +230,7 @@ class Record(Saved):
             "mean": labels.of_filters("mean", lambda estimate: estimate.mean),
             "covariance": labels.of_filters("covariance", lambda estimate: estimate.covariance),
             **labels.sent(),
+            **labels.attitudes(),
         }
         if modes:
             fields["modes"] = labels.of_filters("modes", read_modes)
@@ -251,8 +252,7 @@ class Record(Saved):
         estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in there}
         fields = ("mean", "covariance", *(["modes"] if "modes" in dataset else []))
         for node, name, claim, values in each_filter(dataset, fields, lead):
-            moments = values["mean"], values["covariance"]
-            estimates[node][name] = Estimate(*moments, claim, without_padding(values.get("modes")))
+            estimates[node][name] = read_estimate(dataset, claim, values)
         return cls(
             time=np.asarray(dataset[TIME].values),
             states=tuple(names_of(dataset, "state")),

@@ -11,6 +11,7 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import first
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import PyTree
@@ -147,10 +148,10 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
     measurements = split_measurements(network, batch["measurements"])
     mean = split_by_name(network, batch, attrgetter("mean"), -3)
     covariance = split_by_name(network, batch, attrgetter("covariance"), -4)
-    modes = collect_modes(network, batch)
+    modes, attitude = collect_modes(network, batch), first(network.plant).manifold.rotations
     estimates = {
         node: {
-            name: Estimate(mean[node][name], covariance[node][name], claim, modes.get((node, name)))
+            name: Estimate(mean[node][name], covariance[node][name], claim, modes.get((node, name)), attitude=attitude)
             for name, claim in claims.items()
         }
         for node, claims in network.claims().items()

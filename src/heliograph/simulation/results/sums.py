@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -58,7 +59,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         means = [jnp.asarray(estimate.mean).reshape(-1, n) for estimate in parts]
         claimed = [jnp.asarray(estimate.covariance).reshape(-1, n, n) for estimate in parts]
         # Errors and their NEES, and where these are invalid.
-        errors = [truth - mean for mean in means]
+        errors = [replace(estimate, mean=mean).error(truth) for estimate, mean in zip(parts, means, strict=True)]
         distances = jax.vmap(squared_distance, in_axes=(0, 0, None))
         nees = [distances(b, e, truth) for b, e in zip(claimed, errors, strict=True)]
         joined, distance = jnp.concatenate(errors), jnp.concatenate(nees)
@@ -208,7 +209,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     estimate = record.estimates[node][name]
     # The sums of a simulation, in which this is the only estimate; runs are dealt to batches.
     arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
-    step: OfStep = over_runs(_reduce_run, *arrays)
+    step: OfStep = over_runs(partial(_reduce_run, attitude=estimate.attitude), *arrays)
     sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))
     count = np.bincount(np.arange(len(record.truth)) % BATCHES, minlength=BATCHES).astype(float)
     common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
@@ -218,9 +219,10 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     return replace(_statistics(count, parts, estimate.claim), uplink=uplink)
 
 
-def _reduce_run(truth: Array, mean: Array, covariance: Array) -> OfStep:
+def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[int, ...]) -> OfStep:
     """Reduce one run of a record."""
-    steps = {"truth": truth, "estimates": (), "fused": {"": Estimate(mean, covariance, "none")}, "uplinks": {}}
+    estimate = Estimate(mean, covariance, "none", attitude=attitude)
+    steps = {"truth": truth, "estimates": (), "fused": {"": estimate}, "uplinks": {}}
     return reduce_rows(Statistics(), steps)
 
 

@@ -261,7 +261,7 @@ def _only(results: PyTree) -> PyTree:
 def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[where]
     mean, covariance = (np.asarray(part)[where] for part in (outputs.mean, outputs.covariance))
-    return lower_unsound_claim(Estimate(mean, covariance, claim, modes))
+    return lower_unsound_claim(Estimate(mean, covariance, claim, modes, attitude=outputs.attitude))
 
 
 def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:

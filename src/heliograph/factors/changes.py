@@ -1,0 +1,35 @@
+"""Gaussians of states that are attitudes: a mean on the group, and a covariance of changes from it.
+
+Moments are computed of changes from a center, added to it: x = center + d stands for center plus d. What comes out has
+its mean beside the center; here it becomes a mean on the group, and its covariance one of changes from that mean.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.factors.columns import Columns
+from heliograph.factors.gaussian import Gaussian, from_columns
+from heliograph.numerics.manifold import Manifold
+
+
+def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
+    """Return the law of center plus d, from that of center + d: the mean settled, errors turned to its own axes.
+
+    About m' = center plus E d an error is J (d - E d) to first order, J the derivative of the change from m' there.
+
+    Source: Sola, Quaternion kinematics for the error-state Kalman filter (2017), section 6.3 (the reset).
+    """
+    reset = manifold.reset(x.mean - center) if manifold.rotations else None
+    if reset is None:
+        return x
+    return from_columns(manifold.settle(center, x.mean), Columns(reset @ x.root, x.variances))
+
+
+def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
+    """Return the law of center + d, from that of x = center plus d: the inverse of `settle`."""
+    if not manifold.rotations:
+        return x
+    mean = manifold.unsettle(center, x.mean)
+    reset = manifold.reset(mean - center)
+    assert reset is not None
+    return from_columns(mean, Columns(jnp.linalg.inv(reset) @ x.root, x.variances))

@@ -1,0 +1,86 @@
+"""Whether a function of states knows that a full turn of an angle, or of an attitude, is none."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compute_once
+from heliograph.numerics.angle import TURN
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.manifold import Manifold
+from heliograph.numerics.traced import is_traced
+from heliograph.random_affine.noise import Vector
+
+SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
+SOME_TURN = (0.3, -0.2, 0.5)  # radians about the three axes: no attitude is at rest there
+
+
+def check_turns(
+    name: str,
+    function: Callable[..., jax.Array],
+    center: Vector,
+    given: Manifold,
+    results: Manifold,
+    *rest: np.ndarray,
+) -> None:
+    """Raise ValueError where a full turn of an angle or an attitude changes f(center) by more than turns of results.
+
+    `rest` are further arguments of the function. What depends on a traced number has no value to judge: it was judged
+    where its numbers were known.
+    """
+    if not (given.angles or given.rotations) or is_traced(center):
+        return
+    center = np.asarray(center)
+    turned = center + TURN * np.eye(len(center))[list(given.angles)]
+    _compare(f"{name} with circular states", function, center, turned, results, rest)
+    # Attitudes: at one that is no special case, with rates that are not 0, and by its other rotation vector.
+    change = np.zeros(len(center))
+    change[list(given.rotations)] = np.resize(SOME_TURN, len(given.rotations))
+    some = given.plus(center, change)
+    others = [_turn_fully(some, given.rotations[i : i + 3]) for i in range(0, len(given.rotations), 3)]
+    rates = tuple(np.ones_like(values) for values in rest)
+    kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
+    _compare(kind, function, some, others, results, rates)
+
+
+def _compare(
+    name: str,
+    function: Callable[..., jax.Array],
+    center: np.ndarray,
+    turned: Sequence[np.ndarray] | np.ndarray,
+    results: Manifold,
+    rest: tuple[np.ndarray, ...],
+) -> None:
+    """Raise ValueError where f of one of the states turned, the same as `center`, differs by more than turns."""
+    if not len(turned):
+        return
+    try:
+        start, *values = compute_once(_values_at, _values_by_xla, (function, np.stack([center, *turned]), rest))
+    except jax.errors.TracerArrayConversionError:  # the function holds a traced number
+        return
+    for value, other in zip(values, turned, strict=True):
+        change = np.abs(results.difference(np.asarray(value), np.asarray(start)))
+        if np.any(change > SAME * (1 + np.abs(start))):
+            places = np.flatnonzero(other != center).tolist()
+            words = f"state {places[0]}" if len(places) == 1 else f"states {places}"
+            got = f"a change of {change.max():.3g} by a turn of {words}"
+            raise fail(name, "one that a full turn does not change", got)
+
+
+def _turn_fully(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
+    """Return the state with the other rotation vector of the same attitude, the long way round."""
+    r = x[list(places)]
+    other: np.ndarray = x.copy()
+    other[list(places)] = r * (1 - TURN / np.linalg.norm(r))
+    return other
+
+
+def _values_at(function: Callable[..., jax.Array], points: jax.Array, rest: tuple[jax.Array, ...]) -> jax.Array:
+    """Return f(x) at each of some points x."""
+    return jnp.stack([jnp.asarray(function(point, *rest)) for point in points])
+
+
+_values_by_xla = quickly_compiled(_values_at)

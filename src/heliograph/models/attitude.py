@@ -1,0 +1,84 @@
+"""Attitudes as states: rotation vectors turned, and as rotation matrices and unit quaternions."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.rotation import matrix_of, quaternion_of, rotation_vector_of, turn
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+
+def turn_attitude(attitude: Float[ArrayLike, "*any 3"], by: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 3"]:
+    """Return an attitude turned in its own axes: log(exp(attitude) exp(by)), a rotation vector of at most pi.
+
+    What a gyroscope says: r+ = turn_attitude(r, rate * dt), exact while the rate stays in the body's axes. Written for
+    the transition of a plant with `attitude=`, and for arrays.
+
+    Args:
+        attitude: rotation vector in radians, R = exp [r]x from body to world. Shape (..., 3).
+        by: the turn in the body's axes, in radians. Shape (..., 3).
+
+    Raises:
+        ValueError: arrays of another shape.
+    """
+    turned: Array = turn(_read("attitude", attitude, 3), _read("turn of an attitude", by, 3))
+    return turned
+
+
+def rotation_matrix(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 3 3"]:
+    """Return R = exp [r]x of an attitude: R v is a vector v of the body as the world sees it, R' that of the world.
+
+    Args:
+        attitude: rotation vector in radians. Shape (..., 3).
+
+    Raises:
+        ValueError: an array of another shape.
+    """
+    matrix: Array = matrix_of(_read("attitude", attitude, 3))
+    return matrix
+
+
+def to_quaternion(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 4"]:
+    """Return the unit quaternion (w, x, y, z) of an attitude, w >= 0 up to half a turn.
+
+    Args:
+        attitude: rotation vector in radians, as estimates have it. Shape (..., 3).
+
+    Raises:
+        ValueError: an array of another shape.
+    """
+    quaternion: Array = quaternion_of(_read("attitude", attitude, 3))
+    return quaternion
+
+
+def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*any 3"]:
+    """Return the attitude of a quaternion (w, x, y, z) of any length, as a rotation vector of at most pi.
+
+    Args:
+        quaternion: w first; q and -q are one attitude. Shape (..., 4).
+
+    Raises:
+        ValueError: an array of another shape, a quaternion of length 0.
+    """
+    values = _read("quaternion", quaternion, 4)
+    if not is_traced(values) and not (values**2).sum(axis=-1).all():
+        raise fail("quaternion", "four numbers of which one is not 0", "all of them 0")
+    attitude: Array = rotation_vector_of(values)
+    return attitude
+
+
+def _read(name: str, value: ArrayLike, last: int) -> Any:
+    """Return an array of JAX as it is, any other as doubles, NaN for what is missing; check its last axis."""
+    if isinstance(value, jax.Array):
+        if jnp.shape(value)[-1:] != (last,):
+            raise fail(name, f"shape (..., {last})", f"shape {jnp.shape(value)}")
+        return value
+    try:
+        free = max(np.ndim(value) - 1, 0)
+    except (TypeError, ValueError):  # no array, which the check names
+        free = 0
+    return array(name, value, (*(None for _ in range(free)), last), missing=True)

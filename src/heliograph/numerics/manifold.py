@@ -1,0 +1,101 @@
+"""States that are no numbers on a line: angles, and attitudes as rotation vectors, among others that are.
+
+A state x has n numbers, and so has a small change d of it: x plus d is x + d, but for angles, where full turns are
+taken off, and attitudes, which turn by d in their own axes. `difference` is the inverse; covariances are of such
+changes.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.angle import Angles, continue_angles, nearest, wrap_angles
+from heliograph.numerics.rotation import turn, turn_between
+from heliograph.numerics.types import Array
+
+A = TypeVar("A", jax.Array, np.ndarray)
+Rotations = Angles  # places of rotation vectors, three after three
+
+
+class Manifold(NamedTuple):
+    """Which states are angles, and which, three by three, are the rotation vectors of attitudes; all others are lines.
+
+    Args:
+        angles: places of angles.
+        rotations: places of rotation vectors, three of each attitude.
+    """
+
+    angles: Angles = ()
+    rotations: Rotations = ()
+
+    def plus(self, x: Array, d: Array) -> Any:
+        """Return x changed by d, (..., n) both: angles between -pi and pi, attitudes turned in their own axes."""
+        total: Any = x + d
+        return self._turned(wrap_angles(total, self.angles), turn, x, d)
+
+    def difference(self, x: Array, other: Array) -> Any:
+        """Return d with x = other plus d, (..., n): angles and turns of at most pi."""
+        change: Any = x - other
+        return self._turned(wrap_angles(change, self.angles), turn_between, x, other)
+
+    def _turned(self, whole: Array, make: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
+        """Return `whole` with its rotation vectors replaced by what is made of those of x and y."""
+        for i in range(0, len(self.rotations), 3):
+            at = np.array(self.rotations[i : i + 3])
+            x, y = (v if np.shape(v) == np.shape(whole) else v + np.zeros(np.shape(whole)) for v in (x, y))
+            value = make(x[..., at], y[..., at])
+            if isinstance(whole, jax.Array) or isinstance(value, jax.Array):
+                whole = jnp.asarray(whole).at[..., at].set(value)
+            else:
+                whole = whole.copy()
+                whole[..., at] = value
+        return whole
+
+    def near(self, x: A, reference: Array) -> A:
+        """Return the same state, its angles within half a turn of those of `reference` (..., n)."""
+        return nearest(x, reference, self.angles)
+
+    def chart(self, function: Callable[[jax.Array], jax.Array], center: jax.Array) -> Callable[[jax.Array], jax.Array]:
+        """Return x -> function(center plus (x - center)): of the state whose change from `center` is x - center."""
+        if not self.rotations:
+            return function
+        return lambda x: function(self._turned(x, lambda r, d: turn(r, d), center, x - center))
+
+    def moved(
+        self, function: Callable[[jax.Array], jax.Array], center: jax.Array, middle: jax.Array | None = None
+    ) -> Any:
+        """Return the motion of states near `center` as moments are made of it: changes from `middle`, added to it.
+
+        f -> m + (f(center plus (x - center)) difference m), with m = f(center) unless given; angles are continued.
+        """
+        continued = continue_angles(function, center, self.angles, self.angles)
+        if not self.rotations:
+            return continued
+        inside, m = self.chart(continued, center), function(center) if middle is None else middle
+        return lambda x: self.unsettle(m, inside(x))
+
+    def settle(self, center: Array, x: Array) -> Any:
+        """Return the state whose change from `center` is x - center, (..., n); angles stay as they are."""
+        return self._turned(x, turn, center, x - center) if self.rotations else x
+
+    def unsettle(self, center: Array, x: Array) -> Any:
+        """Return center + (x difference center), (..., n), the inverse of `settle`; angles stay as they are."""
+        return self._turned(x, lambda r, other: other + turn_between(r, other), x, center)
+
+    def reset(self, change: jax.Array) -> jax.Array | None:
+        """Return d((x + d) difference x')/dd at d = change, x' = x plus change (n, n): the identity but for attitudes.
+
+        By it errors about x are errors about x'; the right Jacobian of the rotations. None where all is the identity.
+        """
+        if not self.rotations:
+            return None
+        matrix = jnp.eye(len(change), dtype=change.dtype)
+        for i in range(0, len(self.rotations), 3):
+            at = np.array(self.rotations[i : i + 3])
+            own = change[at]
+            block = jax.jacfwd(lambda d, own=own: turn_between(d, own))(own)
+            matrix = matrix.at[at[:, None], at].set(block)
+        return matrix

@@ -1,0 +1,86 @@
+"""Attitudes as rotation vectors: the group of rotations by three numbers, by NumPy or JAX, without a singular zero.
+
+A rotation vector r turns by |r| radians about its own direction: v in the body is R(r) v in the world, R = exp [r]x.
+All products go through unit quaternions q = (w, x, y, z) = (cos |r|/2, sin(|r|/2) r / |r|), which have no singular
+attitude. Of a rotation, r with |r| <= pi is the one that is returned.
+
+Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics (2018), section IV and example 4.
+"""
+
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.types import Array
+
+A = TypeVar("A", jax.Array, np.ndarray)
+SMALL = 1e-4  # of a square: below it four terms of a series are exact to the last digit
+
+
+def _library(*values: object) -> Any:
+    """Return jax.numpy where one is of JAX."""
+    return jnp if any(isinstance(value, jax.Array) for value in values) else np
+
+
+def quaternion_of(r: Array) -> Any:
+    """Return the unit quaternion (..., 4), w first, of rotation vectors (..., 3)."""
+    xp = _library(r)
+    s = xp.sum(r * r, axis=-1, keepdims=True)  # |r|^2
+    near = s < SMALL
+    half = xp.sqrt(xp.where(near, 1.0, s)) / 2
+    cosine = xp.where(near, 1 - s / 8 * (1 - s / 48 * (1 - s / 120)), xp.cos(half))
+    share = xp.where(near, (1 - s / 24 * (1 - s / 80 * (1 - s / 168))) / 2, xp.sin(half) / (2 * half))
+    return xp.concatenate([cosine, share * r], axis=-1)
+
+
+def rotation_vector_of(q: Array) -> Any:
+    """Return the rotation vector (..., 3), at most pi long, of quaternions (..., 4) of any length; q and -q are one."""
+    xp = _library(q)
+    q = xp.where(q[..., :1] < 0, -q, q)
+    w, v = q[..., :1], q[..., 1:]
+    s = xp.sum(v * v, axis=-1, keepdims=True)
+    near = s < SMALL * w * w
+    # r = 2 atan2(|v|, w) v / |v|, by the series of atan(t) / t with t = |v| / w where t is small.
+    size, along = xp.sqrt(xp.where(near, 1.0, s)), xp.where(near, w, 1.0)
+    t = xp.where(near, s, 0.0) / (along * along)
+    series = (1 - t * (1 / 3 - t * (1 / 5 - t * (1 / 7 - t / 9)))) / along
+    return 2 * v * xp.where(near, series, xp.arctan2(size, w) / size)
+
+
+def multiply(q: Array, p: Array) -> Any:
+    """Return the product of quaternions (..., 4): first the turn p, then q."""
+    xp = _library(q, p)
+    a, b, c, d = (q[..., i] for i in range(4))
+    e, f, g, h = (p[..., i] for i in range(4))
+    parts = [
+        a * e - b * f - c * g - d * h,
+        a * f + b * e + c * h - d * g,
+        a * g - b * h + c * e + d * f,
+        a * h + b * g - c * f + d * e,
+    ]
+    return xp.stack(parts, axis=-1)
+
+
+def turn(r: Array, by: Array) -> Any:
+    """Return r plus a turn in its own axes, log(exp(r) exp(by)): rotation vectors (..., 3)."""
+    return rotation_vector_of(multiply(quaternion_of(r), quaternion_of(by)))
+
+
+def turn_between(r: Array, other: Array) -> Any:
+    """Return the turn from `other` to r in the axes of `other`, log(exp(-other) exp(r)): rotation vectors (..., 3)."""
+    return rotation_vector_of(multiply(quaternion_of(-other), quaternion_of(r)))
+
+
+def matrix_of(r: Array) -> Any:
+    """Return R (..., 3, 3), by which what the body sees is what the world sees, of rotation vectors (..., 3)."""
+    xp = _library(r)
+    q = quaternion_of(r)
+    w, x, y, z = (q[..., i] for i in range(4))
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
