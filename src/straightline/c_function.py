@@ -113,11 +113,11 @@ def to_c(
     arguments = [x._replace(used=b in source.needed) for x, b in zip(arguments, buffers, strict=True)]
     results = _describe_results(written, program, outputs, flat, real)
     ends = [
-        f"    {x.name}[{i}] = {source.name(node)};"
+        f"    {x.name}[{i}] = {'(unsigned char)' if node.type == 'bool' else ''}{source.name(node)};"
         for x, nodes in zip(results, flat, strict=True)
         for i, node in enumerate(nodes)
     ]
-    unread = [f"    (void){x.name};" for x in arguments if not x.used]
+    unread = [f"    (void){x.name};" for x in (*arguments, *results) if not x.used or not x.size]
     head = _declared(name, arguments, results)
     lines = [f"{head}\n{{", *unread, *source.declarations(), *body, *ends, "}"]
     definition = "\n\n".join([*source.table_definitions(), "\n".join(lines)])

@@ -10,7 +10,7 @@ import pytest
 
 from heliograph.export.c_files import export_c
 
-COMPILER, FLAGS = "cc", ("-std=c99", "-pedantic", "-Wall", "-Werror", "-O2")  # what the files promise to pass
+COMPILER, FLAGS = "cc", ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-O2")
 
 needs_compiler = pytest.mark.skipif(
     shutil.which(COMPILER) is None, reason=f"no C compiler: the command {COMPILER!r} is not there"
@@ -20,8 +20,10 @@ needs_compiler = pytest.mark.skipif(
 class Device:
     """One filter as it runs on a device; `state` is its memory."""
 
-    def __init__(self, filter_, folder: Path, name: str = "step", precision: str = "double", of=None, node=None):
-        self.exported = export_c(filter_, folder / f"{name}.c", precision, name=of, node=node)
+    def __init__(
+        self, filter_, folder: Path, name: str = "step", precision: str = "double", of=None, node=None, apart=False
+    ):
+        self.exported = export_c(filter_, folder / f"{name}.c", precision, of, node, apart)
         library = folder / f"{name}_{precision}.so"
         command = [COMPILER, *FLAGS, "-shared", "-fPIC", self.exported.source.name, "-o", library.name, "-lm"]
         subprocess.run(command, cwd=folder, check=True)
@@ -35,8 +37,12 @@ class Device:
 
     def step(self, z, u=()) -> int:
         """Advance; 0 unless refused."""
-        z, u = (np.ascontiguousarray(a, dtype=self.real) for a in (z, u))
-        return self._function("step")(*map(self._pointer, (self.state, z, u)))
+        return self.call("step", z, u)
+
+    def call(self, function, *numbers) -> int:
+        """Call a function of the state with arrays of numbers; arrays that are of the device's numbers it may fill."""
+        arrays = [np.ascontiguousarray(a, dtype=self.real) for a in numbers]
+        return self._function(function)(*map(self._pointer, (self.state, *arrays)))
 
     def mean(self) -> np.ndarray:
         """The estimate's mean."""

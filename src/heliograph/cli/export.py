@@ -21,6 +21,7 @@ def export(
         str | None, Parameter(help="Node that has it, fused for the centre; needed where several do.")
     ] = None,
     precision: Annotated[str, Parameter(help="double, or float: single precision.")] = "double",
+    apart: Annotated[bool, Parameter(help="Prediction, correction and a start as functions of their own too.")] = False,
 ) -> None:
     """Write one step of a filter of your own network as C99, for a device: no heap, no library but libm.
 
@@ -42,7 +43,7 @@ def export(
     check_place(out)
     named = find_filter_by_name(load_network(network), filter, node)
     # Write the files, then compile and time them.
-    written = write_filter(named.filter, named.received, out, precision)
+    written = write_filter(named.filter, named.received, out, precision, apart)
     exported, real = named.filter, PRECISIONS[precision]
     measured = measure_cost(written.header, written.source, exported.received, len(exported.inputs), real)
     claim = claim_of(exported, real)

@@ -44,15 +44,18 @@ def export_c(
     precision: str = "double",
     name: str | None = None,
     node: str | None = None,
+    apart: bool = False,
 ) -> Exported:
     """Write one step of a filter as C99, for a device: `step.h` and `step.c` where `path` is "step.c".
 
     `step_start(state)` initialises; `step_step(state, z, u)` predicts over one step with the inputs u and corrects by
     the components of z that arrived (NaN: did not arrive), and returns 0, or refuses by another number and leaves the
     state unchanged, as where a component is more than 1e6 deviations from what was expected, or a time step "dt" is
-    negative; `step_mean(state)` and `step_covariance(state)` (row by row) are the estimate. There is no heap, no global
-    variable, and no library but libm. All names begin with the name of the file. A filter of a plant that varies over
-    time contains its tables, and refuses a step past their end.
+    negative; `step_mean(state)` and `step_covariance(state)` (row by row) are the estimate. `apart`: also
+    `step_predict(state, u)`, `step_correct(state, z, innovation)`, and `step_start_at(state, mean, covariance)` of a
+    filter whose state is these two. There is no heap, no global variable, and no library but libm. All names begin with
+    the name of the file. A filter of a plant that varies over time contains its tables, and refuses a step past their
+    end.
 
     Args:
         filter: the filter; or a network, of which `name` says the filter.
@@ -60,6 +63,8 @@ def export_c(
         precision: "double", which agrees with `Stream` to rounding; "float", single precision, for filters that carry
             their covariance as factors L D L', whose variances stay positive, and schedules of gains (default
             "double").
+        apart: whether prediction and correction are functions of their own beside the step, so that each sensor is used
+            when it comes, and the innovation is told; False by default.
 
     Returns:
         The two files, the number of each operation in a step, and the bytes of the state.
@@ -73,12 +78,12 @@ def export_c(
     """
     if isinstance(filter, Network):
         named = find_filter_by_name(filter, "" if name is None else name, node)
-        return write_filter(named.filter, named.received, path, precision)
+        return write_filter(named.filter, named.received, path, precision, apart)
     if name is not None or node is not None:
         raise fail("export by name", "a network", show_value(filter))
     what = "a filter, or a network and the name of its filter or fusion"
     checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
-    return write_filter(checked, _name_received(checked), path, precision)
+    return write_filter(checked, _name_received(checked), path, precision, apart)
 
 
 def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
@@ -87,12 +92,14 @@ def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
     return outputs if len(outputs) == filter.received else tuple(f"z{i}" for i in range(filter.received))
 
 
-def write_filter(filter: AbstractFilter, received: Sequence[str], path: str | Path, precision: str) -> Exported:
+def write_filter(
+    filter: AbstractFilter, received: Sequence[str], path: str | Path, precision: str, apart: bool = False
+) -> Exported:
     """Write as `export_c`, with names for the components of z."""
     source = check_place(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
-    text = make_text(filter, received, source.stem, PRECISIONS[precision])
+    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -113,7 +120,7 @@ def check_place(path: str | Path) -> Path:
     return source
 
 
-def make_text(filter: AbstractFilter, received: Sequence[str], prefix: str, real: Real) -> CText:
+def make_text(filter: AbstractFilter, received: Sequence[str], prefix: str, real: Real, apart: bool = False) -> CText:
     """Return the text of both files of a filter."""
     kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
     if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
@@ -121,7 +128,7 @@ def make_text(filter: AbstractFilter, received: Sequence[str], prefix: str, real
         raise fail("single precision", expected, type(filter).__name__)
     try:
         with use_precision(np.float64 if real == "double" else np.float32):
-            program = write_step_program(filter, real, prefix)
+            program = write_step_program(filter, real, prefix, apart)
         return write_c_text(program, Form(prefix, real, received, kind))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision

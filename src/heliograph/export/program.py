@@ -1,27 +1,27 @@
-"""One step of a filter as a function of C: from state, measurement and inputs to the state after, and to flags."""
+"""One step of a filter as functions of C: from state, measurement and inputs to the state after, and to flags."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.export.parts import Part, parts_of_step
+from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plausibility import Judgement
-from heliograph.model.checks.inputs import do_inputs_spoil
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, to_c
 
 Real = Literal["double", "float"]
-ROUNDING: dict[Real, float] = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
 RESERVED = frozenset((
     "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
     "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
     "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
 ))  # fmt: skip
 ADDED = frozenset(("step", "estimate_mean", "estimate_covariance", "z", "u"))  # names beside the filter's state
+SAME = 1e-6  # deviations to which a covariance's factors give it back
 
 
 class Member(NamedTuple):
@@ -32,80 +32,61 @@ class Member(NamedTuple):
 
 
 class StepProgram(NamedTuple):
-    """A step: `compute` is its function of C, from `members`, z, u and step, and `initial` that of the first state.
+    """A step as functions of C.
 
-    The results of `compute` are those of `members`, whether the estimate would lose its digits, so that the step must
-    not be used, and whether the inputs are none. `mean` and `covariance` name the members that hold the estimate, which
-    may be the filter's own; the others come last. `counts`: whether the step's number is part of the state.
+    `parts` are the whole step, or prediction and correction, and `computes` their functions: from `read`, the data and
+    the step's number to `members` and what is beside these. `initial` makes the first state; `at` that of a mean and a
+    covariance, None of a state that is more than these. `mean` and `covariance` name the members that hold the
+    estimate, which may be the filter's own; the others come last. `counts`: whether the step's number is part of the
+    state.
     """
 
     filter: AbstractFilter
     members: list[Member]
     read: list[Member]
-    compute: Any
+    parts: list[Part]
+    computes: list[Any]
     initial: Any
+    at: Any
     mean: str
     covariance: str
     counts: bool
 
+    @property
+    def operations(self) -> dict[str, int]:
+        """Return the number of each operation in a step."""
+        counts = [code.operations for code in self.computes]
+        return {op: sum(count.get(op, 0) for count in counts) for every in counts for op in every}
 
-def write_step_program(filter: AbstractFilter, real: Real, prefix: str) -> StepProgram:
-    """Write `step` of a filter as a function of C, for numbers of this type.
 
-    A measurement that differs from what was expected by less than `ROUNDING` of itself is used, however small its
-    deviations are: after many steps its expectation is rounded by as much (and below 1e-33 has few digits).
+def write_step_program(filter: AbstractFilter, real: Real, prefix: str, apart: bool = False) -> StepProgram:
+    """Write `step` of a filter as a function of C, for numbers of this type; `apart`: as two, predict and correct.
 
     Raises:
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
     state = filter.init()
-    leaves, tree = jax.tree.flatten(state)
-    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
-    rounding, precision = ROUNDING[real], np.float64 if real == "double" else np.float32
-
-    @jax.jit
-    def step(leaves: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
-        after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, leaves), z, u, k)
-        # Each component by itself, which is cheap: larger than expected, and beyond the bound of its own deviations.
-        # Of a filter whose innovation is of part of z, such as a neighbour's measurement, every far one counts.
-        far, differs = Judgement.find_far(innovation), jnp.abs(innovation.value)
-        if differs.shape == z.shape:
-            larger = jnp.abs(z) > jnp.abs(z - innovation.value)
-            far &= larger & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
-        implausible = jnp.any(far) | (judgement.input > 0)
-        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, precision)
-        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
-
-    examples = leaves, z, u, k
+    leaves = jax.tree.leaves(state)
     named = [Member(name, np.asarray(leaf)) for name, leaf in zip(name_arrays(state), leaves, strict=True)]
-    estimate = filter.estimate(state)
+    read, estimate, parts = list(named), filter.estimate(state), parts_of_step(filter, real, apart)
     named += [Member("estimate_mean", np.asarray(estimate.mean))]
     named += [Member("estimate_covariance", np.asarray(estimate.covariance))]
     try:
-        symmetric = _find_symmetric(step, examples)
-        whole = _write_step(step, examples, symmetric, prefix, real)
+        symmetric = _find_symmetric(parts)
+        wholes = [_write_part(part, symmetric, prefix, real) for part in parts]
         # The estimate is a member of its own only if it is no array of the state.
-        kept = list(range(len(leaves)))
-        places = [_place(n, whole, named) for n in (len(leaves), len(leaves) + 1)]
-        kept += [n for n in places if n >= len(leaves)]
+        places = [max(_place(n, whole, named) for whole in wholes) for n in (len(leaves), len(leaves) + 1)]
+        kept = [*range(len(leaves)), *(n for n in places if n >= len(leaves))]
         members = [named[n] for n in kept]
-
-        def chosen(*arguments: Any) -> list[jax.Array]:
-            results = step(*arguments)
-            return [results[n] for n in [*kept, -2, -1]]
-
-        names = [*(m.name for m in named[: len(leaves)]), "z", "u", "step"]
-        results = [*(f"next_{m.name}" for m in members), "implausible", "spoilt"]
-        compute = _write_step(chosen, examples, symmetric, prefix, real, (names, results))
-        starts = [m.start for m in members]
-        initial = to_c(
-            lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), [m.name for m in members])
-        )
+        computes = [_write_part(part, symmetric, prefix, real, kept, (read, members)) for part in parts]
+        names, starts = [m.name for m in members], [m.start for m in members]
+        initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
+        at = _write_start(filter, kept, names, prefix, real) if isinstance(state, Gaussian) and apart else None
     except Unsupported as error:
         raise no_c(error.operation, error.where) from None
     mean, covariance = (named[n].name for n in places)
-    counts = compute.arguments[-1].used or filter.horizon is not None
-    return StepProgram(filter, members, named[: len(leaves)], compute, initial, mean, covariance, counts)
+    counts = any(code.arguments[-1].used for code in computes) or filter.horizon is not None
+    return StepProgram(filter, members, read, parts, computes, initial, at, mean, covariance, counts)
 
 
 def _place(number: int, code: Any, named: Sequence[Member]) -> int:
@@ -115,40 +96,81 @@ def _place(number: int, code: Any, named: Sequence[Member]) -> int:
     return next((n for n in same if np.array_equal(named[n].start, start, equal_nan=True)), number)
 
 
-def _write_step(
-    step: Callable[..., Any],
-    examples: tuple[Any, ...],
+def _write_part(
+    part: Part,
     symmetric: set[int],
     prefix: str,
     real: Real,
-    names: tuple[Sequence[str], Sequence[str]] = ((), ()),
+    kept: Sequence[int] | None = None,
+    names: tuple[Sequence[Member], Sequence[Member]] = ((), ()),
 ) -> Any:
-    """Write a step as C; all but the measurement, of which components may be missing, is finite."""
-    count = len(examples[0])
-    finite = {*range(count), count + 1, count + 2}
+    """Write a part of a step as C; all but the measurement, of which components may be missing, is finite.
+
+    `kept`: which arrays of state and estimate are results, all by default; `names`: of what is read and of these.
+    """
+    count = len(part.examples[0])
+
+    def chosen(*arguments: Any) -> list[jax.Array]:
+        results = part.function(*arguments)
+        return results if kept is None else [*(results[n] for n in kept), *results[count + 2 :]]
+
+    read, members = ([m.name for m in some] for some in names)
+    data = [count + n for n, name in enumerate(part.data) if name != "z"]
     return to_c(
-        step,
-        *examples,
-        name=f"{prefix}_compute",
+        chosen,
+        *part.examples,
+        name=f"{prefix}_compute" if part.name == "step" else f"{prefix}_compute_{part.name}",
         single=real == "float",
-        names=names,
-        finite=finite,
+        names=([*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.beside])
+        if kept is not None
+        else ((), ()),
+        finite={*range(count), *data, count + len(part.data)},
         symmetric=symmetric,
     )
 
 
-def _find_symmetric(step: Callable[..., Any], examples: tuple[Any, ...]) -> set[int]:
+def _write_start(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
+    """Write the function from mean and covariance to the members, and whether these are none.
+
+    A covariance whose factors do not give it back is none: elimination keeps each pivot at zero or above.
+    """
+
+    @jax.jit
+    def begin(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
+        state = from_covariance(mean, covariance)
+        estimate = filter.estimate(state)
+        results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
+        deviations = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))
+        apart = jnp.abs(jnp.asarray(state.covariance) - covariance)
+        same = jnp.all(apart <= SAME * jnp.outer(deviations, deviations))
+        right = same & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
+        return [*(results[n] for n in kept), ~right]
+
+    n = len(filter.states)
+    return to_c(
+        begin,
+        np.zeros(n),
+        np.eye(n),
+        name=f"{prefix}_compute_start",
+        single=real == "float",
+        names=(["mean", "covariance"], [*(f"next_{name}" for name in names), "none"]),
+    )
+
+
+def _find_symmetric(parts: Sequence[Part]) -> set[int]:
     """Return which arrays of the state are always symmetric, of which one triangle is read.
 
-    By induction: symmetric at the start, and after a step from symmetric ones. Assume all, drop those that are not.
+    By induction: symmetric at the start, and after each part from symmetric ones. Assume all, drop those that are not.
     """
-    symmetric = {n for n, leaf in enumerate(map(np.asarray, examples[0])) if _is_symmetric(leaf)}
-    while True:
-        results = _write_step(step, examples, symmetric, "step", "double").results if symmetric else []
-        lost = {n for n in symmetric if not results[n].symmetric}
+    leaves = parts[0].examples[0]
+    symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}
+    while symmetric:
+        codes = [_write_part(part, symmetric, "step", "double") for part in parts]
+        lost = {n for n in symmetric if not all(code.results[n].symmetric for code in codes)}
         if not lost:
-            return symmetric
+            break
         symmetric -= lost
+    return symmetric
 
 
 def no_c(operation: str, where: str) -> InputError:

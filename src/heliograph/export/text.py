@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import heliograph
 from heliograph.disk.quoting import visible
+from heliograph.export.functions import declare_innovation, explain_parts, list_heads, write_functions
 from heliograph.export.program import Real, StepProgram
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
@@ -42,14 +43,14 @@ class CText(NamedTuple):
 def write_c_text(program: StepProgram, form: Form) -> CText:
     """Write a step as C."""
     prefix, real = form.prefix, form.real
-    kinds = {x.name.removeprefix("next_"): x.type for x in program.compute.results}
+    kinds = {x.name.removeprefix("next_"): x.type for x in program.computes[0].results}
+    started = [] if program.at is None else [program.at]
     text = _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
-        functions="\n\n".join(_static(code) for code in (program.initial, program.compute)),
+        functions="\n\n".join(_static(code) for code in (program.initial, *started, *program.computes)),
         start=_start(program),
-        checks="\n".join(_write_checks(program)),
-        step="\n".join(_write_step(program)),
+        step="\n\n".join(write_functions(program, prefix, real)),
         mean=program.mean,
         covariance=program.covariance,
         real=real,
@@ -61,10 +62,12 @@ def write_c_text(program: StepProgram, form: Form) -> CText:
         guard=f"{prefix.upper()}_H",
         comment=_write_comment(program, form),
         members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _counter(program)),
+        innovation=declare_innovation(program, prefix, real),
+        functions="".join(f"{head};\n" for head in list_heads(program, prefix, real)),
         real=real,
     )
     sizes = [(SIZES[kind], count) for kind, _, count in fields] + ([(8, 1)] if program.counts else [])
-    return CText(header, text, program.compute.operations, _measure_state(sizes))
+    return CText(header, text, program.operations, _measure_state(sizes))
 
 
 def _static(code: Any) -> str:
@@ -92,30 +95,6 @@ def _start(program: StepProgram) -> str:
     return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")
 
 
-def _write_checks(program: StepProgram) -> list[str]:
-    """Return the statements that refuse invalid inputs before the computation."""
-    filter = program.filter
-    lines = [f"    if (isinf(z[{i}])) return 1;" for i in range(filter.received)]
-    lines += [f"    if (!isfinite(u[{i}])) return 2;" for i in range(len(filter.inputs))]
-    return [*lines, f"    if (state->step >= {filter.horizon}) return 3;"] if filter.horizon is not None else lines
-
-
-def _write_step(program: StepProgram) -> list[str]:
-    """Return the statements that compute a step, refuse an implausible one, and then write all that changed."""
-    read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
-    written = [*(f"after.{m.name}" for m in program.members), "implausible", "spoilt"]
-    arguments = [*read, "z", "u", "state->step" if program.counts else "0", *written]
-    states = len(program.filter.states)
-    return [
-        f"    {program.compute.name}(\n        " + ",\n        ".join(arguments) + ");",
-        "    if (spoilt[0]) return 6;",
-        f"    for (int i = 0; i < {states}; ++i) if (!isfinite(after.{program.mean}[i])) return 4;",
-        "    if (implausible[0]) return 5;",
-        *(["    after.step = state->step + 1;"] if program.counts else []),
-        "    *state = after;",
-    ]
-
-
 def claim_of(filter: AbstractFilter, real: Real) -> Claim:
     """Return the filter's claim; single precision proves nothing, since its rounding is not bounded."""
     return filter.claim if real == "double" or filter.claim == "none" else "nominal"
@@ -140,6 +119,7 @@ def _write_comment(program: StepProgram, form: Form) -> str:
         "5 the measurement or an input is so far from what was expected that the estimate would lose its digits,",
         "6 the inputs are none: dt is negative, beyond 2^53 units or the wrapped difference of unsigned counters of 32",
         "bits, or a function of the inputs returned no finite numbers, or no covariance.",
+        *(explain_parts(program, prefix) if len(program.parts) > 1 else []),
         "",
         *_number_entries("z", form.received, [""] * len(form.received)),
         *_number_entries("u", filter.inputs, [""] * len(filter.inputs)),
@@ -175,9 +155,8 @@ typedef struct {{
 {members}
 }} {prefix}_state;
 
-void {prefix}_start({prefix}_state *state);
-int {prefix}_step({prefix}_state *state, const {real} z[], const {real} u[]);
-const {real} *{prefix}_mean(const {prefix}_state *state);
+{innovation}void {prefix}_start({prefix}_state *state);
+{functions}const {real} *{prefix}_mean(const {prefix}_state *state);
 const {real} *{prefix}_covariance(const {prefix}_state *state);
 
 #ifdef __cplusplus
@@ -203,14 +182,7 @@ void {prefix}_start({prefix}_state *state)
 {start}
 }}
 
-int {prefix}_step({prefix}_state *state, const {real} z[], const {real} u[])
-{{
-{checks}
-    {prefix}_state after;
-    unsigned char implausible[1], spoilt[1];
 {step}
-    return 0;
-}}
 
 const {real} *{prefix}_mean(const {prefix}_state *state)
 {{

@@ -78,6 +78,24 @@ class Judgement(NamedTuple):
         return self.reason > 0
 
     @staticmethod
+    def judge_prediction(
+        claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], spoilt: Array
+    ) -> "Judgement":
+        """Judge a prediction by itself, from states and estimates before and after it, as a step without data."""
+        (before, prior), (was, expected), nothing = states, estimates, jnp.zeros(0)
+        empty = Innovation(nothing, jnp.zeros((0, 0)), jnp.zeros(()))
+        return judge_step(claim, (before, prior, prior), (was, expected, expected), empty, nothing, False, spoilt)
+
+    @staticmethod
+    def judge_correction(
+        claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], innovation: Innovation,
+        z: Float[Array, " m"], of_atoms: bool,
+    ) -> "Judgement":  # fmt: skip
+        """Judge a correction by itself, from states and estimates before and after it."""
+        (prior, after), (expected, corrected) = states, estimates
+        return judge_step(claim, (prior, prior, after), (expected, expected, corrected), innovation, z, of_atoms)
+
+    @staticmethod
     def find_far(innovation: Innovation) -> jax.Array:
         """Mask of the components e_j that are beyond the bound of their own deviations, |e_j| > 1e6 sqrt(S_jj)."""
         variances = jnp.diagonal(jnp.asarray(innovation.covariance))

@@ -1,0 +1,138 @@
+"""Text of the functions of an exported step: whole, or its prediction, its correction and a start apart."""
+
+from heliograph.export.parts import Part
+from heliograph.export.program import Real, StepProgram
+
+
+def list_heads(program: StepProgram, prefix: str, real: Real) -> list[str]:
+    """Return the heads of the functions that move the state."""
+    state = f"{prefix}_state *state"
+    step = f"int {prefix}_step({state}, const {real} z[], const {real} u[])"
+    if len(program.parts) == 1:
+        return [step]
+    start = f"int {prefix}_start_at({state}, const {real} mean[], const {real} covariance[])"
+    predict = f"int {prefix}_predict({state}, const {real} u[])"
+    correct = f"int {prefix}_correct({state}, const {real} z[], {prefix}_innovation *innovation)"
+    return [*([] if program.at is None else [start]), predict, correct, step]
+
+
+def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
+    """Declare what a correction tells beside the estimate; nothing of a whole step."""
+    if len(program.parts) == 1:
+        return ""
+    count = max(program.filter.received, 1)
+    weight = f"    {real} weight[{count}];\n" if "weight" in program.parts[1].beside else ""
+    return (
+        f"typedef struct {{\n    {real} value[{count}];\n{weight}    {real} nis;\n    {real} arrived;\n"
+        f"}} {prefix}_innovation;\n\n"
+    )
+
+
+def explain_parts(program: StepProgram, prefix: str) -> list[str]:
+    """Explain the functions that are apart, for a reader of the header."""
+    lines = [
+        "",
+        f"{prefix}_step is {prefix}_predict and {prefix}_correct, which may be called apart: predict at each step of",
+        "time, and then correct as often as measurements come, each with the components of z that are new and NaN for",
+        "all others. Noises of components that come in different calls are taken to be independent.",
+        f"{prefix}_correct tells in *innovation, unless that is a null pointer, z - E[z] (NaN: did not arrive), and",
+        "its squared size nis in units of its covariance (NaN: nothing arrived), chi-squared of so many degrees of",
+        "freedom as components arrived; also of a measurement that it refuses.",
+    ]
+    if "weight" in program.parts[1].beside:
+        lines.append("weight is how much of each component was used: 1 all, 0 left out.")
+    if program.at is not None:
+        lines += [
+            f"{prefix}_start_at starts from another mean and covariance, row by row, in place of {prefix}_start; it",
+            "returns 0, or refuses by 7 what is no finite mean or no covariance.",
+        ]
+    return lines
+
+
+def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
+    """Write the functions that move the state; each writes it only where nothing is refused."""
+    heads = list_heads(program, prefix, real)
+    if len(program.parts) == 1:
+        body = [*_check_inputs(program, both=True), *_compute(program, 0, prefix), "    return 0;"]
+        return [_join(heads[0], body)]
+    predict = [*_check_inputs(program), *_compute(program, 0, prefix), "    return 0;"]
+    correct = [*_check_measurement(program), *_compute(program, 1, prefix), "    return 0;"]
+    step = [
+        f"    {prefix}_state after = *state;",
+        f"    int refused = {prefix}_predict(&after, u);",
+        "    if (refused) return refused;",
+        f"    refused = {prefix}_correct(&after, z, 0);",
+        "    if (refused) return refused;",
+        "    *state = after;",
+        "    return 0;",
+    ]
+    begun = [] if program.at is None else [_write_start(program, prefix)]
+    return [_join(head, body) for head, body in zip(heads, [*begun, predict, correct, step], strict=True)]
+
+
+def _join(head: str, body: list[str]) -> str:
+    return "\n".join([head, "{", *body, "}"])
+
+
+def _check_measurement(program: StepProgram) -> list[str]:
+    return [f"    if (isinf(z[{i}])) return 1;" for i in range(program.filter.received)]
+
+
+def _check_inputs(program: StepProgram, both: bool = False) -> list[str]:
+    """Return the statements that refuse inputs, and a step past the end; of a whole step measurements first."""
+    filter = program.filter
+    lines = _check_measurement(program) if both else []
+    lines += [f"    if (!isfinite(u[{i}])) return 2;" for i in range(len(filter.inputs))]
+    return [*lines, f"    if (state->step >= {filter.horizon}) return 3;"] if filter.horizon is not None else lines
+
+
+def _compute(program: StepProgram, number: int, prefix: str) -> list[str]:
+    """Return the statements that compute a part, refuse an implausible one, and then write all that changed."""
+    part, code = program.parts[number], program.computes[number]
+    read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
+    written = [*(f"after.{m.name}" for m in program.members), *(_place_beside(name) for name in part.beside)]
+    arguments = [*read, *part.data, _say_step(program, part), *written]
+    flags = [name for name in part.beside if name in ("implausible", "spoilt")]
+    told = part.name == "correct"
+    # A correction is of the step that was predicted; the others count it.
+    step = "state->step" if told else "state->step + 1"
+    return [
+        f"    {prefix}_state after;",
+        *([f"    {prefix}_innovation news;"] if told else []),
+        f"    unsigned char {', '.join(f'{name}[1]' for name in flags)};",
+        f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");",
+        *(["    if (innovation) *innovation = news;"] if told else []),
+        *(["    if (spoilt[0]) return 6;"] if "spoilt" in flags else []),
+        f"    for (int i = 0; i < {len(program.filter.states)}; ++i) if (!isfinite(after.{program.mean}[i])) return 4;",
+        "    if (implausible[0]) return 5;",
+        *([f"    after.step = {step};"] if program.counts else []),
+        "    *state = after;",
+    ]
+
+
+def _place_beside(name: str) -> str:
+    """Return where what stands beside the state is written to: flags are local, the others a caller's to have."""
+    if name in ("implausible", "spoilt"):
+        return name
+    return f"&news.{name}" if name in ("nis", "arrived") else f"news.{name}"
+
+
+def _say_step(program: StepProgram, part: Part) -> str:
+    """Return the number of the step that a part belongs to."""
+    if not program.counts:
+        return "0"
+    return "state->step > 0 ? state->step - 1 : 0" if part.name == "correct" else "state->step"
+
+
+def _write_start(program: StepProgram, prefix: str) -> list[str]:
+    """Return the statements of a start from a given mean and covariance."""
+    members = ", ".join(f"after.{m.name}" for m in program.members)
+    return [
+        f"    {prefix}_state after;",
+        "    unsigned char none[1];",
+        f"    {program.at.name}(mean, covariance, {members}, none);",
+        "    if (none[0]) return 7;",
+        *(["    after.step = 0;"] if program.counts else []),
+        "    *state = after;",
+        "    return 0;",
+    ]

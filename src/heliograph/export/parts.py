@@ -1,0 +1,94 @@
+"""A filter's step as functions of arrays that C can have: whole, or apart as its prediction and its correction."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import Judgement
+from heliograph.model.checks.inputs import do_inputs_spoil
+from heliograph.model.estimate import Innovation
+from heliograph.numerics.types import PyTree
+
+ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
+
+
+class Part(NamedTuple):
+    """A function from (arrays of the state, data, step number) to arrays of state and estimate, and what is `beside`.
+
+    `name` is that of the function in C, `data` what the data are: "z", "u" or both. `beside` has "implausible": the
+    estimate would lose its digits, and what was computed must not be used.
+    """
+
+    name: str
+    data: tuple[str, ...]
+    function: Callable[..., list[jax.Array]]
+    examples: tuple[Any, ...]
+    beside: tuple[str, ...]
+
+
+def parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[Part]:
+    """Return the step, or apart its prediction and its correction, for numbers of type `real`.
+
+    A measurement that differs from what was expected by less than `ROUNDING` of itself is used, however small its
+    deviations are: after many steps its expectation is rounded by as much (and below 1e-33 has few digits).
+    """
+    leaves, tree = jax.tree.flatten(filter.init())
+    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
+    precision = np.float64 if real == "double" else np.float32
+
+    def restore(arrays: list[jax.Array]) -> PyTree:
+        return jax.tree.unflatten(tree, arrays)
+
+    @jax.jit
+    def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
+        after, estimate, judgement, innovation = filter.judge_step(restore(arrays), z, u, k)
+        implausible = find_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
+        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, precision)
+        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
+
+    @jax.jit
+    def predict(arrays: list[jax.Array], u: jax.Array, k: jax.Array) -> list[jax.Array]:
+        before = restore(arrays)
+        prior = filter.predict(before, u, k)
+        estimates = filter.estimate(before), filter.estimate(prior)
+        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, precision)
+        judgement = Judgement.judge_prediction(filter.claim, (before, prior), estimates, spoilt)
+        return [*jax.tree.leaves(prior), estimates[1].mean, estimates[1].covariance, judgement.input > 0, spoilt]
+
+    @jax.jit
+    def correct(arrays: list[jax.Array], z: jax.Array, k: jax.Array) -> list[jax.Array]:
+        prior = restore(arrays)
+        after, innovation = filter.correct(prior, z, k)
+        expected, estimate = filter.estimate(prior), filter.after_step(after, k)
+        judgement = Judgement.judge_correction(
+            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms
+        )
+        implausible = find_implausible(innovation, z, ROUNDING[real])
+        told = [innovation.value, judgement.distance, judgement.arrived]
+        weight = [] if innovation.weight is None else [innovation.weight]
+        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, *told, *weight]
+
+    if not apart:
+        return [Part("step", ("z", "u"), step, (leaves, z, u, k), ("implausible", "spoilt"))]
+    weighs = filter.correct(filter.predict(filter.init(), u, 0), z, 0)[1].weight is not None
+    told = ("implausible", "value", "nis", "arrived", *(("weight",) if weighs else ()))
+    return [
+        Part("predict", ("u",), predict, (leaves, u, k), ("implausible", "spoilt")),
+        Part("correct", ("z",), correct, (leaves, z, k), told),
+    ]
+
+
+def find_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
+    """Return whether some component is larger than expected and beyond the bound of its own deviations, which is cheap.
+
+    Of a filter whose innovation is of part of z, such as a neighbour's measurement, every far one counts.
+    """
+    far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
+    if differs.shape == z.shape:
+        larger = jnp.abs(z) > jnp.abs(z - innovation.value)
+        far &= larger & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
+    return jnp.any(far)
