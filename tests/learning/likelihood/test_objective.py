@@ -1,6 +1,7 @@
 """Likelihoods, scores and information of native code and of XLA are one; they are those of the filter's likelihood."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -29,14 +30,30 @@ def walk():
     return hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[2.0]], hg.free(0.3, "r")), hg.perfect(), {})})
 
 
-@pytest.fixture(scope="module", params=[relayed, walk])
+def everywhere():
+    """Numbers of every part: matrix, input, noises, start, sensor, link."""
+    turn = hg.free(0.2, "turn", "real")
+    plant = hg.LinearPlant(
+        jnp.array([[0.9, 0.0], [0.0, 0.7]]) + turn * jnp.array([[0.0, 1.0], [-1.0, 0.0]]),
+        hg.free(0.3, "Q") * jnp.array([[1.0, 0.2], [0.2, 0.5]]),
+        jnp.array([1.0, 0.0]) * hg.free(0.7, "start", "real"),
+        jnp.eye(2) * hg.free(2.0, "spread"),
+        jnp.ones((2, 1)) * hg.free(0.5, "push", "real"),
+    )
+    matrix, link = jnp.array([[1.0, 0.3], [0.0, 1.0]]) * hg.free(1.1, "scale", "real"), hg.hop(0.8, 0.1, dimension=2)
+    sensor = hg.LinearSensor(matrix, hg.Gaussian(0.4 * np.eye(2), jnp.ones(2) * hg.free(0.2, "bias", "real")))
+    return hg.Network(plant, {"node": hg.Node(sensor, link, {})})
+
+
+@pytest.fixture(scope="module", params=[relayed, walk, everywhere])
 def both(request):
     """An objective and data of which one number is lost."""
     objective = make_objectives(describe(request.param))[0]
     received = objective.description.start.nodes["node"].received
     z = np.cumsum(np.random.default_rng(0).normal(size=(RECORDINGS, STEPS, received)), axis=1)
-    z[0, 3, 0] = np.nan
-    return objective, Data(z, np.zeros((RECORDINGS, STEPS, 0)), (STEPS,) * RECORDINGS)
+    z[0, 3, 0] = z[0, 20:23] = np.nan
+    u = np.random.default_rng(2).normal(size=(RECORDINGS, STEPS, len(objective.description.start.inputs)))
+    return objective, Data(z, u, (STEPS,) * RECORDINGS)
 
 
 def points(objective):
@@ -66,11 +83,28 @@ def test_scores_are_the_derivatives_of_the_likelihood(both):
     for x in points(objective):
         result = evaluate_at_points(objective, x[None], data)
         with jax.enable_x64(True):
-            total = sum(hg.log_likelihood(objective.filter(x), z) for z in data.measurements)
+            rows = zip(data.measurements, data.inputs, strict=True)
+            total = sum(hg.log_likelihood(objective.filter(x), z, u) for z, u in rows)
         np.testing.assert_allclose(result.total[0], total, rtol=1e-12)
         ends = [evaluate_at_points(objective, x + sign * DIFFERENCE * np.eye(len(x)), data).total for sign in (-1, 1)]
         slopes = (ends[1] - ends[0]) / (2 * DIFFERENCE)
         np.testing.assert_allclose(result.gradient[0], slopes, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", [walk, everywhere])
+def test_behind_a_known_gain_they_are_those_of_the_factors(network):
+    """To 1e-10 of the largest, a million roundings: the derivatives of factors and of covariances are two ways."""
+    objective = make_objectives(describe(network))[0]
+    z = np.random.default_rng(0).normal(size=(40, objective.description.start.nodes["node"].received))
+    z[[3, 20], 0] = z[21] = np.nan
+    u = np.random.default_rng(2).normal(size=(40, len(objective.description.start.inputs)))
+    data, x = Data(z[None], u[None], (40,)), points(objective)[0]
+    result = evaluate_at_points(objective, x[None], data)
+    with jax.enable_x64(True):
+        total, slopes = jax.value_and_grad(lambda x: hg.log_likelihood(objective.filter(x), z, u))(x)
+    np.testing.assert_allclose(result.total[0], total, rtol=1e-12)
+    np.testing.assert_allclose(result.gradient[0], slopes, rtol=0, atol=1e-10 * np.abs(slopes).max())
 
 
 def test_nodes_of_which_one_varies_over_time_are_learned_as_one_node():

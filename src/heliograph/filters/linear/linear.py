@@ -6,6 +6,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
@@ -105,6 +106,12 @@ class LinearFilter(AbstractSizedFilter):
     def is_linear(self) -> bool:
         """Always True: its gains depend on the moments before any data."""
         return True
+
+    @property
+    def has_known_gain(self) -> bool:
+        """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
+        whole = stacked(self.channel)
+        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
