@@ -10,6 +10,7 @@ from pathlib import Path
 FOLDER = Path(__file__).resolve().parents[2] / "build" / "peers"
 REQUIREMENTS = {
     "cuthbert": ("cuthbert==0.1.1",),
+    "fast-kalman": ("fast-kalman==0.2.4",),
     "filterpy": ("filterpy==2.0.0",),
     "kalman-py": ("kalman-py[jax]==0.1.1",),
     "pykalman": ("pykalman==0.11.2",),
