@@ -69,9 +69,7 @@ def test_bad_input_is_one_line():
         hg.linear.critical_arrival(plant([[1.2]]), sensor([[1.0]]), gain=[[5.0]])
     with pytest.raises(ValueError, match="gain: expected shape"):
         hg.linear.critical_arrival(plant([[1.2]]), sensor([[1.0]]), gain=[1.0])
-    with pytest.raises(ValueError, match="boundedness: expected a LinearPlant that does not vary, got Plant"):
+    with pytest.raises(ValueError, match="plant: expected a LinearPlant that does not vary, got Plant"):
         hg.linear.critical_arrival(hg.Plant(lambda x, u: x, 1.0, [0.0], 1.0), sensor([[1.0]]))
-    with pytest.raises(
-        ValueError, match="boundedness: expected a LinearSensor that does not vary, got one that varies"
-    ):
+    with pytest.raises(ValueError, match="sensor: expected a LinearSensor that does not vary, got one that varies"):
         hg.linear.critical_arrival(plant([[1.2]]), hg.model.over_time([sensor([[1.0]])]))

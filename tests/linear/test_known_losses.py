@@ -165,7 +165,7 @@ def test_size_is_refused_with_the_number():
         np.eye(n), np.eye(n), chain, chain[1], np.zeros(40, dtype=int), (np.zeros((0, n)),), (np.zeros((0, 0)),) * 40
     )
     with pytest.raises(
-        ValueError, match="boundedness: expected at most 1024 entries of covariances over all modes, got 4840"
+        ValueError, match="chain of losses: expected at most 1024 entries of covariances over all modes, got 4840"
     ):
         find_gains(system)
 

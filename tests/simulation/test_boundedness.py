@@ -240,23 +240,26 @@ def test_a_mode_that_is_never_reached_does_not_matter():
 
 def test_uncertain_transitions_are_refused():
     chain = hg.random_affine.MarkovChain([[0.9, 0.1], [0.5, 0.5]], radius=0.01)
-    with pytest.raises(ValueError, match="boundedness: expected chains of known transition"):
+    with pytest.raises(ValueError, match="chain of a channel: expected one of known transition"):
         scalar(hg.markov_fading([hg.perfect(), hg.erasure(hg.perfect(), 0.0)], chain))
 
 
 def test_what_varies_or_filters_is_refused():
     sensor = hg.LinearSensor([[1.0]], 1.0)
-    with pytest.raises(ValueError, match="boundedness: expected channels that do not vary"):
+    with pytest.raises(ValueError, match="channel: expected one that does not vary"):
         judged(plant([[0.9]]), (sensor, hg.model.over_time([hg.perfect()])))
-    with pytest.raises(ValueError, match="boundedness: expected a LinearPlant that does not vary, got one that varies"):
+    with pytest.raises(ValueError, match="plant: expected a LinearPlant that does not vary, got one that varies"):
         judged(hg.model.over_time([plant([[0.9]])]), (sensor, hg.perfect()))
 
 
 def test_a_link_that_delivers_late_is_refused_and_doubted():
     """It has more inputs than the sensor has outputs, which no product of matrices may find out."""
     late = hg.model.delayed(hg.hop(1.0, 0.1), 1)
-    with pytest.raises(ValueError, match="boundedness: expected channels without delays, got one that is late"):
+    with pytest.raises(ValueError, match="channel: expected one without delays, got one that is late"):
         scalar(late)
     sensor = hg.LinearSensor([[1.0]], 2.5)
     doubts = doubts_before_data(hg.Network(plant(UNSTABLE), {"a": hg.Node(sensor, late, {})}))
-    assert any("boundedness: not judged" in str(doubt) for doubt in doubts)
+    assert any(
+        "boundedness: not judged (channel: expected one without delays, got one that is late" in str(doubt)
+        for doubt in doubts
+    )

@@ -51,7 +51,7 @@ class KnownLossSystem(NamedTuple):
         n, modes = len(self.transition), len(self.chain)
         size = n * n * (1 if np.all(self.chain == self.chain[0]) else modes)
         if size > SIZE_LIMIT:
-            raise fail("boundedness", f"at most {SIZE_LIMIT} entries of covariances over all modes", size)
+            raise fail("chain of losses", f"at most {SIZE_LIMIT} entries of covariances over all modes", size)
         loops = [self.transition - gains[s] @ self.outputs[s] for s in self.known]
         added = [gains[s] @ r @ gains[s].T + self.process for s, r in zip(self.known, self.noises, strict=True)]
         return JumpSystem(self.chain[None], np.array([loops]), noise * self.law[:, None, None] * np.array([added]))

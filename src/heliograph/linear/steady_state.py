@@ -97,9 +97,7 @@ def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lowe
     return high, gain
 
 
-def plant_matrices(
-    plant: AnyPlant, what: str = "boundedness"
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+def plant_matrices(plant: AnyPlant, what: str = "plant") -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
     """Return A and Cov(w) of a constant linear plant, for `what` needs them."""
     if (
         not isinstance(plant, LinearPlant)
@@ -112,7 +110,7 @@ def plant_matrices(
 
 
 def sensor_matrices(
-    sensor: AnySensor, states: int, what: str = "boundedness"
+    sensor: AnySensor, states: int, what: str = "sensor"
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
     """Return C and Cov(v) of a constant linear sensor of so many states, for `what` needs them."""
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):

@@ -109,7 +109,7 @@ def certify_boundedness(network: Network) -> Boundedness:
 def _join_links(network: Network, states: int) -> JointLinks:
     """Join all nodes: sensors stacked, channels in parallel."""
     if network.relays is not None:
-        raise fail("boundedness", "nodes that receive the sensors over channels", "relays that filter")
+        raise fail("nodes", "ones that receive the sensors over channels", "relays that filter")
     # Sensors one above the other.
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)
@@ -119,7 +119,7 @@ def _join_links(network: Network, states: int) -> JointLinks:
     joint = parallel(channels) if len(channels) > 1 else channels[0]
     for memory in memories(joint).values():
         if memory.is_uncertain:
-            raise fail("boundedness", "chains of known transition", "one whose probabilities are uncertain")
+            raise fail("chain of a channel", "one of known transition", "one whose probabilities are uncertain")
     modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
     # Modes that can occur.
@@ -132,9 +132,9 @@ def _join_links(network: Network, states: int) -> JointLinks:
 
 def _constant(channel: Channel) -> AbstractRandomAffine:
     if isinstance(channel, OverTime):
-        raise fail("boundedness", "channels that do not vary", "one that varies")
+        raise fail("channel", "one that does not vary", "one that varies")
     if channel.past:
-        raise fail("boundedness", "channels without delays", f"one that is late by up to {channel.past} steps")
+        raise fail("channel", "one without delays", f"one that is late by up to {channel.past} steps")
     return channel
 
 
