@@ -43,7 +43,7 @@ class Columns(NamedTuple):
 
     @property
     def diagonal(self) -> jax.Array:
-        """Variances (n,)."""
+        """Diagonal of the covariance: variances (n,)."""
         variances: jax.Array = jnp.asarray(self.matrix) ** 2 @ self.weights
         return variances
 

@@ -32,7 +32,7 @@ class Diffuse(NamedTuple):
 
     @property
     def root(self) -> jax.Array:
-        """L, (n, n)."""
+        """Lower triangular factor L (n, n) with ones on its diagonal."""
         return jnp.asarray(unit_lower(self.lower))
 
     @property

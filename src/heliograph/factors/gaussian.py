@@ -128,7 +128,7 @@ class Image(NamedTuple):
 
     @property
     def columns(self) -> Columns:
-        """Covariance of f(x)."""
+        """Covariance of f(x), as columns with their weights."""
         return join_columns(self.explained, self.curvature)
 
 

@@ -16,7 +16,7 @@ class Observed(NamedTuple):
 
     @property
     def covariance(self) -> Float[np.ndarray, "*items n n"]:
-        """W+ W+'."""
+        """Covariance W+ W+' after the observation."""
         return covariance_of_root(self.root)
 
 

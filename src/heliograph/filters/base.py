@@ -311,7 +311,7 @@ def make_sizes(claim: Claim, like: HasStates, received: int) -> Sizes:
 
 @compile_on_call
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
-    """Compiled body of `AbstractFilter.step`."""
+    """Predict, correct and estimate: compiled body of `AbstractFilter.step`."""
     after, _ = filter.correct(filter.predict(state, u, k), z, k)
     return after, filter.after_step(after, k)
 

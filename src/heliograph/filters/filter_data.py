@@ -32,7 +32,7 @@ class SteppedFilter(Protocol):
 
     @property
     def claim(self) -> Claim:
-        """Meaning of its covariances."""
+        """What the filter claims of its covariances."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -40,7 +40,7 @@ class SteppedFilter(Protocol):
 
     @property
     def received(self) -> int:
-        """Length of its measurement."""
+        """Length of the filter's measurement z."""
 
     @property
     def horizon(self) -> int | None:
@@ -157,7 +157,7 @@ def _warn_of_few(counts: Array | None) -> Array | None:
 
 
 def _compute_filtered(filter: SteppedFilter, z: Array, u: Array) -> PyTree:
-    """Compiled body of `run_over_data`."""
+    """Filter all rows and return the results stacked: compiled body of `run_over_data`."""
     return scan_with_last_state(filter, z, u, partial(_tell_estimate, filter))
 
 

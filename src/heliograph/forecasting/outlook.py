@@ -34,7 +34,7 @@ class HasComponents(Protocol):
 
     @property
     def components(self) -> tuple[jax.Array, Gaussian]:
-        """Weights and Gaussians."""
+        """Weights of a mixture's components, and the components as Gaussians."""
 
 
 class Moments(NamedTuple):

@@ -19,7 +19,7 @@ class Law(NamedTuple):
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean of each (rows,)."""
+        """Mean of each row's forecast (rows,)."""
         return np.asarray(np.sum(self.weights * self.means, axis=1))
 
 

@@ -99,29 +99,29 @@ class ErrorMoments(NamedTuple):
 
     @property
     def state_mean(self) -> Float[jax.Array, " n"]:
-        """E x."""
+        """Mean E x of the plant's state."""
         return self.mean[0]
 
     @property
     def state_covariance(self) -> Float[jax.Array, "n n"]:
-        """Cov x."""
+        """Covariance Cov x of the plant's state."""
         n = self.mean.shape[1]
         return self.covariance[:n, :n]
 
     @property
     def bias(self) -> Float[jax.Array, "node n"]:
-        """E e_i."""
+        """Mean error E e_i of each node's estimate."""
         return self.mean[1:]
 
     @property
     def with_state(self) -> Float[jax.Array, "node n n"]:
-        """Cov(e_i, x)."""
+        """Cross-covariance Cov(e_i, x) of each node's error with the state."""
         n = self.mean.shape[1]
         return self.covariance[n:, :n].reshape(-1, n, n)
 
     @property
     def joint(self) -> Float[jax.Array, "node n node n"]:
-        """Cov(e_i, e_j)."""
+        """Covariance Cov(e_i, e_j) of all pairs of nodes' errors."""
         nodes, n = self.bias.shape
         return self.covariance[n:, n:].reshape(nodes, n, nodes, n)
 
@@ -209,7 +209,7 @@ class SourceFactors(NamedTuple):
 
     @property
     def state(self) -> Float[Array, "n sources"]:
-        """Deviation of x by sources."""
+        """Deviation of x from its mean, by the sources that cause it."""
         return self.roots[: self.mean.shape[1]]
 
     @property

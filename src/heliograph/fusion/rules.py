@@ -372,7 +372,7 @@ class Fusion(Module):
         return self.uplink is not None or (self.rule.uses_reports and self.quantizer is not None)
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
-        """Report links of these nodes."""
+        """Links over which these nodes report, in the order of the nodes."""
         return spread_over_names("report links", ReportLink() if self.uplink is None else self.uplink, nodes)
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:

@@ -170,7 +170,7 @@ def horizon_design(
     parts = [np.asarray(values[entries]) for entries in problem.places]
     solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
-    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_next_weight, solved)]
+    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_weigh_state_and_error, solved)]
     failed = _find_first_failing(steps, solved, weights, square)
     if failed is not None:
         text = f"the solver's answer fails at step {failed} ({status})"
@@ -228,7 +228,7 @@ class _Recursion:
             if unknowns is None or not _inequality_holds(step, unknowns, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
-            present = _next_weight(unknowns)
+            present = _weigh_state_and_error(unknowns)
             design.gains[k] = c.gain(step.nominal + _gain_correction(unknowns), k)
             design.weights[k + 1] = relative * c.weight(present, k + 1)
             design.multipliers[k] = all_multipliers(system, relative * c.multipliers(unknowns, k), self.separate)
@@ -271,7 +271,7 @@ def _gain_correction(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:
     return np.asarray(np.linalg.solve(unknowns.error, unknowns.product))
 
 
-def _next_weight(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
+def _weigh_state_and_error(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
     """Return diag(P1, P2)."""
     zero = np.zeros_like(unknowns.state)
     return np.block([[unknowns.state, zero], [zero, unknowns.error]])

@@ -133,7 +133,7 @@ class UnknownsLayout(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Length of the vector."""
+        """Length of the vector of all unknowns."""
         n, m = self.states, self.received
         free = n * m + m * (m + 1) // 2 if self.gain is None else 0
         return n * (n + 1) + free + self.multipliers

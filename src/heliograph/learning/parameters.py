@@ -91,14 +91,14 @@ class Parameters:
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
-        """The starts on the line."""
+        """Starts of all free numbers, mapped to the whole line."""
         return np.concatenate(
             [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
         )
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Rows of the table."""
+        """Rows of the table of parameters: one for each free number."""
         results, begin = [], 0
         for parameter in self.every:
             on_line = parameter.domain.kind == "interval"

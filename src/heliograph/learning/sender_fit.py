@@ -59,7 +59,7 @@ class SenderFit:
 
     @property
     def values(self) -> dict[str, float | np.ndarray]:
-        """The estimates by name."""
+        """Estimates of the free numbers, by name."""
         return self.description.parameters.known(self.x)
 
     @property

@@ -130,17 +130,17 @@ class Solution:
 
     @property
     def steps(self) -> int:
-        """Steps of the last climb."""
+        """Count of steps of the last climb to the maximum."""
         return self.top.steps
 
     @property
     def form(self) -> Form:
-        """Form of the likelihood."""
+        """Name of the form of likelihood that was maximised."""
         return self.surface.objective.form
 
     @property
     def parameters(self) -> Parameters:
-        """Free numbers."""
+        """Free numbers of the model that was fitted."""
         return self.surface.objective.description.parameters
 
     @cached_property

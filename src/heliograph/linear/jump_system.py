@@ -71,7 +71,7 @@ class JumpSystem(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of X before the first step."""
+        """Shape (modes, n, n) of X before the first step; of one mode where X is the same in all."""
         _, modes, n, _ = self.maps.shape
         return (1 if np.all(self.chain[0] == self.chain[0][:1]) else modes, n, n)
 

@@ -175,7 +175,7 @@ class JointNoise(Module):
 
     @property
     def mean(self) -> jax.Array:
-        """Means of all."""
+        """Mean of the joint noise: the means of all its parts."""
         return jnp.concatenate([plant.noise_mean() for plant in self.plants])
 
     def sample(self, key: jax.Array, u: jax.Array) -> jax.Array:

@@ -144,7 +144,7 @@ class ToldApart(NamedTuple):
     numbers: tuple[int, ...]
 
 
-def take_apart(channel: AbstractRandomAffine) -> ToldApart:
+def separate_told(channel: AbstractRandomAffine) -> ToldApart:
     """Take a channel apart into its link and what is told of it; of another one all rows are values."""
     maps = channel.maps if isinstance(channel, Stack) else (channel,)
     told_of = {affine.memory.identity for affine in told_maps(channel)}
@@ -167,7 +167,7 @@ def take_apart(channel: AbstractRandomAffine) -> ToldApart:
 
 def build_with_told(build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]) -> M:
     """Return what is built of channels, with all that is told of them after z: it passes by whatever is built."""
-    links = [take_apart(channel).link for channel in channels]
+    links = [separate_told(channel).link for channel in channels]
     built = build(links)
     apart = any(link is not channel for link, channel in zip(links, channels, strict=True))
     return cast(M, deliver_told(built)) if apart else built
@@ -182,7 +182,7 @@ def stack_with_told(
         place: makes of the links of several signals as many of all of them.
         channels: the channels.
     """
-    links = [take_apart(channel).link for channel in channels]
+    links = [separate_told(channel).link for channel in channels]
     placed, maps = place(links), list[AbstractRandomAffine]()
     for link, channel, of_all in zip(links, channels, placed, strict=True):
         maps += [of_all] if link is channel else [of_all, *_announce(of_all, of_all.inputs)]
@@ -197,7 +197,7 @@ def name_received(outputs: tuple[str, ...], channel: AbstractRandomAffine, more:
         channel: from the sensor to the receiver; told numbers have names of their own.
         more: how many numbers are received beside what the channel delivers.
     """
-    link, values, numbers = take_apart(channel)
+    link, values, numbers = separate_told(channel)
     count = len(values) + more
     names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
     told_names = [name for affine in told_maps(link) for name in affine.names] if numbers else []

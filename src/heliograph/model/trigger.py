@@ -309,7 +309,7 @@ def check_threshold(delta: ArrayLike) -> Float[Array, "..."]:
 
 
 def one_of(name: str, value: object, kinds: object) -> Any:
-    """One of the words of a type.
+    """Return a value that is one of the words of a type; refuse any other.
 
     Raises:
         ValueError: none of them.

@@ -39,7 +39,7 @@ class SideBySide(Module):
         return jnp.concatenate(parts)
 
     def each(self, u: jax.Array) -> list[tuple[Any, jax.Array]]:
-        """Pair each plant with its inputs."""
+        """Return each plant with the inputs that are its own."""
         return [(p, jnp.asarray(u)[np.array(at, int)]) for p, at in zip(self.plants, self.places, strict=True)]
 
 

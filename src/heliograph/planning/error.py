@@ -113,7 +113,7 @@ class Criterion(NamedTuple):
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
     def exact(self, p: Matrices) -> float:
-        """Number itself, not smoothed."""
+        """Return the error itself, not the smooth function that a search takes for it."""
         if self.sharpness is None:
             return self.smooth(p)[0]
         root = _root(self.weight)

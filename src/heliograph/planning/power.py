@@ -46,12 +46,12 @@ class SentPower(Module):
 
     @property
     def mean(self) -> dict[str, float]:
-        """Mean over time."""
+        """Power of each transmitter by name, the mean over time."""
         return {name: float(np.mean(power)) for name, power in self.over_time.items()}
 
     @property
     def peak(self) -> dict[str, float]:
-        """Largest mean square of any step."""
+        """Power of each transmitter by name, the largest of any step."""
         return {name: float(np.max(power)) for name, power in self.over_time.items()}
 
     @property

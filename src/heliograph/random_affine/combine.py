@@ -295,7 +295,7 @@ class Stack(AbstractCombination):
         return Stack([plain for plain, _ in parts]), Independent(noises)
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
-        """Visit each map as one part."""
+        """Visit each map as one part; return the whole as they became, and the place after it."""
         visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number(self.maps, "part")]
         return self.rebuilt(*visited), position
 

@@ -47,12 +47,12 @@ class AbstractWrapper(AbstractComposite):
 
     @property
     def outputs(self) -> int:
-        """Outputs of the part."""
+        """Length of z: that of the part."""
         return self.parts[0].outputs
 
     @property
     def inputs(self) -> int:
-        """Inputs of the part."""
+        """Length of y: that of the part."""
         return self.parts[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
@@ -67,12 +67,12 @@ class AbstractUniform(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """Outputs of each map."""
+        """Length of z: that of each of the maps."""
         return self.maps[0].outputs
 
     @property
     def inputs(self) -> int:
-        """Inputs of each map."""
+        """Length of y: that of each of the maps."""
         return self.maps[0].inputs
 
     def carry_angles(self, sent: Angles) -> Angles:

@@ -40,7 +40,7 @@ class AbstractDelayLine(AbstractWrapper):
 
     @property
     def parts(self) -> Sequence[AbstractRandomAffine]:
-        """The map of the line."""
+        """Maps that this one is made of: that of the line alone."""
         return (self.line,)
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
@@ -64,7 +64,7 @@ class DelayLine(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """The map."""
+        """The map that was given, whose input is the whole line."""
         return self.plain
 
     @property
@@ -123,7 +123,7 @@ class Delayed(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """The choice, then the link."""
+        """The map from the line of past signals to what arrives: the choice of one, then the link."""
         if not self.timestamped:
             return Series([self.delay, self.link])
         m = self.link.inputs
@@ -132,7 +132,7 @@ class Delayed(AbstractDelayLine):
 
     @property
     def past(self) -> int:
-        """The longest delay."""
+        """Longest delay in steps."""
         return max(self.times)
 
     @property
@@ -150,7 +150,7 @@ class Delayed(AbstractDelayLine):
         return f"{self.link.in_words() or DIRECT}, {late}"
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
-        """Visit the hops of the link."""
+        """Visit the hops of the link; return it as they became, and the place after them."""
         link, position = self.link.visit_hops(visit, position)
         return replace_inner_maps(self, [link, self.delay]), position
 

@@ -97,7 +97,7 @@ class ModeOutput(AbstractModal):
 
     @property
     def inputs(self) -> int:
-        """Length of what is sent."""
+        """Length of y."""
         return self.sent
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -105,7 +105,7 @@ class ModeOutput(AbstractModal):
         return ()
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
-        """Nothing: it has no transmitter."""
+        """Return the map as it is, and the place as it was: it has no transmitter."""
         return self, position
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
@@ -143,7 +143,7 @@ class OneStepLate(AbstractWrapper):
         return self.base.carry_angles(sent)
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
-        """Visit the hops of the map."""
+        """Visit the hops of the map; return it as they became, and the place after them."""
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position
 

@@ -51,7 +51,7 @@ class AbstractNoise(Module):
 
     @property
     def dimension(self) -> int:
-        """Length of the noise vector."""
+        """Length of the noise vector n."""
         return int(self.mean.shape[-1])
 
     @property
@@ -131,7 +131,7 @@ class Gaussian(AbstractNoise):
 
     @property
     def columns(self) -> Columns:
-        """A diag(w) A'."""
+        """Covariance A diag(w) A' as columns A with weights w."""
         return Columns(self.factor, self.weights)
 
     @property
@@ -332,7 +332,7 @@ class Shaped(AbstractNoise):
 
     @property
     def columns(self) -> Columns:
-        """B W diag(w) (B W)'."""
+        """Covariance B W diag(w) (B W)' as columns B W with weights w."""
         return self.source.columns.through(self.matrix)
 
     def list_atoms(self) -> list[NoiseAtom]:

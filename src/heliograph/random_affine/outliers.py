@@ -49,7 +49,7 @@ class StudentT(AbstractNoise):
 
     @property  # type: ignore[misc]
     def covariance(self) -> Square:  # type: ignore[override]
-        """The scale times nu / (nu - 2).
+        """Covariance of the noise: the scale times nu / (nu - 2).
 
         Raises:
             ValueError: at most 2 degrees.

@@ -37,12 +37,12 @@ class Rotation(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """Always two."""
+        """Length of z: always two, real and imaginary part."""
         return 2
 
     @property
     def inputs(self) -> int:
-        """Always two."""
+        """Length of y: always two, real and imaginary part."""
         return 2
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -61,7 +61,7 @@ class Rotation(AbstractRandomAffine):
         return Moments(matrix.real, 2, 2, order)
 
     def visit_hops(self, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
-        """Nothing: it has no transmitter."""
+        """Return the map as it is, and the place as it was: it has no transmitter."""
         return self, position
 
     def mean_gain(self) -> AbstractRandomAffine:

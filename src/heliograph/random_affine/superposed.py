@@ -76,7 +76,7 @@ class Superposed(AbstractCombination):
 
     @property
     def outputs(self) -> int:
-        """Outputs of each map."""
+        """Length of z: that of each map, as they add up."""
         return self.noise.dimension
 
     @property

@@ -61,7 +61,7 @@ class FreshNumbers(AbstractFresh):
 
     @property
     def announced(self) -> int:
-        """All of them."""
+        """Count of the numbers that are told: all of them."""
         return self.count
 
     def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
@@ -199,7 +199,7 @@ class Told(AbstractTold):
 
     @property
     def typical(self) -> Numbers:
-        """The example given."""
+        """The numbers of a typical message: the example that was given."""
         return self.example
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
@@ -267,7 +267,7 @@ class PilotedHop(AbstractHop, AbstractTold):
 
     @property
     def typical(self) -> Numbers:
-        """The mean gain."""
+        """The number that is told in a typical message: the mean gain."""
         numbers: Numbers = library(self.memory.law).stack([self.memory.law.moment(1)])
         return numbers
 

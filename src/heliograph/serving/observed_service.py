@@ -60,7 +60,7 @@ class Watches(Protocol):
     lock: Lock
 
     def taking(self) -> AbstractContextManager[None]:
-        """Hold the lock for a batch."""
+        """Return what holds the lock while a batch is taken."""
 
     def note(self, outputs: Sequence[Output], last: Taken | None) -> None:
         """Record the outputs and statistics of a batch."""

@@ -223,11 +223,11 @@ class HasNodes(Protocol):
 
     @property
     def plant(self) -> AnyPlant:
-        """Plant of all nodes."""
+        """Plant that all nodes of the network observe."""
 
     @property
     def nodes(self) -> dict[str, Node | ReceivingNode]:
-        """Nodes by name."""
+        """Nodes of the network by name."""
 
     @property
     def fused(self) -> dict[str, Fusion | AbstractFilter]:

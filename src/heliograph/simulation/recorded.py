@@ -281,7 +281,7 @@ class NetworkRows(Recursion):
     filters: AllFilters
 
     def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
-        """Step all filters."""
+        """Step all filters over one row; return their states and what is recorded of them."""
         z, u = row
         return self.filters.step(state, z, jnp.asarray(u), jnp.asarray(k), {})
 

@@ -94,7 +94,7 @@ class AbstractSmoothing(Module):
 
 @compile_on_call
 def _sweep_compiled(smoothing: AbstractSmoothing, steps: SmootherStep) -> Estimate:
-    """Compiled body of `AbstractSmoothing.estimates`."""
+    """Go back over all steps; return the smoothed estimates: compiled body of `AbstractSmoothing.estimates`."""
     return smoothing.sweep(steps)
 
 

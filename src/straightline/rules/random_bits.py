@@ -97,7 +97,7 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _hash(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Hash words (...)."""
+    """Hash words (...) with Threefry; return both words of each pair."""
     shape = result_shape(equation)
     items = zip(*broadcast(inputs, shape), strict=True)
     keys = [_new_key(lowering.graph, Key(first, second), high, low) for first, second, high, low in items]

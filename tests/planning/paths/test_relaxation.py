@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 import heliograph as hg
 from heliograph.planning import split_power
-from heliograph.planning.paths.relaxation import SplitPaths, compute_envelope, split
+from heliograph.planning.paths.relaxation import SplitPaths, compute_envelope, split_power_over_hops
 
 
 @pytest.mark.parametrize("alpha", [[1.0, 2.0], [0.3, 2.0, 0.1, 7.0]], ids=["two hops", "four hops"])
@@ -42,7 +42,7 @@ def test_the_envelope_is_concave_above_and_touches():
     alpha[0, 0, 1:], alpha[0, 1, 2] = 0.0, 0.0  # one hop, two hops, three and three
     whole = SplitPaths(full, full * draws.uniform(0.3, 0.95, (1, 4)), alpha)
     bound, x = compute_envelope(whole, np.full((1, 4), 200.0)), np.linspace(0, 200, 801)
-    exact = np.array([split(whole, np.full((1, 4), p)).information[0] for p in x])
+    exact = np.array([split_power_over_hops(whole, np.full((1, 4), p)).information[0] for p in x])
     above = np.array([bound.information(np.full((1, 4), p))[0][0] for p in x])
     assert np.all(above >= exact * (1 - 1e-12)) and np.all(np.diff(above, 2, axis=0) <= 1e-12)
     steepest = np.max(exact[1:] / x[1:, None], axis=0)[1:]

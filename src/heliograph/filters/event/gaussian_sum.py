@@ -135,7 +135,7 @@ def merge_groups(parts: GaussianSum, groups: int = 1) -> GaussianSum:
 
 @partial(jax.jit, static_argnames="groups")
 def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
-    """Compiled body of `merge_groups`."""
+    """Merge the components of each group into one Gaussian: compiled body of `merge_groups`."""
 
     def merge_group(parts: GaussianSum) -> GaussianSum:
         total = log_total(parts.log_weight)

@@ -38,7 +38,7 @@ class PredictedMeasurement(NamedTuple):
 
     @property
     def columns(self) -> Columns:
-        """Cov t."""
+        """Columns whose weighted products are Cov t."""
         return join_columns(Columns(self.slopes, self.prior.variances), self.noise)
 
 

@@ -59,7 +59,7 @@ class Signal(NamedTuple):
 
     @property
     def cross(self) -> jax.Array:
-        """Cov(x, y) (n, p)."""
+        """Cross-covariance Cov(x, y) (n, p) of state and signal."""
         return jnp.asarray((self.prior.root * self.prior.variances) @ self.slopes.T)
 
     def about_mean(self) -> "Signal":

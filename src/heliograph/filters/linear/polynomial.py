@@ -172,7 +172,7 @@ class PolynomialFilter(AbstractSizedFilter):
         return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute the inner filter."""
+        """Return the same filter with all of the inner one precomputed that no data change."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
 
     def with_past(self, steps: SmootherStep) -> AbstractFilter:

@@ -62,7 +62,7 @@ class MergeAll(AbstractMerging):
         return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ rows, axis=0))
 
     def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Each mode moves the one mixture."""
+        """Return which mixture each predicted component was and which mode moved it: each mode moves one."""
         return np.zeros(modes, int), np.arange(modes)
 
 
@@ -121,7 +121,7 @@ class MergePairs(AbstractMerging):
         return weight, self._by_mode((jnp.sum(weight, axis=0)[:, None] * rows).reshape(-1), modes)
 
     def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Each mode moves what ended in each mode."""
+        """Return which mixture each predicted component was and which mode moved it: each mode moves all."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
     def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:

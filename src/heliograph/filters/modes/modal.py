@@ -147,7 +147,7 @@ class ModalFilter(AbstractJointModalFilter):
     @in_float64
     def init(self) -> ModalBelief:
         """Return the prior, independent of the mode."""
-        law, (prior, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
+        law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)
         moments, centre = law[:, None, None] * second, jnp.asarray(at(self.plant, 0).initial_mean)
         return ModalBelief(prior, moments, centre, jnp.asarray(False))
 
@@ -296,7 +296,7 @@ def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Arra
     return measure, pad_with_zeros(jnp.asarray(sensor.noise.covariance))
 
 
-def prior_of_modes(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
+def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
     """Return the law of zeta at the start, and E[x~ x~'].
 
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.

@@ -48,7 +48,7 @@ class ModeObservedBelief(NamedTuple):
 
     @property
     def gaussian(self) -> Gaussian:
-        """The state given the data."""
+        """Law of the state given the data."""
         return self.belief.gaussian
 
 

@@ -82,7 +82,7 @@ class HasPatterns(Protocol):
 
     @property
     def present(self) -> Bool[Array, "A m"]:
-        """Which components arrive."""
+        """Which components of z arrive in each pattern."""
 
     @property
     def chance(self) -> Float[Array, "M A"]:

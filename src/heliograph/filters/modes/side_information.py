@@ -79,7 +79,7 @@ class SideInformationBelief(NamedTuple):
 
     @property
     def covariance(self) -> Float[jax.Array, "N N"]:
-        """E[e e' | side information]."""
+        """Second moment E[e e' | side information] of the error."""
         return self.errors.covariance
 
 

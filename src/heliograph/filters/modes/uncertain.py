@@ -21,11 +21,11 @@ from heliograph.filters.modes.modal import (
     centred_measurement,
     centred_transition,
     claim_of_modes,
+    compute_initial_moments,
     concatenate_modes,
     mean_from_centre,
     observe_modes,
     predict_by_mode,
-    prior_of_modes,
     rounding_of_received,
     separate_modes,
     subtract_mean_output,
@@ -67,7 +67,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
     @in_float64
     def init(self) -> UncertainBelief:
         """Return the prior, independent of the mode, whose initial law is known."""
-        law, (prior, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
+        law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)
         centre = jnp.asarray(at(self.plant, 0).initial_mean)
         return UncertainBelief(prior, second, centre, law, law, law, jnp.asarray(False))
 

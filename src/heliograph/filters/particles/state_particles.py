@@ -56,7 +56,7 @@ class StateParticles(NamedTuple):
     @property
     @in_float64
     def weight(self) -> jax.Array:
-        """Weights (N,), which sum to 1."""
+        """Weights (N,) of the particles, which sum to 1."""
         return jax.nn.softmax(self.log_weight)
 
     @property

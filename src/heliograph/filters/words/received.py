@@ -51,7 +51,7 @@ class LinkOfBits(Module):
 
     def pairs(self, received: Pairs) -> list[Pairs]:
         """Return for each combination what the received bits say of those that were sent, (components, bits, 2)."""
-        return [send_back(link, received) for link in self.links]
+        return [infer_sent_bits(link, received) for link in self.links]
 
 
 def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
@@ -118,7 +118,7 @@ def _fix_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractRandomAf
     ]
 
 
-def send_back(link: AbstractRandomAffine, received: Pairs) -> Pairs:
+def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
     """Return the likelihoods of the bits that went into a link, from those of the bits that came out.
 
     A bit that may have been flipped: l(s) = (1 - p) l'(s) + p l'(-s); one that was copied: the product; one that
@@ -138,14 +138,14 @@ def send_back(link: AbstractRandomAffine, received: Pairs) -> Pairs:
             return jnp.stack(into)
         case Series():
             for part in reversed(link.maps):
-                received = send_back(part, received)
+                received = infer_sent_bits(part, received)
             return received
         case Stack():
             ends = np.cumsum([part.outputs for part in link.maps])[:-1]
             pieces = zip(link.maps, jnp.split(received, ends), strict=True)
-            return _multiply([send_back(part, piece) for part, piece in pieces], ())
+            return _multiply([infer_sent_bits(part, piece) for part, piece in pieces], ())
         case Erasure():
-            return send_back(link.base, received)
+            return infer_sent_bits(link.base, received)
     raise refuse_link(type(link).__name__)
 
 

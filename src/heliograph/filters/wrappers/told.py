@@ -28,7 +28,7 @@ from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believing
 from heliograph.model.sensor import AnySensor
-from heliograph.model.told import take_apart
+from heliograph.model.told import separate_told
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
@@ -179,7 +179,7 @@ class ToldFilter(AbstractSizedFilter):
 
     @property
     def _optional(self) -> jax.Array:
-        """Which numbers may be missing."""
+        """Which of the numbers that are told may be missing (numbers,)."""
         return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in told_maps(first(self.link))])
 
     def _filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
@@ -215,12 +215,12 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state, or leave open
     what is not drawn anew with each message.
     """
-    link = at_each_step(lambda channel: made_certain(take_apart(channel).link), channel)
+    link = at_each_step(lambda channel: made_certain(separate_told(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
     if any(affine.reservation for affine in told_maps(first(link))):
         claim = weakest([claim, "nominal"])
-    _, values, numbers = take_apart(first(channel))
+    _, values, numbers = separate_told(first(channel))
     filter = ToldFilter(
         base=base,
         plant=plant,
@@ -256,7 +256,7 @@ def takes_told(make: Callable[P, F]) -> Callable[P, F]:
     def build(*args: P.args, **kwargs: P.kwargs) -> F:
         given = parameters.bind(*args, **kwargs).arguments
         channel = given.get("channel")
-        if not isinstance(first(channel), AbstractRandomAffine) or not take_apart(first(channel)).numbers:
+        if not isinstance(first(channel), AbstractRandomAffine) or not separate_told(first(channel)).numbers:
             return make(*args, **kwargs)
         plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
         return cast(F, build_told_filter(plant, sensor, link, MakeFilter(make, given)))

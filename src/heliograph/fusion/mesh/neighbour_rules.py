@@ -51,7 +51,7 @@ class TraceIntersection(AbstractIntersection):
         return trace_shares(believed, self.power, self.improvements)[0]
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Intersect what arrived."""
+        """Find the weights by which a node intersects what arrived from its neighbours."""
         return intersection_weights(believed, trace_shares(believed, self.power, self.improvements))
 
 
@@ -63,7 +63,7 @@ class _NeighbourRule(AbstractFusion):
         raise self._refuse_without_neighbours()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Refused likewise."""
+        """Refuse: a fusion centre has no neighbours."""
         raise self._refuse_without_neighbours()
 
     def _refuse_without_neighbours(self) -> InputError:

@@ -84,12 +84,12 @@ class Evaluation(NamedTuple):
 
     @property
     def total(self) -> Float[np.ndarray, " points"]:
-        """Log-likelihoods of all data."""
+        """Log-likelihood of all data at each point."""
         return np.asarray(self.density.sum(axis=(1, 2)))
 
     @property
     def gradient(self) -> Float[np.ndarray, "points p"]:
-        """Scores of all data."""
+        """Gradient of the log-likelihood of all data at each point."""
         return np.asarray(self.score.sum(axis=(1, 2)))
 
 

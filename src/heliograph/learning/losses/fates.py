@@ -36,7 +36,7 @@ class BetweenArrivals(np.ndarray):
 
     @staticmethod
     def of(fates: np.ndarray) -> "BetweenArrivals":
-        """Mark fates (packets,)."""
+        """Return the fates (packets,), marked as those between arrivals."""
         marked = fates.view(BetweenArrivals)
         marked.chosen = True
         return marked

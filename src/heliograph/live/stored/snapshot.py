@@ -63,7 +63,7 @@ HEAD = "head"
 
 
 def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Serialise a head and arrays."""
+    """Return a head and arrays as bytes."""
     file = BytesIO()
     written = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
     np.savez(file, allow_pickle=False, **{HEAD: written, **arrays})

@@ -18,7 +18,7 @@ class Flat(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Length of a row."""
+        """Length of a row: how many numbers the tree holds."""
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def tree(self, rows: jax.Array | np.ndarray) -> PyTree:

@@ -60,17 +60,17 @@ class Numbers(NamedTuple):
 
     @property
     def start(self) -> Vector:
-        """Start of a search."""
+        """Values of all free numbers at which a search starts."""
         return np.concatenate([number.start.ravel() for number in self.by_name.values()])
 
     @property
     def low(self) -> Vector:
-        """Least values."""
+        """Least values of all free numbers."""
         return np.concatenate([number.low.ravel() for number in self.by_name.values()])
 
     @property
     def high(self) -> Vector:
-        """Largest values."""
+        """Largest values of all free numbers."""
         return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
     def named(self, x: Array) -> dict[str, Any]:
@@ -232,7 +232,7 @@ class Point(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Error as it is made small."""
+        """Return the error that the search makes small, at these numbers."""
         return self.criterion.smooth(self.covariances)[0]
 
     @property

@@ -80,7 +80,7 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
     if power and not 1 / LARGEST <= power <= LARGEST:
         raise fail("total power", f"0, or a number from {1 / LARGEST:g} to {LARGEST:g}", f"{power:g}")
     unit = np.ones((1, 1))
-    return np.asarray(split(SplitPaths(unit, 0 * unit, noise[None, None]), power * unit).powers[0, 0])
+    return np.asarray(split_power_over_hops(SplitPaths(unit, 0 * unit, noise[None, None]), power * unit).powers[0, 0])
 
 
 def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
@@ -93,7 +93,7 @@ def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
     return noise
 
 
-def split(whole: SplitPaths, total: PathValues) -> Split:
+def split_power_over_hops(whole: SplitPaths, total: PathValues) -> Split:
     """Return the best split of each path's power: one multiplier l for its hops, by Newton's method for log l."""
     alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]
     hops = (alpha > 0).sum(axis=-1)
@@ -142,7 +142,7 @@ class Envelope(NamedTuple):
 
     def information(self, total: PathValues) -> tuple[PathValues, PathValues]:
         """Return the envelope and its slope at these powers of the paths."""
-        exact = split(self.whole, total)
+        exact = split_power_over_hops(self.whole, total)
         on_ray = total < self.touch
         return np.where(on_ray, self.ray * total, exact.information), np.where(on_ray, self.ray, exact.slope)
 
@@ -161,6 +161,6 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
         low, high = np.where(rises, middle, low), np.where(rises, high, middle)
     touch = np.where(hops > 1, _split_at_multiplier(alpha, low[..., None])[0].sum(axis=-1), 0.0)
     touch = np.minimum(touch, cap)
-    there = split(whole, touch)
+    there = split_power_over_hops(whole, touch)
     ray = np.divide(there.information, touch, out=np.zeros_like(touch), where=touch > 0)
     return Envelope(whole, touch, ray)

@@ -38,7 +38,7 @@ class Rayleigh(AbstractLaw):
         return jnp.log(g) - jnp.square(g / self.scale) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """From 0 to 9 scales."""
+        """Interval that holds nearly all of the law: from 0 to 9 scales."""
         return 0.0, 9 * self.scale
 
 
@@ -75,7 +75,7 @@ class Rician(AbstractLaw):
         return jnp.log(g) - jnp.square((g - sight) / scale) / 2 + jnp.log(bessel)
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Within 9 scales of the line of sight."""
+        """Interval that holds nearly all of the law: within 9 scales of the line of sight."""
         return library(self.sight, self.scale).maximum(self.sight - 9 * self.scale, 0.0), self.sight + 9 * self.scale
 
 
@@ -169,6 +169,6 @@ class LogNormal(AbstractLaw):
         return -jnp.log(g) - jnp.square((jnp.log(g) - self.log_mean) / self.log_deviation) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Within 9 deviations of the logarithm."""
+        """Interval that holds nearly all of the law: within 9 deviations of its logarithm."""
         xp = library(self.log_mean, self.log_deviation)
         return xp.exp(self.log_mean - 9 * self.log_deviation), xp.exp(self.log_mean + 9 * self.log_deviation)

@@ -118,7 +118,7 @@ class Constant(AbstractLaw):
 
     @property
     def constant(self) -> Scalar:
-        """The value."""
+        """The one value that the gain has."""
         return self.value
 
     def sample(self, key: jax.Array) -> jax.Array:

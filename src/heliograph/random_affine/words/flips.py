@@ -41,17 +41,17 @@ class Flips(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """Number of words."""
+        """Length of z: one number for each word."""
         return self.dimension
 
     @property
     def inputs(self) -> int:
-        """Number of words."""
+        """Length of y: one number for each word."""
         return self.dimension
 
     @property
     def gain(self) -> Constant | Discrete:
-        """Law of g = 1 - 2p."""
+        """Law of the gain g = 1 - 2p, p the probability that a bit is flipped."""
         if isinstance(self.error, Constant):
             return Constant(1 - 2 * self.error.value)
         return Discrete(1 - 2 * self.error.values, self.error.probabilities)
@@ -102,12 +102,12 @@ class BitFlips(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """All numbers of all words."""
+        """Length of z: all bits of all words, and what stands beside them."""
         return self.dimension * (self.bits + self.beside)
 
     @property
     def inputs(self) -> int:
-        """All numbers of all words."""
+        """Length of y: that of z."""
         return self.outputs
 
     def sample(self, key: jax.Array) -> jax.Array:

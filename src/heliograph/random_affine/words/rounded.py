@@ -75,7 +75,7 @@ class Rounded(AbstractNoise):
 
     @property  # type: ignore[misc]
     def mean(self) -> Vector:  # type: ignore[override]
-        """E v - centre."""
+        """Mean of the sensor's noise v less the centre."""
         mean: Vector = self.source.mean - self.centre
         return mean
 
@@ -87,7 +87,7 @@ class Rounded(AbstractNoise):
 
     @property
     def columns(self) -> Columns:
-        """Those of v, and of e."""
+        """Covariance as columns: those of v, then those of the rounding error e."""
         return self._with_error(LARGEST[self.dither].error * self.step**2)
 
     @property
@@ -147,7 +147,7 @@ class Rounded(AbstractNoise):
         return jnp.clip(share, 0.0, 0.25)
 
     def _squares(self) -> Square:
-        """diag(D^2)."""
+        """Return diag(D^2), the squares of the steps on a diagonal."""
         xp = library(self.step)
         squares: Square = xp.asarray(self.step)[..., :, None] ** 2 * np.eye(self.dimension)
         return squares

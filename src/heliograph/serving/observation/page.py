@@ -285,7 +285,7 @@ def _read_page_file(name: str) -> str:
 
 
 def file(request: Request) -> Response:
-    """Serve a file of the page."""
+    """Return a file of the page as the answer to a request."""
     name = request.url.path.removeprefix("/")
     return Response(_read_page_file(name), media_type=KINDS[name], headers=POLICY)
 

@@ -118,7 +118,7 @@ class Watch:
 
     @contextmanager
     def taking(self) -> Iterator[None]:
-        """Hold the lock for a batch."""
+        """Hold the lock while a batch is taken, so that no page sees half of it."""
         with self.lock:
             self._begun = monotonic()
             try:

@@ -53,17 +53,17 @@ class CrossCovariances:
 
     @property
     def joint(self) -> Float[np.ndarray, "node n node n"]:
-        """Cov(e_i, e_j) of all pairs."""
+        """Covariance Cov(e_i, e_j) of all pairs of nodes' errors."""
         return np.asarray(self._sources.joint())
 
     @property
     def of_state(self) -> Float[np.ndarray, "node n n"]:
-        """Cov(e_i, x)."""
+        """Cross-covariance Cov(e_i, x) of each node's error with the state."""
         return np.asarray(self.shared @ self.state.T)
 
     @property
     def state_covariance(self) -> Float[np.ndarray, "n n"]:
-        """Cov x."""
+        """Covariance of the plant's state, Cov x."""
         return np.asarray(self.state @ self.state.T)
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:

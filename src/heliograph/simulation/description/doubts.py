@@ -18,7 +18,7 @@ from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.premises.agreement import CHANNEL, matrix_of
 from heliograph.model.sensor import AbstractSensor
-from heliograph.model.told import take_apart
+from heliograph.model.told import separate_told
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import DOUBLE
@@ -240,7 +240,7 @@ def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
 
 def _leave_out_told(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return a channel as it is once its receiver is told: what is told is no memory that it has to have."""
-    link, _, numbers = take_apart(channel)
+    link, _, numbers = separate_told(channel)
     return believe_typical(link) if numbers else channel
 
 

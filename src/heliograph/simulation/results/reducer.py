@@ -56,7 +56,7 @@ class AbstractReducer(Module, Generic[Result]):
     """
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Reduce one step of one run."""
+        """Return what remains of one step of one run."""
         raise unwritten(self, "of_step")
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
