@@ -174,6 +174,20 @@ def test_a_delay_of_no_step_is_none():
         np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-14)
 
 
+def test_what_could_not_yet_arrive_is_no_silence():
+    """Before the first message that a link can deliver, the law of x is that before any data."""
+    plant, sensor = hg.LinearPlant([[0.95]], [[0.1]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], [[0.01]])
+    item = hg.filters.late_filter(hg.event_filter(plant, sensor, hg.perfect(), hg.SendOnDelta([0.5])), 3)
+    assert item.silence_tells
+    state, variance = item.init(), 1.0
+    for k in range(3):
+        state, estimate = item.step(state, [np.nan], (), k)
+        variance = 0.95**2 * variance + 0.1
+        np.testing.assert_allclose(estimate.covariance, [[variance]], rtol=1e-12)
+    _, estimate = item.step(state, [np.nan], (), 3)
+    assert estimate.covariance[0, 0] < 0.95**2 * variance + 0.1, "what could arrive and did not is silence"
+
+
 LATE = [0.5, 0.3, 0.2]  # a relay's own delay
 RELAYS = [
     hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), N, delay=hg.Discrete([0, 1], [0.7, 0.3])),

@@ -10,11 +10,8 @@ from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
-    AbstractSizedFilter,
-    FilterAngles,
     Step,
     corrects,
-    estimates,
     predicts,
 )
 from heliograph.filters.gaussian.belief import second_moments_at_start
@@ -31,7 +28,8 @@ from heliograph.filters.gaussian.scores import (
     score_update,
 )
 from heliograph.filters.robust_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
-from heliograph.model.estimate import Estimate, Innovation
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step
 from heliograph.model.premises.premise import believing
 from heliograph.model.sensor import AbstractSensor
@@ -57,7 +55,7 @@ class AdaptiveBelief(NamedTuple):
     scale: Float[jax.Array, " m"]
 
 
-class AdaptiveFilter(AbstractSizedFilter):
+class AdaptiveFilter(AbstractWrapper):
     """Gaussian or robust filter whose noise variances are learned. Built by `adaptive_filter`.
 
     Of each component that arrived, with a_0, b_0 of the filter's own variance r = b_0 / a_0:
@@ -81,9 +79,9 @@ class AdaptiveFilter(AbstractSizedFilter):
     noise: ReceivedNoise | OverTime
     memory: Float[jax.Array | np.ndarray, ""]
 
-    def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within."""
-        return self.base.angles_used()
+    def within(self, state: AdaptiveBelief) -> Gaussian:
+        """Return the belief of the plant's state."""
+        return state.gaussian
 
     @in_float64
     def init(self) -> AdaptiveBelief:
@@ -125,12 +123,6 @@ class AdaptiveFilter(AbstractSizedFilter):
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(before.signal))
         innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
         return AdaptiveBelief(learned.state, learned.shape, learned.scale), innovation
-
-    @estimates
-    def estimate(self, state: AdaptiveBelief) -> Estimate:
-        """Return the filter's own."""
-        posterior = self.base.estimate(state.gaussian)
-        return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
         """Return the noise variances of what arrives, b / a, of one state or of several stacked."""

@@ -9,24 +9,21 @@ import numpy as np
 
 from heliograph.filters.base import (
     AbstractFilter,
-    AbstractSizedFilter,
     Step,
     corrects,
-    estimates,
     make_sizes,
-    predicts,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_sent
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise, weakest
+from heliograph.model.estimate import Claim, Innovation, lower_by_noise, weakest
 from heliograph.model.over_time import at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
 from heliograph.model.words.route import FLAG, about_centres, find_places
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
@@ -36,7 +33,7 @@ SEEN = 0.01  # share of the rms error that overload may change a claim by
 MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 
 
-class LinearWordsFilter(AbstractSizedFilter):
+class LinearWordsFilter(AbstractWrapper):
     """A linear filter of the numbers z = q' - c - E[g] d, with q' the received words and d the dithers to take off.
 
     Of a number that is no word nothing is taken.
@@ -55,16 +52,6 @@ class LinearWordsFilter(AbstractSizedFilter):
     words: tuple[int, ...] = eqx.field(static=True)
     overload: Overload
 
-    @in_float64
-    def init(self) -> PyTree:
-        """Return the state before any message."""
-        return self.base.init()
-
-    @predicts
-    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict as without words."""
-        return self.base.predict(state, u, k)
-
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct with the words that arrived, as numbers."""
@@ -73,15 +60,6 @@ class LinearWordsFilter(AbstractSizedFilter):
         value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(lacking, jnp.nan)])
         covariance = jnp.pad(innovation.covariance, ((0, lacking), (0, lacking)), constant_values=jnp.nan)
         return after, Innovation(value, covariance, innovation.log_likelihood)
-
-    @estimates
-    def estimate(self, state: PyTree) -> Estimate:
-        """Return the mean and covariance of the estimate."""
-        return self._claim(self.base.estimate(state))
-
-    def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Return the mean and covariance after step k."""
-        return self._claim(self.base.after_step(state, k))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the numbers."""
@@ -93,9 +71,6 @@ class LinearWordsFilter(AbstractSizedFilter):
         if self.received == len(self.centres):
             return values
         return values.at[np.array(self.words)].add(-jnp.asarray(self.gains) * z[len(self.centres) :])
-
-    def _claim(self, estimate: Estimate) -> Estimate:
-        return Estimate(estimate.mean, estimate.covariance, self.claim)
 
 
 def build_behind_words(

@@ -9,11 +9,8 @@ import jax.numpy as jnp
 
 from heliograph.factors.gaussian import Gaussian, correct_by_gain
 from heliograph.filters.base import (
-    AbstractSizedFilter,
-    FilterAngles,
     Step,
     corrects,
-    estimates,
     make_sizes,
     predicts,
 )
@@ -23,13 +20,14 @@ from heliograph.filters.gaussian.signal import innovation_covariance, make_recei
 from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import at, first
+from heliograph.model.estimate import Innovation
+from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import nearest, wrap_angles
+from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import eigh
@@ -55,7 +53,7 @@ class ClockBelief(NamedTuple):
     observed: Bool[jax.Array, " clocks"]
 
 
-class ClockFilter(AbstractSizedFilter):
+class ClockFilter(AbstractWrapper):
     """A Gaussian filter of a plant with clocks, in which a clock that cannot be observed is considered, not estimated.
 
     An offset o enters as y - o dy/dt. It is observable against another clock on the same plant, and while the plant
@@ -77,9 +75,9 @@ class ClockFilter(AbstractSizedFilter):
     base: GaussianFilter
     offsets: tuple[int, ...] = eqx.field(static=True)
 
-    def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within."""
-        return self.base.angles_used()
+    def within(self, state: ClockBelief) -> Gaussian:
+        """Return the belief of plant and clocks."""
+        return state.gaussian
 
     @in_float64
     def init(self) -> ClockBelief:
@@ -152,12 +150,6 @@ class ClockFilter(AbstractSizedFilter):
 
         _, squares = jax.lax.scan(add_derivative, (state.gaussian.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
-
-    @estimates
-    def estimate(self, state: ClockBelief) -> Estimate:
-        """Return the mean and covariance of the belief, angles between -pi and pi."""
-        x = state.gaussian
-        return Estimate(wrap_angles(x.mean, first(self.base.plant).angles), x.covariance, self.claim)
 
 
 def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:

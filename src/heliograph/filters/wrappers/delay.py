@@ -13,8 +13,6 @@ import numpy as np
 from heliograph.factors.columns import Columns
 from heliograph.filters.base import (
     AbstractFilter,
-    AbstractSizedFilter,
-    FilterAngles,
     Step,
     corrects,
     estimates,
@@ -25,6 +23,7 @@ from heliograph.filters.gaussian.signal import link_noise
 from heliograph.filters.linear.belief import LinearBelief, PlantMotion, predict_belief
 from heliograph.filters.linear.plan import PlannedFilter, plan_filter
 from heliograph.filters.modes.patterns import append_flag
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_link, delayed
 from heliograph.model.enlarged.bias import driven_by
 from heliograph.model.enlarged.past import with_past
@@ -43,38 +42,7 @@ from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 
-class AbstractPartFilter(AbstractSizedFilter):
-    """Filter that estimates the first states of those of `base`, which it predicts and corrects."""
-
-    base: eqx.AbstractVar[AbstractFilter]
-
-    @in_float64
-    def init(self) -> PyTree:
-        """Return the larger filter's initial state."""
-        return self.base.init()
-
-    @predicts
-    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict with the larger filter."""
-        return self.base.predict(state, u, k)
-
-    @corrects
-    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the larger filter."""
-        return self.base.correct(state, z, k)
-
-    @estimates
-    def estimate(self, state: PyTree) -> Estimate:
-        """Return the mean and covariance of the first states."""
-        return self._select_first_states(self.base.estimate(state))
-
-    def _select_first_states(self, whole: Estimate) -> Estimate:
-        """Select mean and covariance of the first states."""
-        n = len(self.states)
-        return Estimate(whole.mean[..., :n], whole.covariance[..., :n, :n], self.claim)
-
-
-class PartFilter(AbstractPartFilter):
+class PartFilter(AbstractWrapper):
     """A filter of a larger system that estimates its first states alone. Built by `part_filter`."""
 
     base: AbstractFilter
@@ -82,15 +50,6 @@ class PartFilter(AbstractPartFilter):
     def __init__(self, base: AbstractFilter, states: int):
         self.base, self.claim, self.states = base, base.claim, base.states[:states]
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
-
-    def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the larger filter among its first states."""
-        angles = self.base.angles_used()
-        return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
-
-    def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Return the mean and covariance of the first states after step k."""
-        return self._select_first_states(self.base.after_step(state, k))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Plan the larger filter, and keep the rows of its plan that belong to the first n states."""
@@ -121,7 +80,7 @@ def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
     return PartFilter(filter, states)
 
 
-class HeldFilter(AbstractPartFilter):
+class HeldFilter(AbstractWrapper):
     """Best linear filter of (x, past signals of the sensor, past received signals of each relay).
 
     Each line of past signals is as long as its values may still be received. At each step relay i receives r = G l + n
@@ -217,7 +176,7 @@ class LateState(NamedTuple):
     step: Int[jax.Array, ""]
 
 
-class LateFilter(AbstractSizedFilter):
+class LateFilter(AbstractWrapper):
     """A filter behind a link with constant delay d: it filters at time k - d and predicts d steps ahead.
 
     This is the best linear filter with the past as states, without its cost. Built by `late_filter`.
@@ -229,10 +188,6 @@ class LateFilter(AbstractSizedFilter):
     def __init__(self, base: AbstractFilter, delay: int):
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
         self.inputs, self.received = base.inputs, base.received
-
-    def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within."""
-        return self.base.angles_used()
 
     @in_float64
     def init(self) -> LateState:
@@ -257,12 +212,10 @@ class LateFilter(AbstractSizedFilter):
     def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
         """Correct with what was sent at step k - delay; values received before the first signal say nothing."""
         then = jnp.asarray(k) - self.delay
-        observed = jnp.where(then >= 0, jnp.asarray(z), jnp.nan)
-        step = jnp.maximum(then, 0)
-        base, innovation = self.base.correct(state.base, observed, step)
-        _, early = self.base.correct(state.base, z, step)
-        published = jax.tree.map(lambda now, before: jnp.where(then >= 0, now, before), innovation, early)
-        return state._replace(base=base), Innovation(published.value, published.covariance, innovation.log_likelihood)
+        after, innovation = self.base.correct(state.base, z, jnp.maximum(then, 0))
+        base = jax.tree.map(lambda new, old: jnp.where(then >= 0, new, old), after, state.base)
+        likelihood = jnp.where(then >= 0, innovation.log_likelihood, 0.0)
+        return state._replace(base=base), Innovation(innovation.value, innovation.covariance, likelihood)
 
     @estimates
     def estimate(self, state: LateState) -> Estimate:
@@ -274,6 +227,10 @@ class LateFilter(AbstractSizedFilter):
         if not self.delay:
             return self.base.estimate(state.base)
         return self.base.estimate(jax.lax.fori_loop(0, self.delay, move, jax.tree.map(jnp.asarray, state.base)))
+
+    def after_step(self, state: LateState, k: Step) -> Estimate:
+        """Return the prediction over the last `delay` steps."""
+        return self.estimate(state)
 
 
 def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
@@ -297,7 +254,7 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
     return believing(late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel)))
 
 
-class KnownDelayFilter(AbstractPartFilter):
+class KnownDelayFilter(AbstractWrapper):
     """The best linear filter behind a link with time stamps: the delay of each value is its last received component.
 
     It estimates the past signals as well, so that a signal received twice counts once, with two channel noises: joint

@@ -8,11 +8,8 @@ import jax.numpy as jnp
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
-    AbstractSizedFilter,
-    FilterAngles,
     Step,
     corrects,
-    estimates,
     predicts,
 )
 from heliograph.filters.gaussian.belief import second_moments_at_start
@@ -20,9 +17,10 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal,
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.centred import predict_signal
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
+from heliograph.model.estimate import Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import AnyPlant
@@ -40,7 +38,7 @@ class BeliefAndPrior(NamedTuple):
     prior: Gaussian
 
 
-class PredictionFilter(AbstractSizedFilter):
+class PredictionFilter(AbstractWrapper):
     """A Gaussian filter whose estimate at step k is made before z_k is used: from z_0 ... z_k-1.
 
     Mean and covariance are those of f(x, u) + w; z_k is used for the next step. Built by `prediction_of`.
@@ -52,9 +50,9 @@ class PredictionFilter(AbstractSizedFilter):
         self.base, self.claim = base, base.claim
         self.states, self.inputs, self.received, self.kept = base.states, base.inputs, base.received, base.kept
 
-    def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within."""
-        return self.base.angles_used()
+    def within(self, state: BeliefAndPrior) -> Gaussian:
+        """Return the prediction, which is the estimate."""
+        return state.prior
 
     @in_float64
     def init(self) -> BeliefAndPrior:
@@ -72,11 +70,6 @@ class PredictionFilter(AbstractSizedFilter):
         """Correct the belief for the next step; the estimate stays the prediction."""
         belief, innovation = self.base.correct(state.belief, z, k)
         return BeliefAndPrior(belief, state.prior), innovation
-
-    @estimates
-    def estimate(self, state: BeliefAndPrior) -> Estimate:
-        """Return the mean and covariance of the prediction."""
-        return self.base.estimate(state.prior)
 
 
 def prediction_of(filter: AbstractFilter) -> PredictionFilter:
@@ -104,7 +97,7 @@ class FedBackBelief(NamedTuple):
     reference: Float[jax.Array, " m"]
 
 
-class FedBackFilter(AbstractSizedFilter):
+class FedBackFilter(AbstractWrapper):
     """Filter whose estimate is fed back to the sensor: z = G (y - r) + n with r = h(f(xhat, u)), which both compute.
 
     y - r has the mean E[y] - r, zero for a linear model, and the covariance of the innovation: that alone costs power,
@@ -119,6 +112,10 @@ class FedBackFilter(AbstractSizedFilter):
     """
 
     base: GaussianFilter
+
+    def within(self, state: FedBackBelief) -> Gaussian:
+        """Return the belief of the plant's state."""
+        return state.gaussian
 
     def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
         """Reference r subtracted from y at step k, from the estimate after step k - 1 and the input over step k."""
@@ -150,11 +147,6 @@ class FedBackFilter(AbstractSizedFilter):
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
         after, innovation = correct_signal(sent, at(base.channel, k), base.rule, jnp.asarray(z))
         return FedBackBelief(after, state.reference), innovation
-
-    @estimates
-    def estimate(self, state: FedBackBelief) -> Estimate:
-        """Return the mean and covariance of the belief."""
-        return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
 
 @believes

@@ -12,22 +12,19 @@ import numpy as np
 
 from heliograph.filters.base import (
     AbstractFilter,
-    AbstractSizedFilter,
-    FilterAngles,
     Step,
     corrects,
-    estimates,
     make_sizes,
     predicts,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believing
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -43,7 +40,7 @@ class StateUnderInputs(NamedTuple):
     u: jax.Array | np.ndarray
 
 
-class FilterOfInputs(AbstractSizedFilter):
+class FilterOfInputs(AbstractWrapper):
     """A filter whose sensor is at each step the one that the inputs give.
 
     Given the inputs the sensor varies in a known way, as one over time does: the claim is that of the filter within.
@@ -57,6 +54,10 @@ class FilterOfInputs(AbstractSizedFilter):
     base: AbstractFilter
     plant: AnyPlant
     sensor: AnySensor
+
+    def within(self, state: StateUnderInputs) -> PyTree:
+        """Return the state of the filter within."""
+        return state.base
 
     @in_float64
     def init(self) -> StateUnderInputs:
@@ -75,38 +76,10 @@ class FilterOfInputs(AbstractSizedFilter):
         after, innovation = self._filter_under(state.u, k).correct(state.base, jnp.asarray(z), k)
         return state._replace(base=after), innovation
 
-    @estimates
-    def estimate(self, state: StateUnderInputs) -> Estimate:
-        """Return the mean and covariance of the estimate."""
-        return self.base.estimate(state.base)
-
-    def after_step(self, state: StateUnderInputs, k: Step) -> Estimate:
-        """Return the mean and covariance after step k."""
-        return self.base.after_step(state.base, k)
-
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the sensor under the inputs of this step."""
         filter = self._filter_under(jnp.asarray(step.u), step.k)
-        return filter.smoother_step(step.map_states(lambda state: state.base))
-
-    @property
-    def attitude(self) -> Angles:
-        """Return the places of attitudes among the states of the filter within."""
-        return self.base.attitude
-
-    def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the filter within."""
-        return self.base.angles_used()
-
-    @property
-    def of_atoms(self) -> bool:
-        """As the filter within."""
-        return self.base.of_atoms
-
-    @property
-    def silence_tells(self) -> bool:
-        """As the filter within."""
-        return self.base.silence_tells
+        return filter.smoother_step(step.map_states(self.within))
 
     def _filter_under(self, u: Array, k: Step) -> AbstractFilter:
         now = at(self.sensor, k).under(self.inputs, u)

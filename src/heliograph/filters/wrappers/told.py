@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Callable
-from dataclasses import replace
 from functools import wraps
 from typing import ParamSpec, TypeVar, cast
 
@@ -13,17 +12,15 @@ import numpy as np
 
 from heliograph.filters.base import (
     AbstractFilter,
-    AbstractSizedFilter,
     FilterAngles,
     Step,
     corrects,
-    estimates,
     make_sizes,
-    predicts,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Estimate, Innovation, weakest
+from heliograph.model.estimate import Innovation, weakest
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believing
@@ -55,7 +52,7 @@ class MakeFilter(Module):
         return self.function(plant=plant, sensor=sensor, channel=channel, **self.arguments)
 
 
-class ToldFilter(AbstractSizedFilter):
+class ToldFilter(AbstractWrapper):
     """The filter that `make` builds, for each message behind the link whose law its numbers give.
 
     Between messages all such filters are one: how a state moves depends on the plant, not on the link. A value is not
@@ -79,16 +76,6 @@ class ToldFilter(AbstractSizedFilter):
     values: tuple[int, ...] = eqx.field(static=True)
     numbers: tuple[int, ...] = eqx.field(static=True)
 
-    @in_float64
-    def init(self) -> PyTree:
-        """Return the state before any message."""
-        return self.base.init()
-
-    @predicts
-    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict as without what is told."""
-        return self.base.predict(state, u, k)
-
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct by the filter of the law that the numbers of the message give."""
@@ -107,15 +94,6 @@ class ToldFilter(AbstractSizedFilter):
             weight = jnp.full(received, jnp.nan).at[values_at].set(weight)
         return after, Innovation(value, covariance, innovation.log_likelihood, weight)
 
-    @estimates
-    def estimate(self, state: PyTree) -> Estimate:
-        """Return the mean and covariance of the estimate."""
-        return self._claim(self.base.estimate(state))
-
-    def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Return the mean and covariance after step k."""
-        return self._claim(self.base.after_step(state, k))
-
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the law that was told."""
         values, numbers = self._split(jnp.asarray(step.z))
@@ -131,16 +109,6 @@ class ToldFilter(AbstractSizedFilter):
         """Return the angles of the filter within, at their rows; what is told is none."""
         angles = self.base.angles_used()
         return angles and angles._replace(received=tuple(self.values[i] for i in angles.received))
-
-    @property
-    def of_atoms(self) -> bool:
-        """As the filter within."""
-        return self.base.of_atoms
-
-    @property
-    def silence_tells(self) -> bool:
-        """As the filter within."""
-        return self.base.silence_tells
 
     @property
     def knows_gain(self) -> bool:
@@ -166,9 +134,6 @@ class ToldFilter(AbstractSizedFilter):
             numbers=self.numbers,
             **sizes,
         )
-
-    def _claim(self, estimate: Estimate) -> Estimate:
-        return replace(estimate, claim=self.claim)
 
     def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Values and numbers of a message; no value where a number is missing without which it means nothing."""

@@ -1,0 +1,84 @@
+"""What filters around another filter have in common: whatever they do not change, the filter within does."""
+
+from dataclasses import replace
+
+import equinox as eqx
+
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+)
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.numerics.angle import Angles
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, PyTree
+
+
+class AbstractWrapper(AbstractSizedFilter):
+    """A filter around another, `base`, of whose states it estimates the first ones: mostly all of them.
+
+    A final class defines what it does otherwise. One that keeps more than the state of `base` says where that is, in
+    `within`, and defines `init`, `predict` and `correct`. Smoothing is not handed on: whoever changes a step says how
+    the way back changes.
+    """
+
+    base: eqx.AbstractVar[AbstractFilter]
+
+    def within(self, state: PyTree) -> PyTree:
+        """Return the state of `base` whose estimate is this filter's."""
+        return state
+
+    @in_float64
+    def init(self) -> PyTree:
+        """Return the initial state of the filter within."""
+        return self.base.init()
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Predict with the filter within."""
+        return self.base.predict(state, u, k)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Correct with the filter within."""
+        return self.base.correct(state, z, k)
+
+    @estimates
+    def estimate(self, state: PyTree) -> Estimate:
+        """Return the mean and covariance of the estimate."""
+        return self._claim_first_states(self.base.estimate(self.within(state)))
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """Return the mean and covariance after step k."""
+        return self._claim_first_states(self.base.after_step(self.within(state), k))
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return the angles of the filter within, of its states those that are estimated."""
+        angles = self.base.angles_used()
+        return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
+
+    @property
+    def attitude(self) -> Angles:
+        """Return the places of attitudes among the states that are estimated."""
+        return tuple(i for i in self.base.attitude if i < len(self.states))
+
+    @property
+    def of_atoms(self) -> bool:
+        """As the filter within."""
+        return self.base.of_atoms
+
+    @property
+    def silence_tells(self) -> bool:
+        """As the filter within."""
+        return self.base.silence_tells
+
+    def _claim_first_states(self, whole: Estimate) -> Estimate:
+        """Return mean and covariance of the first states, under this filter's own claim."""
+        n = len(self.states)
+        mean, covariance = whole.mean[..., :n], whole.covariance[..., :n, :n]
+        return replace(whole, mean=mean, covariance=covariance, claim=self.claim, attitude=self.attitude)
