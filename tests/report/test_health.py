@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -183,3 +184,38 @@ def test_how_long_a_sensor_stands_until_it_is_named():
         held = find_held_value(z, np.ones(100))
         assert (held is not None) == found
     assert held.readings == 6 and held.stuck == 8
+
+
+def test_times_in_another_unit_are_doubted():
+    """A place of a car each 20 ms: times in milliseconds make all noise of the motion a thousand times too large."""
+    rng, n, dt = np.random.default_rng(0), 600, 0.02
+    noise = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) / 2
+    plant = hg.LinearPlant(
+        lambda u: jnp.array([[1.0, u[0]], [0.0, 1.0]]),
+        lambda u: jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]]) / 2,
+        [0.0, 1.0], np.eye(2), states=["place", "speed"], inputs=["dt"],
+    )  # fmt: skip
+    sensor = hg.LinearSensor([[1.0, 0.0]], 0.04)
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)})})
+    speed, place = np.cumsum(rng.multivariate_normal(np.zeros(2), noise, n) * [0, 1], axis=0)[:, 1] + 1, 0.0
+    z = (np.cumsum(speed) * dt + place + 0.2 * rng.standard_normal(n))[:, None]
+    said = {}
+    for factor in (1.0, 1000.0):
+        u = np.full((n, 1), dt * factor)
+        said[factor] = examine(network, hg.run(network, {"a": z}, u, time=np.cumsum(u)), u).warnings()
+    assert said[1.0] == []
+    first = said[1000.0][0]
+    assert first.startswith(
+        "dt is 20 between rows, and seems to be in another unit than the plant: with a thousandth of"
+    )
+
+
+def test_what_a_node_refuses_as_stuck_is_said_to_be_refused_and_not_to_be_lost():
+    rng = np.random.default_rng(2)
+    sensor = hg.LinearSensor([[1.0]], 1.0, outputs=["y"], resolution=0.01)
+    z = np.round(np.cumsum(0.1 * rng.standard_normal(STEPS)) + rng.standard_normal(STEPS), 2)[:, None]
+    z[700:1100] = z[700]
+    node = hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(PLANT, sensor)}, stuck=True)
+    with pytest.warns(UserWarning, match="396 of 1500 values count as not arrived; row 705: y"):
+        (line,) = health_of(hg.Network(PLANT, {"a": node}), {"a": z}).warnings()
+    assert line.startswith("a: y is stuck") and line.endswith("what repeated for longer was refused")

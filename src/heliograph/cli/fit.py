@@ -124,7 +124,7 @@ def _find_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]
     None of a node that nobody knows to be due: where rows are messages, of one without a rate of its own.
     """
     from heliograph.learning.losses.fates import fates_of_measurements, fates_of_sequence
-    from heliograph.report.health import list_arrivals
+    from heliograph.report.arrivals import list_arrivals
 
     fates = fates_of_measurements(recording.measurements)
     for arrivals in list_arrivals(network, recording.time, recording.measurements):

@@ -3,14 +3,20 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
+from heliograph.model.over_time import OverTime, first
+from heliograph.model.trigger import Periodic
+from heliograph.numerics.check import InputError
 from heliograph.numerics.shares import count_independent
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.report.pattern import Pattern, find_pattern
 from heliograph.report.rate import Rate, find_rate
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 
 FEW = 8  # arrivals from which a rate of its own can be told
 NEAR = 0.25  # of a period: how far an interval may be from whole periods
@@ -33,6 +39,8 @@ class Arrivals:
         declared_period: rows between messages of a sender that says so (`Periodic`); None of others.
         stated_share: probability of arrival by the network; None where it is not one number, as in bursts.
         of_messages: whether each row is there because some node's message is, so that others are not due in it.
+        refuses: whether the node refuses values, beyond limits or stuck, which then are missing here.
+        watched: whether it refuses those that are stuck.
     """
 
     node: str
@@ -44,6 +52,8 @@ class Arrivals:
     declared_period: int | None = None
     stated_share: float | None = None
     of_messages: bool = False
+    refuses: bool = False
+    watched: bool = False
 
     @cached_property
     def rate(self) -> Rate | None:
@@ -190,3 +200,49 @@ def _clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
     if time.dtype.kind == "M":
         return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)
     return np.asarray(time, dtype=float)
+
+
+def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
+    """Return when each component arrived, by distinct times: of messages at one time each may be a row.
+
+    Args:
+        network: the network.
+        times: of the rows (time,).
+        received: by node, (time, received), NaN where nothing arrived.
+    """
+    time, row = np.unique(times, return_inverse=True)
+
+    def by_time(there: Any) -> np.ndarray:
+        came = np.zeros(len(time), dtype=bool)
+        came[row[there]] = True
+        return came
+
+    messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
+    links = []
+    for node, z in received.items():
+        receiver = network.nodes[node]
+        declared, may_be_lost, limits = None, not receiver.complete, receiver.limits
+        shares = _find_arrival_probabilities(receiver) if isinstance(receiver, Node) else None
+        if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
+            declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
+        for i, name in enumerate(receiver.received_names):
+            there = ~np.isnan(z[:, i])
+            stated = None if shares is None or i >= len(shares) else float(shares[i])
+            refuses, watched = limits is not None, limits is not None and limits.stuck is not None
+            values = time, by_time(there), z[there, i]
+            links.append(Arrivals(node, name, *values, may_be_lost, declared, stated, messages, refuses, watched))
+    return links
+
+
+def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
+    """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
+    sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
+    if not sends_always or isinstance(receiver.channel, OverTime):
+        return None
+    if receiver.channel.remembers or not receiver.channel.erases:
+        return None
+    try:
+        sets = receiver.channel.list_outcomes()
+    except InputError:  # more sets of losses than are listed
+        return None
+    return np.asarray(np.sum([float(o.probability) * o.arrived for o in sets], axis=0))

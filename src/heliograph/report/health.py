@@ -2,27 +2,25 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
-from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import TIME_STEP
-from heliograph.model.trigger import Periodic
-from heliograph.numerics.check import InputError, array, fail, instance
+from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.report.arrivals import Arrivals, rows_are_messages
+from heliograph.report.arrivals import Arrivals, list_arrivals
 from heliograph.report.compared_nodes import compare_nodes
 from heliograph.report.constant_error import ConstantError, find_constant_error
 from heliograph.report.doubts import say_apart, say_memory, say_off, say_overconfident, say_underconfident
 from heliograph.report.expected_squares import compare_squares, expect_squares
 from heliograph.report.forecasts import Forecasts
+from heliograph.report.held import HeldValue
 from heliograph.report.outputs import OutputHealth, judge_outputs_of_filter, list_listeners, weighs
+from heliograph.report.time_unit import doubt_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, whitened_innovations
 
@@ -81,6 +79,7 @@ class Health:
     predicted: Forecasts = field(default_factory=dict)  # of each row, by node and filter, where it was asked for
     off: Mapping[tuple[str, str], ConstantError] = field(default_factory=dict)  # by node and filter, where it says most
     apart: ConstantError | None = None  # of one node against the others, which filter by themselves
+    time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
@@ -89,6 +88,8 @@ class Health:
             name = f"{link.node}: {link.component}"
             if not link.arrived.any():
                 lines.append(f"{name} never arrived")
+            elif link.refuses:  # what it refused is missing
+                continue
             elif not link.may_be_lost and link.share < 1:
                 lines.append(
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
@@ -96,6 +97,7 @@ class Health:
             elif link.contradicts(FALSE / len(self.links)):
                 lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
         lines += [] if self.apart is None else [say_apart(self.apart)]
+        lines += [self.time_unit] * bool(self.time_unit)
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
     def held(self) -> dict[tuple[str, str], str]:
@@ -109,10 +111,10 @@ class Health:
             for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED)
             if health.judged.held is not None and (health.node, health.filter) in trusted
         }
+        watched = {f"{link.node}: {link.component}" for link in self.links if link.watched}
         return {
             (health.node, health.judged.output): f"{name} is stuck, or has no noise: {held}, where its "
-            "noise makes no run as long; what else is said of filters that use it may be due to that. "
-            f"stuck={held.stuck} of its node refuses what repeats for longer"
+            f"noise makes no run as long; {_say_what_to_do(held, name in watched)}"
             for name, health in stuck.items()
             if (held := health.judged.held) is not None
         }
@@ -207,6 +209,14 @@ class Health:
                 )
 
 
+def _say_what_to_do(held: HeldValue, refused: bool) -> str:
+    """Say that the rest of a run was refused, or how it would be."""
+    if refused:
+        return "what repeated for longer was refused"
+    start = "what else is said of filters that use it may be due to that. "
+    return f"{start}stuck={held.stuck} of its node refuses what repeats for longer"
+
+
 def compare_with_claim(size: float, error: float, numbers: int, level: float) -> int:
     """Return 1 or -1 where a mean square of so many numbers is off its claim by its interval and by a tenth; else 0.
 
@@ -268,7 +278,17 @@ def examine(
     )
     off = {(judged.node, judged.filter): _find_off(network, health, judged, u) for judged in health.doubted()}
     apart = None if health.held() else compare_nodes(network, record, u, FALSE)
-    return replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
+    health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
+    return replace(health, time_unit=_doubt_time_unit(network, health, u))
+
+
+def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
+    """Say that the times are in another unit, by the first filter of which something is doubtful."""
+    doubted = [(judged.node, judged.filter) for judged in health.doubted() if judged.test is not None]
+    listeners = (one for one in list_listeners(network, health.record) if (one.node, one.name) in doubted[:1])
+    found = [doubt_time_unit(f"{one.node}/{one.name}", one.filter, one.measurements, inputs, network.inputs)
+             for one in listeners]  # fmt: skip
+    return found[0] if found else ""
 
 
 def _find_off(network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray) -> ConstantError | None:
@@ -311,38 +331,6 @@ def _check_run(network: Network, record: Record) -> None:
             raise fail("record", "the run over one recording", f"estimates of shape {estimate.mean.shape}")
 
 
-def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np.ndarray]) -> list[Arrivals]:
-    """Return when each component arrived, by distinct times: of messages at one time each may be a row.
-
-    Args:
-        network: the network.
-        times: of the rows (time,).
-        received: by node, (time, received), NaN where nothing arrived.
-    """
-    time, row = np.unique(times, return_inverse=True)
-
-    def by_time(there: Any) -> np.ndarray:
-        came = np.zeros(len(time), dtype=bool)
-        came[row[there]] = True
-        return came
-
-    messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
-    links = []
-    for node, z in received.items():
-        receiver = network.nodes[node]
-        declared, may_be_lost = None, not receiver.complete
-        shares = _find_arrival_probabilities(receiver) if isinstance(receiver, Node) else None
-        if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
-            declared, may_be_lost = int(receiver.trigger.period), first(receiver.channel).erases
-        for i, name in enumerate(receiver.received_names):
-            there = ~np.isnan(z[:, i])
-            stated = None if shares is None or i >= len(shares) else float(shares[i])
-            links.append(
-                Arrivals(node, name, time, by_time(there), z[there, i], may_be_lost, declared, stated, messages)
-            )
-    return links
-
-
 def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
     """Innovations less their mean: those that count of a law with outliers to one side have one, and no memory by it.
 
@@ -372,17 +360,3 @@ def _compare_size(
     squares, means = (np.where(there, a, 0.0).sum(axis=1) / count for a in (white**2, expected))
     power, error = compare_squares(np.where(there.any(axis=1), squares, np.nan), means)
     return replace(test, power=power, power_error=error)
-
-
-def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
-    """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
-    sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
-    if not sends_always or isinstance(receiver.channel, OverTime):
-        return None
-    if receiver.channel.remembers or not receiver.channel.erases:
-        return None
-    try:
-        sets = receiver.channel.list_outcomes()
-    except InputError:  # more sets of losses than are listed
-        return None
-    return np.asarray(np.sum([float(o.probability) * o.arrived for o in sets], axis=0))
