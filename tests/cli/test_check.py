@@ -2,6 +2,7 @@
 
 import pytest
 
+import heliograph as hg
 from heliograph import cli
 from heliograph.cli.app import app
 from heliograph.cli.command import COMMANDS
@@ -42,3 +43,41 @@ def test_every_help_shows_an_example_that_the_command_takes(capsys, command, arg
     assert f"Example: heliograph {name} {arguments}" in shown
     words = arguments.partition(" | ")[0].partition(" >> ")[0].split()
     assert app.parse_args([name, *words], exit_on_error=False, print_error=False)[0] is command
+
+
+PAIR = """
+import numpy as np
+import heliograph as h
+
+plant = h.LinearPlant([[1.0, 0.5], [0.0, 0.9]], np.diag([0.01, 0.05]), [0, 0], 1.0, states=["way", "speed"])
+sensors = {"gnss": h.LinearSensor([[1.0, 0.0]], 4.0), "wheel": h.LinearSensor([[0.0, 1.0]], 0.1)}
+network = h.Network(plant, {name: h.Node(sensor, h.perfect(1), {}) for name, sensor in sensors.items()})
+"""
+
+
+def test_what_sensors_are_worth_is_a_table_of_the_function(folder, capsys):
+    (folder / "pair.py").write_text(PAIR)
+    assert cli.main(["check", "pair.py", "--without", "each", "--outage", "gnss:60"]) == 0
+    said = capsys.readouterr().out.splitlines()[-5:]
+    assert said[0].split() == ["way", "speed"]
+    scope = {}
+    exec(PAIR, scope)
+    found = hg.planning.worth_of_sensors(scope["network"], 200, ["gnss", "wheel"], {"gnss": 60})
+    for line, case in zip(said[1:], [found.complete, *found.cases], strict=True):
+        cells = [f"{e:.4g} ({times:.3g})" for e, times in zip(case.error, case.increase, strict=True)]
+        assert line.startswith(case.name) and " ".join(line.split()).endswith(" ".join(cells))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--without", "radar"], "sensor: expected one of the nodes gnss, wheel, got 'radar'"),
+        (["--outage", "gnss:300"], "outage of 'gnss': expected at most the 200 steps of the run, got 300"),
+        (["--outage", "gnss"], "--outage: expected NODE:STEPS, such as gnss:60, got 'gnss'"),
+        (["--without", "gnss", "--input", "dt"], "--input: expected NAME=VALUE, such as dt=0.5, got 'dt'"),
+        (["--without", "gnss", "--input", "dt=1"], "--input: expected one of each input of the plant, []"),
+    ],
+)
+def test_what_cannot_be_left_out_is_one_line(folder, capsys, options, said):
+    (folder / "pair.py").write_text(PAIR)
+    refused(folder, capsys, ["check", "pair.py", *options], said)

@@ -39,3 +39,8 @@ from .network_of_design import (
 from .paths.relaxation import (
     split_power as split_power,
 )
+from .sensors import (
+    ErrorWithout as ErrorWithout,
+    SensorWorth as SensorWorth,
+    worth_of_sensors as worth_of_sensors,
+)

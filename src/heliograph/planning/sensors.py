@@ -1,0 +1,198 @@
+"""What sensors are worth: the error of one filter of all nodes, with some left out, out for a while, or added."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.model.enlarged.joint import join_links
+from heliograph.model.over_time import at_each_step, first
+from heliograph.model.sensor import is_linear
+from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.check import check_count, fail, instance, items, table
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.simulate import monte_carlo
+
+
+@readable
+@dataclass(frozen=True)
+class ErrorWithout:
+    """Error of the filter of all nodes in one case.
+
+    Args:
+        name: "all", "without gnss", "gnss out for 60 steps", "with mast".
+        error: root mean square error of each state at the end (n,).
+        uncertainty: standard error of that, of the runs drawn (n,); 0 where it is computed.
+        increase: the error over that of all nodes (n,), below 1 for one that is added; NaN where that is 0.
+    """
+
+    name: str
+    error: Float[np.ndarray, " n"]
+    uncertainty: Float[np.ndarray, " n"]
+    increase: Float[np.ndarray, " n"]
+
+
+@readable
+@dataclass(frozen=True)
+class SensorWorth:
+    """Errors with all nodes, and in each case.
+
+    Args:
+        states: names of the states (n,).
+        complete: with all nodes of the network.
+        cases: each node left out, each outage, each addition, in the order asked for.
+        exact: whether errors are covariances of an exact filter, and not squares of errors that were drawn.
+    """
+
+    states: tuple[str, ...]
+    complete: ErrorWithout
+    cases: tuple[ErrorWithout, ...]
+    exact: bool
+
+
+class _Case(NamedTuple):
+    """A case: its name, and which rows of each node are used, False where a node's value is left out (steps, nodes)."""
+
+    name: str
+    used: Bool[np.ndarray, "steps nodes"]
+
+
+def worth_of_sensors(
+    network: "Network",
+    steps: int = 200,
+    without: "Sequence[str] | None" = None,
+    outages: "Mapping[str, int] | None" = None,
+    additions: "Mapping[str, Node] | None" = None,
+    runs: int = 200,
+    key: int = 0,
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+) -> "SensorWorth":
+    """Compare the error at the end of a run, of one filter of all nodes, with nodes left out, out at the end, or added.
+
+    The filter is the best linear one where plant and sensors are linear, else the cubature filter; it knows what is
+    missing. Where its claim is exact, the error is its covariance, averaged over what the links lost in the runs;
+    else the mean square of the errors drawn. All cases have the same draws, so that differences are known better than
+    errors.
+
+    Args:
+        network: the network; its own filters do not matter.
+        steps: length of a run, 200 by default; long enough to be steady where the steady error is asked for.
+        without: nodes that are left out, each by itself; by default each of several.
+        outages: for how many steps at the end of the run a node is out, by node; none by default.
+        additions: nodes that are tried beside those there are, each by itself, such as one sensor at several places;
+            none by default.
+        runs: number of runs, 200 by default.
+        key: a seed, 0 by default.
+        inputs: (steps, inputs), common to all runs; by default a plant without inputs is assumed.
+
+    Raises:
+        ValueError: a node that is not there, an outage longer than the run, an addition of a name that is taken, nodes
+            with triggers or words, relays that filter.
+    """
+    instance("network", network, Network, "a Network")
+    nodes, added = _plain_nodes(network), table("additions", additions or {}, "nodes")
+    if taken := [name for name in added if name in nodes]:
+        raise fail("additions", "nodes of other names than the network's", taken[0])
+    check_count("steps", steps)
+    cases = list(_list_cases([*nodes], [*added], steps, without, table("outages", outages or {}, "steps")))
+    # One filter of all that is received, and one set of draws.
+    every = {**nodes, **{name: instance(f"addition {name!r}", node, Node, "a Node") for name, node in added.items()}}
+    bare = {name: Node(node.sensor, node.channel, {}) for name, node in every.items()}
+    filter = _filter_of_all(network, bare)
+    drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs), key, inputs=inputs)
+    u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, float)
+    exact, sizes = filter.claim == "exact", [bare[name].received for name in bare]
+    z, truth = np.concatenate([drawn.measurements[name] for name in bare], axis=-1), np.asarray(drawn.truth)
+    found = []
+    for case in cases:
+        squares = _squares_at_end(filter, np.where(np.repeat(case.used, sizes, axis=1), z, np.nan), u, truth, exact)
+        error = np.sqrt(squares.mean(axis=0))
+        spread = squares.std(axis=0) / np.sqrt(len(squares))
+        found.append((case.name, error, np.divide(spread, 2 * error, out=np.zeros_like(error), where=error > 0)))
+    whole = found[0][1]
+    complete, *others = (
+        ErrorWithout(name, error, spread, np.divide(error, whole, out=np.full_like(error, np.nan), where=whole > 0))
+        for name, error, spread in found
+    )
+    return SensorWorth(network.states, complete, tuple(others), exact)
+
+
+def _plain_nodes(network: Network) -> dict[str, Node]:
+    """Return the nodes, refused where more than a sensor and a link makes what they receive."""
+    if network.relays is not None or network.common is not None:
+        raise fail("network", "nodes that receive sensors through channels of their own", "relays that filter")
+    for name, node in network.nodes.items():
+        if not isinstance(node, Node) or node.trigger is not None or node.encoder is not None:
+            raise fail(f"node {name!r}", "a sensor that sends what it measures at each step", "a trigger or words")
+    return {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+
+
+def _list_cases(
+    names: list[str], added: list[str], steps: int, without: Sequence[str] | None, outages: Mapping[str, int]
+) -> Iterator[_Case]:
+    """Yield the cases: all nodes first, then each left out, each outage, each addition."""
+    left = (names if len(names) > 1 else []) if without is None else items("nodes left out", without, "names")
+    for name in (*left, *outages):
+        if name not in names:
+            raise fail("sensor", f"one of the nodes {', '.join(names)}", repr(name))
+    base = np.tile(np.isin([*names, *added], names), (steps, 1))
+    yield _Case("all", base)
+    for name in left:
+        used = base.copy()
+        used[:, names.index(name)] = False
+        yield _Case(f"without {name}", used)
+    for name, count in outages.items():
+        if check_count(f"outage of {name!r}", count) > steps:
+            raise fail(f"outage of {name!r}", f"at most the {steps} steps of the run", count)
+        used = base.copy()
+        used[steps - count :, names.index(name)] = False
+        yield _Case(f"{name} out for {count} steps", used)
+    for i, name in enumerate(added):
+        used = base.copy()
+        used[:, len(names) + i] = True
+        yield _Case(f"with {name}", used)
+
+
+def _filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
+    """Return the filter of all that the nodes receive."""
+    # A filter skips what is lost, and is given the channel of what arrives.
+    plant = network.plant
+    channels = [
+        node.channel if first(node.channel).remembers else at_each_step(_given_arrival, node.channel)
+        for node in nodes.values()
+    ]
+    sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, channels)
+    on_line = not first(plant).circular and not first(sensor).circular
+    return likelihood_filter(plant, sensor, channel, linear=on_line and is_linear(plant, sensor))
+
+
+def _given_arrival(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    return channel.condition_on_arrival() if channel.erases else channel
+
+
+def _squares_at_end(
+    filter: AbstractFilter,
+    z: Float[np.ndarray, "runs steps received"],
+    u: Float[np.ndarray, "steps inputs"],
+    truth: Float[np.ndarray, "runs steps n"],
+    exact: bool,
+) -> Float[np.ndarray, "runs n"]:
+    """Return the squared error of each state after the last step, or its variance where that is exact."""
+    squares, used = [], filter.angles_used()
+    alike = exact and np.array_equal(np.isnan(z), np.broadcast_to(np.isnan(z[:1]), z.shape))
+    for row, x in zip(z, truth, strict=True):
+        filtered = filter.run(row, u)
+        if exact:
+            squares.append(np.diagonal(filtered.covariances[-1]))
+        else:
+            squares.append(wrap_angles(filtered.means[-1] - x[-1], used.states if used else ()) ** 2)
+        if alike:  # the same rows arrive in all runs
+            break
+    return np.array(squares)
