@@ -10,9 +10,10 @@ LONGEST = 200_000
 # Executions of each operation after which care pays: it takes LLVM 20 to 90 us an operation more, and saves 0.03 to 0.3
 # ns for a block of runs. Of thirteen filters of 180 to 42,000 operations, it pays after 160,000 to 1,600,000.
 OFTEN = 200_000
-# Operations of a step of one plant above which care seldom pays: LLVM takes four to nine times as long (for 300
-# particles of two states, 77,000 operations, 41 s instead of 4) to save a third to half of its 0.25 ms.
-ALONE = 20_000
+# Operations of a step of one plant above which care seldom pays: LLVM takes four to ten times as long (for 300
+# particles of two states, 77,000 operations, 41 s instead of 4) to save a third to half of its 0.25 ms. So with care
+# the longest takes as long as the longest of all programs in haste.
+ALONE = LONGEST // 10
 # Operations of vectors in a call: fewer are done sooner than other threads are woken, 30 us.
 LITTLE = 100_000
 
