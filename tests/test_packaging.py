@@ -63,3 +63,20 @@ def test_the_wheel_works_outside_of_the_checkout(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == str(site / "heliograph" / "__init__.py") and (away / "cart.py").is_file()
+
+
+FIRST = """
+import sys
+import numpy as np
+import heliograph as hg
+plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+link = hg.hop(hg.Rayleigh(1.0), 0.1)
+hg.monte_carlo(hg.Network(plant, {"a": hg.Node(sensor, link, {"f": hg.linear_filter(plant, sensor, link)})}), 2, 8, 0)
+print(*(name for name in ("special", "linalg", "sparse", "stats", "optimize") if f"scipy.{name}" in sys.modules))
+"""
+
+
+def test_a_first_monte_carlo_waits_for_no_part_of_scipy():
+    """All of heliograph and JAX take 1.0 s of processor to import, and scipy.stats 0.8 more, scipy.special 0.1."""
+    completed = subprocess.run([sys.executable, "-c", FIRST], check=True, capture_output=True, text=True)
+    assert completed.stdout.split() == []

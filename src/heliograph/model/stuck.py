@@ -5,8 +5,7 @@ from math import ceil
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erf
-from scipy.stats import t
+import scipy
 from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
@@ -89,12 +88,12 @@ def _bound(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) -> Float[n
     """Return the largest probability that one noise lies in an interval of a step, of each output."""
     if isinstance(noise, StudentT):
         scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
-        return np.asarray(1 - 2 * t.cdf(-step / (2 * scale), float(noise.degrees)))
+        return np.asarray(1 - 2 * scipy.special.stdtr(float(noise.degrees), -step / (2 * scale)))
     if not isinstance(noise, Gaussian | Contaminated):
         raise fail("stuck", "Gaussian, Student's or contaminated noise, or a number of readings", type(noise).__name__)
     log_share, _, variance = (np.asarray(part) for part in noise.branches())
     with np.errstate(divide="ignore"):
-        return np.asarray(np.sum(np.exp(log_share) * erf(step[:, None] / np.sqrt(8 * variance)), axis=1))
+        return np.asarray(np.sum(np.exp(log_share) * scipy.special.erf(step[:, None] / np.sqrt(8 * variance)), axis=1))
 
 
 def longest_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:

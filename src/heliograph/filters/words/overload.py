@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem, Steps
@@ -154,7 +154,8 @@ def _count_beyond(
     total: np.ndarray = np.zeros_like(ends)
     for shift, share in zip(shifts, shares, strict=True):
         centre = mean + shift * step
-        total += share * (ndtr((centre - ends) / deviation) + ndtr((-centre - ends) / deviation))
+        below, above = ((side * centre - ends) / deviation for side in (1, -1))
+        total += share * (scipy.special.ndtr(below) + scipy.special.ndtr(above))
     return total
 
 

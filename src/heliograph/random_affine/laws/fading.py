@@ -5,7 +5,7 @@ from math import gamma
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special
+import scipy
 
 from heliograph.numerics.check import scalar
 from heliograph.numerics.traced import library, plain, scipy_for
@@ -64,9 +64,8 @@ class Rician(AbstractLaw):
 
     def quantile(self, probability: Vector) -> np.ndarray:
         """Return scale sqrt of the quantile of the noncentral chi-squared law of 2 degrees."""
-        return np.asarray(
-            np.sqrt(special.chndtrix(probability, 2, (float(self.sight) / float(self.scale)) ** 2)) * float(self.scale)
-        )
+        squared = scipy.special.chndtrix(probability, 2, (float(self.sight) / float(self.scale)) ** 2)
+        return np.asarray(np.sqrt(squared) * float(self.scale))
 
     def log_density(self, g: jax.Array) -> jax.Array:
         """Return log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)), x = g sight / scale^2."""
@@ -121,7 +120,7 @@ class Nakagami(AbstractLaw):
     def quantile(self, probability: Vector) -> np.ndarray:
         """Return the root of the quantile of the gamma law of g^2."""
         return np.asarray(
-            np.sqrt(special.gammaincinv(float(self.shape), probability) * float(self.power) / float(self.shape))
+            np.sqrt(scipy.special.gammaincinv(float(self.shape), probability) * float(self.power) / float(self.shape))
         )
 
     def log_density(self, g: jax.Array) -> jax.Array:
@@ -157,7 +156,7 @@ class LogNormal(AbstractLaw):
 
     def quantile(self, probability: Vector) -> np.ndarray:
         """Return exp(log_mean + log_deviation t) with t the normal quantile."""
-        return np.asarray(np.exp(float(self.log_mean) + float(self.log_deviation) * special.ndtri(probability)))
+        return np.asarray(np.exp(float(self.log_mean) + float(self.log_deviation) * scipy.special.ndtri(probability)))
 
     @property
     def logarithmic(self) -> bool:
