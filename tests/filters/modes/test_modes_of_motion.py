@@ -226,3 +226,30 @@ def test_what_does_not_fit_is_refused_in_one_line(build, said):
     with pytest.raises(ValueError, match=said) as error:
         build(*models())
     assert "\n" not in str(error.value)
+
+
+def test_a_frozen_sensor_repeats_what_it_last_measured():
+    """State (x, s), the sensor reads s: working s+ = x+ + v, frozen s+ = s. Against the sum over all paths."""
+    noise = np.array([[0.1, 0.1], [0.1, 0.1 + 0.2]])  # of (w, w + v)
+    laws = (np.array([[0.9, 0.0], [0.9, 0.0]]), noise), (np.array([[0.9, 0.0], [0.0, 1.0]]), np.diag([0.1, 0.0]))
+    start, T, initial, R = np.diag([1.0, 1e-6]), np.array([[0.95, 0.05], [0.3, 0.7]]), np.array([0.9, 0.1]), 1e-3
+    plant = hg.markov_plant([hg.LinearPlant(F, Q, [0.0, 0.0], start) for F, Q in laws], T, initial=initial)
+    z = np.array([0.7, 0.7])
+    means, weights = [], []
+    for path in [(i, j) for i in range(2) for j in range(2)]:
+        m, P, log_weight = np.zeros(2), start, np.log(initial[path[0]] * T[path])
+        for mode, row in zip(path, z, strict=True):
+            F, Q = laws[mode]
+            m, P = F @ m, F @ P @ F.T + Q
+            s = P[1, 1] + R
+            log_weight -= ((row - m[1]) ** 2 / s + np.log(2 * np.pi * s)) / 2
+            m, P = m + P[:, 1] * (row - m[1]) / s, P - np.outer(P[:, 1], P[1]) / s
+        means, weights = [*means, m], [*weights, np.exp(log_weight)]
+    law = np.array(weights).reshape(2, 2) / np.sum(weights)
+    run = hg.filters.gpb2_filter(plant, hg.LinearSensor([[0.0, 1.0]], R), hg.perfect()).run(z[:, None])
+    # GPB2 sums all pairs of modes, which two rows have: to rounding.
+    np.testing.assert_allclose(run.modes[-1], law.sum(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(run.means[-1], law.ravel() @ np.array(means), rtol=1e-9, atol=1e-12)
+    # .7 after a value that was about 0 excludes ice; the same number again makes it several times what the chain says.
+    assert run.modes[0][1] < 1e-9
+    assert run.modes[1][1] > 5 * T[0, 1]
