@@ -353,7 +353,8 @@ HELPERS = {
 }  # fmt: skip
 HOLDERS = {  # what holds models as they are given, and what only reads them
     "hg.Network", "hg.Node", "hg.model.RelayNetwork", "hg.h_infinity.HInfinityFilter", "hg.filters.PolynomialFilter",
-    "hg.h_infinity.h_infinity_filter", "hg.smoothing.smoother_steps",
+    "hg.h_infinity.h_infinity_filter", "hg.smoothing.smoother_steps", "hg.simulation.NamedFilter",
+    "hg.simulation.find_filter_by_name",
 }  # fmt: skip
 
 

@@ -166,7 +166,7 @@ class Sources:
             asked = self._asked.setdefault(topic, set())
             for source, *_ in self.of(topic):
                 names = [name.path for name in (source.plant, source.node) if isinstance(name, Field)]
-                paths = [path if isinstance(path, str) else path.path for path in source.paths]
+                paths = [part for path in source.paths for part in ((path,) if isinstance(path, str) else path.parts)]
                 asked |= {path.split(".")[0] for path in (*names, *paths, *source.where)}
         return self._asked[topic]
 
