@@ -35,6 +35,8 @@ ORDER = [
         "filters.settled",
         "filters.chunks",
         "filters.filter_data",
+        "filters.event.truncated_normal",
+        "filters.truncation",
         "filters.smoother_step",
         "filters.gaussian.transform",
         "filters.gaussian.scalars",

@@ -52,17 +52,23 @@ def takes_and_makes_models(item):
 STATES, INPUTS, OUTPUTS = {"turn": "rad", "way": "m"}, {"dt": "s"}, {"course": "rad", "range": "m"}
 LAW = hg.random_affine.Independent([hg.Contaminated(0.01, 0.1, 1.0), hg.Gaussian([[0.1]])])
 START = hg.random_affine.Independent([hg.Gaussian([[0.01]]), hg.Contaminated(0.1, 0.2, 2.0)])
-NAMED = {"states": STATES, "inputs": INPUTS}
+NAMED, LIMITS = {"states": STATES, "inputs": INPUTS}, {"way": (-9.0, None)}
 LINEAR = hg.LinearPlant(np.eye(2), LAW, [0.0, 1.0], START, [[1.0], [0.5]], circular=["turn"], **NAMED)
 VARYING = hg.LinearPlant(lambda u: jnp.eye(2) + u[0] * jnp.eye(2, k=1) * 0.0, lambda u: u[0] * jnp.eye(2), [0.0, 1.0],
                          START, circular=["turn"], **NAMED)  # fmt: skip
 CURVED = hg.Plant(lambda x, u: jnp.stack([x[0] + u[0], x[1] + jnp.cos(x[0])]), LAW, [0.0, 1.0], START,
                   circular=["turn"], **NAMED)  # fmt: skip
+LIMITED, LIMITED_CURVED = (  # beside the others, since not every filter takes limits
+    hg.LinearPlant(np.eye(2), LAW, [0.0, 1.0], START, [[1.0], [0.5]], circular=["turn"], limits=LIMITS, **NAMED),
+    hg.Plant(lambda x, u: jnp.stack([x[0] + u[0], x[1] + jnp.cos(x[0])]), LAW, [0.0, 1.0], START, circular=["turn"],
+             limits=LIMITS, **NAMED))  # fmt: skip
 SEEN = hg.LinearSensor(np.eye(2), LAW, OUTPUTS, ["course"])
 BENT = hg.Sensor(lambda x: jnp.stack([x[0], jnp.exp(x[1])]), LAW, OUTPUTS, ["course"])
 PLAIN = hg.LinearPlant(np.eye(2), 0.1, [0.0, 1.0], 1.0, [[1.0], [0.5]], circular=["turn"], **NAMED)  # Gaussian
 COMPASS = hg.LinearSensor(np.eye(2), 0.1, OUTPUTS, ["course"])
-LINE = hg.LinearPlant(np.eye(2), LAW, [0.0, 1.0], START, [[1.0], [0.5]], **NAMED)  # without angles
+LINE, LIMITED_LINE = (
+    hg.LinearPlant(np.eye(2), LAW, [0.0, 1.0], START, [[1.0], [0.5]], limits=limits, **NAMED) for limits in ((), LIMITS)
+)  # without angles
 ON_LINE = hg.LinearSensor(np.eye(2), LAW, OUTPUTS)
 CLEAN, NOISY = hg.perfect(2), hg.hop(1.0, np.diag([0.1, 0.2]))
 LOSSY = hg.erasure(NOISY, 0.8)
@@ -117,7 +123,14 @@ def laws(made, of, start):
             assert new.moment(tuple(powers)) == pytest.approx(old.moment(tuple(4 * np.eye(size, dtype=int)[i])))
 
 
-MODELS = (named, inputs, angles, linear, laws)
+def limits(made, of, start):
+    if not isinstance(of, hg.model.AbstractSensor):
+        carried = dict(made.limits)
+        assert [carried[str(names_of(made)[start + names_of(of).index(name)])] for name, _ in of.limits] == [
+            ends for _, ends in of.limits]  # fmt: skip
+
+
+MODELS = (named, inputs, angles, linear, laws, limits)
 
 
 def an_angle(made, of, start):
@@ -178,7 +191,7 @@ def joint():
 
 def clocks():
     wrong = {"b": hg.model.Clock(0.1, 0.01, 0.001)}
-    for plant in (LINEAR, VARYING, CURVED):
+    for plant in (LINEAR, VARYING, CURVED, LIMITED, LIMITED_CURVED):
         for dt in (0.5, "dt"):
             made, sensors = hg.model.with_clocks(plant, {"a": SEEN, "b": BENT}, wrong, np.zeros((2, 2)), dt)
             yield from ((made, plant, 0), (sensors["a"], SEEN, 0), (sensors["b"], BENT, 0))
@@ -188,7 +201,7 @@ def clocks():
 def biases():
     drifting = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, states={"offset": "rad"}, circular=["offset"])
     as_driven = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, [[0.0]], {"offset": "rad"}, INPUTS, ["offset"])
-    for plant in (LINEAR, VARYING, CURVED):
+    for plant in (LINEAR, VARYING, CURVED, LIMITED, LIMITED_CURVED):
         for sensor in (SEEN, BENT):
             for arguments in ((0.1, 5.0), (0.1, 5.0, "dt"), (drifting, np.inf, 1.0, [[1.0], [0.0]])):
                 made, biased = hg.model.with_bias(plant, sensor, *arguments)
@@ -201,13 +214,14 @@ def biases():
 
 def joined():
     other = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, [[0.0]], {"offset": "rad"}, INPUTS, ["offset"])
-    for plant in (LINEAR, VARYING, CURVED):
+    for plant in (LINEAR, VARYING, CURVED, LIMITED, LIMITED_CURVED):
         made = hg.models.join([plant, other])
         yield from ((made, plant, 0), (made, other, 2)) if plant is LINEAR else ((made, plant, 0),)
 
 
 def past():
     late = hg.hop(1.0, np.eye(2), delay=hg.Discrete([0.0, 1.0], [0.5, 0.5]))
+    yield hg.model.with_past(LIMITED_LINE, ON_LINE, late)[0], LIMITED_LINE, 0
     made, sent, _ = hg.model.with_past(LINE, ON_LINE, late)
     yield made, LINE, 0
     assert [unit_of(name) for name in (*made.states[2:], *sent.outputs)] == ["rad", "m"] * 4
@@ -215,7 +229,7 @@ def past():
 
 
 def at_steps():
-    for model in (LINEAR, CURVED, SEEN, BENT):
+    for model in (LINEAR, CURVED, LIMITED, LIMITED_CURVED, SEEN, BENT):
         for varying in (hg.model.over_time([model, model]), hg.model.OverTime(hg.model.over_time([model]).values)):
             yield at(varying, 0), model, 0
 

@@ -13,6 +13,7 @@ from heliograph.factors.changes import settle, unsettle
 from heliograph.factors.columns import Columns, decorrelate, join_columns, triangularise, unit_lower
 from heliograph.factors.gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.filters.plausibility import innovation_distance
+from heliograph.filters.truncation import PlacedLimits, hold_mean, truncate_to_limits
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.manifold import Manifold
@@ -67,6 +68,7 @@ class SmootherStep(Module):
 
     claim: of estimates given later data too. manifold: which of the plant's states are angles, wrapped to between -pi
     and pi in estimates, but never by a backward pass, and which are attitudes, whose law is one of turns from the mean.
+    limits: of the plant's states, on which estimates are conditioned.
     nis: e' S^-1 e of the step's innovation, with mean `received`, the number of components that arrived.
 
     Shapes: projection (n, N), shift (n,).
@@ -80,6 +82,7 @@ class SmootherStep(Module):
     received: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
     claim: Claim = eqx.field(static=True, kw_only=True)
     manifold: Manifold = eqx.field(static=True, default=EVERY_LINE, kw_only=True)
+    limits: PlacedLimits = eqx.field(static=True, default=(), kw_only=True)
 
     @property
     def mean(self) -> Float[Array, "*time N"]:
@@ -158,6 +161,10 @@ class SmootherStep(Module):
         if self.projection is not None:
             mean, columns = self.projection @ mean, columns.through(self.projection)
         mean = mean if self.shift is None else mean + self.shift
+        if self.limits:
+            law = hold_mean(from_columns(mean, columns), self.limits)
+            _, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], law), self.limits)
+            return Estimate(wrap_angles(inside.mean[0], self.angles), inside.covariance[0], self.claim)
         mean = wrap_angles(mean, self.angles)
         return Estimate(mean, columns.covariance, self.claim, attitude=self.manifold.rotations)
 

@@ -16,6 +16,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.filters.wrappers.limited import LimitedFilter
 from heliograph.forecasting.prediction import Prediction
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import at, first
@@ -56,11 +57,14 @@ class Outlook(Module):
 
     def mixture(self, state: PyTree) -> Moments:
         """Moments of the states, one part of a filter that has no more; the means alone where nothing is claimed."""
+        filter = self.filter
+        if isinstance(filter, LimitedFilter):  # each part within the limits
+            state, filter = filter.condition(state), filter.base
         if isinstance(state, HasComponents):
             weights, parts = state.components
             parts = take_leading(parts, len(self.filter.states))
             return Moments(weights, parts.mean, jnp.asarray(jax.vmap(lambda x: x.covariance)(parts)))
-        estimate = self.filter.estimate(state)
+        estimate = filter.estimate(state)
         covariance = jnp.asarray(estimate.covariance)
         known = covariance if self.filter.claim != "none" else jnp.zeros_like(covariance)
         return Moments(jnp.ones(1), jnp.asarray(estimate.mean)[None], known[None])

@@ -7,6 +7,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
+from heliograph.model.intervals import read_intervals, read_numbers
 from heliograph.model.sensor import AnySensor
 from heliograph.model.stuck import Repeats, StuckLike, count_repeats, stuck_counts
 from heliograph.numerics.check import fail, show_value
@@ -34,7 +35,7 @@ def limits_of(
 
     `stuck` of True is by the noise and resolution of the sensor, behind the channel.
     """
-    codes, counts = _read_numbers("invalid values", invalid), stuck_counts(received, stuck, sensor, channel)
+    codes, counts = read_numbers("invalid values", invalid), stuck_counts(received, stuck, sensor, channel)
     if isinstance(limits, Limits):
         if len(limits.low) != received or codes.size or counts is not None:
             more = " and further codes" * bool(codes.size) + " and stuck=" * (counts is not None)
@@ -87,9 +88,9 @@ class Limits(Module):
         invalid: ArrayLike = (),
         stuck: Float[np.ndarray, " m"] | None = None,
     ):
-        pairs = _read_intervals(limits, received)
+        pairs = read_intervals(limits, received)
         self.low, self.high = pairs[:, 0], pairs[:, 1]
-        codes = _read_numbers("invalid values", invalid)
+        codes = read_numbers("invalid values", invalid)
         if codes.ndim > 1 or not np.all(np.isfinite(codes)):
             raise fail("invalid values", "a finite number or several", show_value(invalid))
         self.invalid, self.stuck = np.atleast_1d(codes), stuck
@@ -145,34 +146,3 @@ def is_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray
     rounding = np.where(codes == np.round(codes), ROUNDING, SINGLE) * np.abs(codes)
     near = (np.abs(numbers - codes) <= rounding) | (numbers == single)
     return np.asarray(near.any(axis=-1))
-
-
-def _read_intervals(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
-    """Return (low, high) for each received number, infinite where there is no limit."""
-    everything = [-np.inf, np.inf]
-    if limits is None:
-        return np.tile(everything, (received, 1))
-    expected = f"(low, high), or such a pair for each of {received} received numbers, None where there is no limit"
-    try:
-        values = np.asarray(limits, dtype=object)
-    except (TypeError, ValueError):
-        raise fail("limits", expected, show_value(limits)) from None
-    if values.shape not in ((2,), (received, 2)):
-        raise fail("limits", expected, show_value(limits))
-    rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
-    pairs = [[end if bound is None else bound for bound, end in zip(row, everything, strict=True)] for row in rows]
-    intervals = _read_numbers("limits", pairs, expected)
-    if np.any(~(intervals[:, 0] < intervals[:, 1])):
-        raise fail("limits", "a low end below the high one", show_value(limits))
-    return intervals
-
-
-def _read_numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
-    """Return real numbers as an array of doubles, or raise one line."""
-    try:
-        values = np.asarray(value)
-        if values.size and values.dtype.kind not in "fiu":
-            raise ValueError
-    except (TypeError, ValueError, OverflowError):
-        raise fail(name, expected, show_value(value)) from None
-    return values.astype(np.float64)

@@ -48,8 +48,8 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
         if start.attitude:
             raise fail("models of a plant", "ones without an attitude", list(start.attitude))
         self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
-        self.deviation, self.states, self.inputs, self.circular = (
-            start.deviation, start.states, start.inputs, start.circular,
+        self.deviation, self.states, self.inputs, self.circular, self.limits = (
+            start.deviation, start.states, start.inputs, start.circular, start.limits,
         )  # fmt: skip
 
     @property  # type: ignore[misc]
@@ -100,8 +100,8 @@ class _ChosenPlant(AbstractPlant):
         self.models, self.index, self.noise = models, index, None
         start = models[0]
         self.initial_mean, self.initial_covariance = start.initial_mean, start.initial_covariance
-        self.deviation, self.states, self.inputs, self.circular = (
-            start.deviation, start.states, start.inputs, start.circular,
+        self.deviation, self.states, self.inputs, self.circular, self.limits = (
+            start.deviation, start.states, start.inputs, start.circular, start.limits,
         )  # fmt: skip
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -205,12 +205,12 @@ def markov_plant(
         modes: a sensor, plant or link whose chain it is, in place of `transition`; none by default.
 
     Raises:
-        ValueError: fewer than two models, models of other states, inputs, angles or laws of x_0 than the first,
+        ValueError: fewer than two models, models of other states, inputs, angles, limits or laws of x_0 than the first,
             probabilities that are none.
     """
     plants = _check_models("models of a plant", models, AbstractPlant)
     for i, plant in enumerate(plants[1:], start=1):
-        for what in ("states", "inputs", "circular"):
+        for what in ("states", "inputs", "circular", "limits"):
             if getattr(plant, what) != getattr(plants[0], what):
                 remedy = " (a model without one of them has it all the same, such as a turn rate that stays 0)"
                 raise fail(f"{what} of model {i}", f"{list(getattr(plants[0], what))}, as those of model 0{remedy}",

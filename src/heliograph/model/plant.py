@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.intervals import StateLimits, StateLimitsLike, read_state_limits
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.turns import check_turns
 from heliograph.model.unknown_start import DiffuseStart
@@ -30,6 +31,7 @@ from heliograph.random_affine.noise import (
 
 TIME_STEP = "dt"  # input that is the time since the row before, in the unit of the times
 MatrixFunction = TypeAliasType("MatrixFunction", Callable[[jax.Array], ArrayLike])  # a matrix of the input u
+MatrixLike = TypeAliasType("MatrixLike", ArrayLike | MatrixFunction)
 
 
 class OfInputs(Module):
@@ -73,6 +75,7 @@ class AbstractPlant(Module):
     x_0 is Gaussian unless `deviation` holds the law of x_0 - initial_mean up to a constant. States that are `circular`
     are angles in radians: x and x with a full turn more in one of them are the same state. Three states that are an
     `attitude` are a rotation vector: changes of it, noises and covariances are turns in its own axes, in radians.
+    `limits` are what filters believe possible, by state; `transition` and the draws know nothing of them.
     """
 
     noise: eqx.AbstractVar[AbstractNoise | NoiseFunction]
@@ -83,6 +86,7 @@ class AbstractPlant(Module):
     inputs: eqx.AbstractVar[tuple[str, ...]]
     circular: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
     attitude: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    limits: StateLimits = eqx.field(static=True, default=(), kw_only=True)
 
     @property
     def angles(self) -> Angles:
@@ -192,7 +196,9 @@ class Plant(AbstractPlant):
     `initial_covariance` is a covariance, or a noise law of x_0 - initial_mean where x_0 is not Gaussian.
     An input named "dt" is filled with the time since the previous row when recorded data has no such column.
     `states` and `inputs` are names, or a mapping of names to units: {"position": "m"}. `circular` names the states that
-    are angles, in radians; f must not mind a full turn more in one of them.
+    are angles, in radians; f must not mind a full turn more in one of them. `limits` are lowest and highest values of
+    states, {"soc": (0, 1), "speed": (0, None)}: filters condition on them, and f must keep them by itself if the plant
+    that is simulated is to keep them.
 
     `attitude` names three states that are the rotation vector of an attitude, R = exp [r]x from body to world, or three
     for each of several, at most pi long: f returns it turned, `hg.models.turn_attitude(r, rate * dt)`, since a rotation
@@ -200,7 +206,8 @@ class Plant(AbstractPlant):
 
     Raises:
         ValueError: a transition that does not return a state, covariances that are none, numbers that are not finite,
-            circular states or attitudes that are none or that a full turn changes.
+            circular states or attitudes that are none or that a full turn changes, limits that exclude the initial
+            mean or stand beside attitudes.
     """
 
     function: Callable[[jax.Array, jax.Array], ArrayLike]
@@ -221,6 +228,7 @@ class Plant(AbstractPlant):
         inputs: Names = (),
         circular: Sequence[str] = (),
         attitude: Sequence[str] = (),
+        limits: StateLimitsLike = (),
     ):
         self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _read_initial(initial_mean, initial_covariance)
@@ -236,6 +244,9 @@ class Plant(AbstractPlant):
             self.noise = as_noise("process noise", noise, n)
         self.circular = _circular(self.states, circular)
         self.attitude = _read_attitude(self.states, attitude, self.circular)
+        if limits and attitude:
+            raise fail("limits of states", "none beside attitudes", list(self.attitude))
+        self.limits = read_state_limits(limits, self.states, self.circular, self.initial_mean)
         check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -244,7 +255,7 @@ class Plant(AbstractPlant):
 
 
 class LinearPlant(AbstractPlant):
-    """A linear plant x+ = A x + B u + w; noise, initial law and circular states are given as for `Plant`.
+    """A linear plant x+ = A x + B u + w; noise, initial law, circular states and limits are given as for `Plant`.
 
     `initial_covariance` may be `hg.diffuse` too: nothing is known of the start, of all states or of named ones.
 
@@ -270,21 +281,22 @@ class LinearPlant(AbstractPlant):
 
     def __init__(
         self,
-        matrix: "ArrayLike | MatrixFunction",
+        matrix: "MatrixLike",
         noise: "NoiseLike | NoiseFunction",
         initial_mean: ArrayLike,
         initial_covariance: "NoiseLike | DiffuseStart",
-        input_matrix: "ArrayLike | MatrixFunction | None" = None,
+        input_matrix: "MatrixLike | None" = None,
         states: "Names | None" = None,
         inputs: "Names | None" = None,
         circular: "Sequence[str]" = (),
+        limits: "StateLimitsLike" = (),
     ):
         self.initial_mean, spread, self.deviation = _read_initial(initial_mean, initial_covariance, unknown=True)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.initial_covariance = spread.of_states(self.states) if isinstance(spread, DiffuseStart) else spread
-        if isinstance(spread, DiffuseStart) and circular:
-            raise fail("initial covariance", "a known one beside states that are angles", "hg.diffuse")
+        if isinstance(spread, DiffuseStart) and (circular or limits):
+            raise fail("initial covariance", "a known one beside angles and limits of states", "hg.diffuse")
         # Inputs: as many as B has columns, or as have names where something depends on them.
         varies = any(callable(entry) for entry in (matrix, input_matrix, noise))
         if varies and not inputs:
@@ -301,10 +313,11 @@ class LinearPlant(AbstractPlant):
             check_shape("process noise covariance(u)", noise, (np.zeros(len(self.inputs)),), (n, n))
         self.noise = noise if callable(noise) else as_noise("process noise", noise, n)
         self.circular = _circular(self.states, circular)
+        self.limits = read_state_limits(limits, self.states, self.circular, self.initial_mean)
         u = np.zeros(len(self.inputs))
         check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
-    def _matrix(self, name: str, value: ArrayLike | MatrixFunction, shape: tuple[int, int]) -> Any:
+    def _matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)

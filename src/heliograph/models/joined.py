@@ -95,10 +95,12 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     noise = Independent(noises) if len(noises) == len(parts) else JointNoise(tuple(parts), places)
     circular = [name for plant in parts for name in plant.circular]
     attitude = [name for plant in parts for name in plant.attitude]
+    limits = tuple(pair for plant in parts for pair in plant.limits)
     if not all(isinstance(plant, LinearPlant) for plant in parts):
-        return Plant(SideBySide(tuple(parts), places), noise, center, start, states, inputs, circular, attitude)
+        move = SideBySide(tuple(parts), places)
+        return Plant(move, noise, center, start, states, inputs, circular, attitude, limits)
     matrix, driven = _matrices(parts, places, len(inputs))
-    return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular)
+    return LinearPlant(matrix, noise, center, start, driven, states, inputs, circular, limits)
 
 
 def _matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.limits import BLOCK
+from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, check_progress, fail, instance
 from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
@@ -128,11 +129,24 @@ def monte_carlo(
 
 
 def _warn_of_nan(result: Result, network: Network) -> Result:
-    """Return a result, with a warning where a record holds what is no number."""
+    """Return a result, with a warning where a record holds what is no number, or a state beyond its limits."""
     if isinstance(result, Record):
+        _warn_beyond_limits(result, network)
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
         warn_of_no_numbers(result, complete, stacklevel=4)
     return result
+
+
+def _warn_beyond_limits(record: Record, network: Network) -> None:
+    """Warn where a state that was drawn is beyond the limits that filters believe: the world does not know them."""
+    for name, (low, high) in first(network.plant).limits if record.truth is not None else ():
+        x = np.asarray(record.truth)[..., network.states.index(name)]
+        beyond = ((x < low) | (x > high)).reshape(-1, x.shape[-1])
+        if beyond.any():
+            where = f"in {beyond.any(axis=1).sum()} of {len(beyond)} runs"
+            said = f"the true {name!r} leaves its limits {low:g} to {high:g} {where}"
+            remedy = "filters believe them, the plant's transition and noise have to keep them"
+            warnings.warn(f"{said}, first at step {np.argmax(beyond.any(axis=0))}: {remedy}", stacklevel=4)
 
 
 def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:

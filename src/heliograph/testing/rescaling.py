@@ -147,7 +147,9 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
     center = s * (plant.initial_mean - (plant.deviation.mean if plant.deviation is not None else 0.0))
     given = plant.noise
     noise = _noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
-    names = {"states": plant.states, "inputs": plant.inputs, "circular": plant.circular}
+    size = dict(zip(plant.states, s, strict=True))
+    limits = {name: (size[name] * low, size[name] * high) for name, (low, high) in plant.limits}
+    names = {"states": plant.states, "inputs": plant.inputs, "circular": plant.circular, "limits": limits}
     if isinstance(plant, LinearPlant):
         matrix, entry = (
             InUnits(given.function, s[:, None] / by, (u,)) if isinstance(given, OfInputs) else s[:, None] * given / by

@@ -8,8 +8,9 @@ import numpy as np
 
 from heliograph.factors.columns import Columns, eliminate, join_columns, zero_covariance
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
-from heliograph.filters.event.gaussian_sum import CERTAIN, GaussianSum
+from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
+from heliograph.filters.truncation import CERTAIN
 from heliograph.numerics.lapack import eigh
 
 MOST_COMPONENTS = 3  # nodes are a grid over all but one of them

@@ -13,15 +13,13 @@ from heliograph.factors.columns import Columns
 from heliograph.factors.gaussian import (
     Gaussian,
     from_columns,
-    impose_moments_of_combination,
     merge_mixture,
     take_leading,
 )
-from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
+from heliograph.filters.truncation import truncate_gaussians
 from heliograph.numerics.types import Array, Float
 
 FLOOR = 1e-6  # probability of what the rule forbids
-CERTAIN = 1e-24  # a variance below this share of its mean square and of the interval's is rounding
 
 
 class GaussianSum(NamedTuple):
@@ -84,46 +82,27 @@ def concatenate(parts: Sequence[GaussianSum]) -> GaussianSum:
 @jax.jit
 def truncate_between(parts: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
     """Truncate each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
-    row, variance = _project_on_direction(parts, direction)
-    ends = [jnp.broadcast_to(end, variance.shape) for end in (lower, upper)]
-    return _truncate(parts, parts.gaussian.mean @ direction, row, variance, ends)
+    row, centre = _project_on_direction(parts, direction)
+    return _truncate(parts, centre, row, [jnp.broadcast_to(end, centre.shape) for end in (lower, upper)])
 
 
 @jax.jit
 def truncate_outside(parts: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
     """Truncate each Gaussian to d'x >= edge, and then each to d'x <= -edge: a sum of 2 K Gaussians."""
-    row, variance = _project_on_direction(parts, direction)
-    centre, edges = parts.gaussian.mean @ direction, jnp.full(2 * len(variance), edge)
+    row, centre = _project_on_direction(parts, direction)
+    edges = jnp.full(2 * len(centre), edge)
     centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
-    return _truncate(concatenate([parts, parts]), centre, row, jnp.tile(variance, 2), [edges])
+    return _truncate(concatenate([parts, parts]), centre, row, [edges])
 
 
 def _project_on_direction(parts: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the row f (K, N) of d'x = d'm + f xi, and its variance (K,)."""
-    row = direction @ parts.gaussian.root
-    return row, jnp.sum(row**2 * parts.gaussian.variances, axis=1)
+    """Return the row f (K, N) of d'x = d'm + f xi, and d'm (K,)."""
+    return direction @ parts.gaussian.root, parts.gaussian.mean @ direction
 
 
-def _truncate(
-    parts: GaussianSum, centre: jax.Array, row: jax.Array, variance: jax.Array, ends: Sequence[jax.Array]
-) -> GaussianSum:
-    """Truncate to where d'x = centre + row xi is above the first end, and below the second if there is one.
-
-    With S the variance of d'x and mu, v the moments of a standard normal number that is cut: d'x moves by sqrt(S) mu
-    and has the variance v S; x given d'x stays.
-    """
-    # Without variance d'x lies inside or it does not.
-    certain = variance <= CERTAIN * (centre**2 + sum(end**2 for end in ends))
-    deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
-    inside = (ends[0] <= centre) & (centre <= ends[-1] if len(ends) > 1 else True)
-    # Moments of a standard normal number between the two, or beyond one.
-    moments = (truncated_normal if len(ends) > 1 else upper_tail)(*((end - centre) / deviation for end in ends))
-    log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
-    # Moments of the part inside, where it has any probability.
-    changes = jnp.isfinite(log_mass) & ~certain
-    shift = deviation * jnp.where(changes, moments.mean, 0.0)
-    ratio = jnp.where(changes, moments.variance, 1.0)
-    after = jax.vmap(impose_moments_of_combination)(parts.gaussian, jnp.where(changes[:, None], row, 0.0), shift, ratio)
+def _truncate(parts: GaussianSum, centre: jax.Array, row: jax.Array, ends: Sequence[jax.Array]) -> GaussianSum:
+    """Truncate to where d'x = centre + row xi is above the first end, and below the second if there is one."""
+    log_mass, after = truncate_gaussians(parts.gaussian, centre, row, ends)
     return GaussianSum(parts.log_weight + log_mass, after, parts.label)
 
 

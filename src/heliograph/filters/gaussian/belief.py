@@ -22,6 +22,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
+from heliograph.filters.wrappers.limited import keeps_limits
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.modes_of_motion import ModalPlant
 from heliograph.model.over_time import at, first
@@ -181,6 +182,7 @@ class OpenLoop(AbstractBeliefFilter):
         return state, no_innovation()
 
 
+@keeps_limits
 @believes
 def open_loop_filter(
     plant: AnyPlant,

@@ -25,6 +25,7 @@ from heliograph.filters.gaussian.signal import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.wrappers.limited import keeps_limits
 from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain, perfect
@@ -195,6 +196,7 @@ def _make_gaussian_filter(
     return believing(filter, premise)
 
 
+@keeps_limits
 @takes_sensor_inputs
 @takes_told
 def gaussian_filter(
@@ -234,6 +236,7 @@ def gaussian_filter(
     )
 
 
+@keeps_limits
 @takes_sensor_inputs
 @takes_told
 def cubature_filter(
@@ -266,6 +269,7 @@ def cubature_filter(
     return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
 
 
+@keeps_limits
 @takes_sensor_inputs
 @takes_told
 def extended_filter(
@@ -296,6 +300,7 @@ def extended_filter(
     return gaussian_filter(plant, sensor, channel, Linearization(), update, initial_mean, initial_covariance)
 
 
+@keeps_limits
 def mean_gain_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -345,6 +350,7 @@ def gaussian_filter_of(
 MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"
 
 
+@keeps_limits
 @takes_sensor_inputs
 def kalman_filter(
     plant: AnyPlant,

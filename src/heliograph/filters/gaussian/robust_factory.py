@@ -8,6 +8,7 @@ from heliograph.filters.gaussian.robust import Gate, RobustFilter, StudentVB
 from heliograph.filters.gaussian.scores import AbstractWeights
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
+from heliograph.filters.wrappers.limited import keeps_limits
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.fading import without_memory
@@ -32,6 +33,7 @@ def _student_degrees_of(noise: ReceivedNoise) -> Vector:
     return degrees
 
 
+@keeps_limits
 @believes
 @takes_told
 def robust_filter(

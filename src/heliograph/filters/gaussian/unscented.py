@@ -7,6 +7,7 @@ from heliograph.factors.gaussian import Gaussian, Image
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
 from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_beside_mean
 from heliograph.filters.gaussian.update import AbstractUpdate
+from heliograph.filters.wrappers.limited import keeps_limits
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant, check_plant
@@ -85,6 +86,7 @@ class Unscented(AbstractTransform):
         return Image(here + shift, Columns(ahead - behind, weights), 2 * steps, curvature)
 
 
+@keeps_limits
 def unscented_filter(
     plant: AnyPlant,
     sensor: AnySensor,

@@ -23,6 +23,7 @@ from heliograph.filters.modes.uncertain import uncertain_modal_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.words.linear import build_behind_words
 from heliograph.filters.wrappers.delay import build_behind_delays, deliver_line_as_current
+from heliograph.filters.wrappers.limited import keeps_limits
 from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link
@@ -148,6 +149,7 @@ def correct_linear(
     return state._replace(gaussian=after), innovation
 
 
+@keeps_limits
 @believes
 @takes_sensor_inputs
 @takes_told

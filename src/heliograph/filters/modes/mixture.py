@@ -27,6 +27,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.filters.wrappers.limited import keeps_limits
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
@@ -170,6 +171,7 @@ def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " 
     return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
 
 
+@keeps_limits
 @believes
 @takes_told
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:

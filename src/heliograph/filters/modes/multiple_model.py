@@ -48,6 +48,7 @@ from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.pairs import ModalLaw, ModalSmootherStep, move_pairs
 from heliograph.filters.modes.patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.wrappers.limited import keeps_limits
 from heliograph.filters.wrappers.sensor_inputs import takes_sensor_inputs
 from heliograph.filters.wrappers.told import takes_told
 from heliograph.model.channel import Channel
@@ -268,6 +269,7 @@ def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> ja
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
+@keeps_limits
 @believes
 @takes_sensor_inputs
 @takes_told
@@ -300,6 +302,7 @@ def imm_filter(
     )
 
 
+@keeps_limits
 @believes
 @takes_sensor_inputs
 @takes_told
@@ -328,6 +331,7 @@ def gpb1_filter(
     return MultipleModelFilter(merging=MergeAll(), **fields_of_mode_filters(plant, sensor, channel, transform, nodes))
 
 
+@keeps_limits
 @believes
 @takes_sensor_inputs
 @takes_told

@@ -29,6 +29,7 @@ from heliograph.filters.gaussian.signal import condition_on_measurement
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.mixing import normalise_columns
 from heliograph.filters.smoother_step import EarlierState, SmootherStep
+from heliograph.filters.truncation import hold_mean, truncate_to_limits
 from heliograph.model.estimate import Estimate
 from heliograph.model.plant import AbstractPlant
 from heliograph.numerics.angle import nearest, wrap_angles
@@ -159,6 +160,11 @@ class ModalSmootherStep(SmootherStep):
         if isinstance(law, Gaussian):
             return super().estimate_from(law)
         parts = law.gaussian
+        if self.limits:
+            held = jax.vmap(lambda x: hold_mean(x, self.limits))(parts)
+            log_mass, parts = truncate_to_limits(held, self.limits)
+            weight = law.law * jnp.exp(log_mass - jnp.max(log_mass))
+            law = ModalLaw(parts, weight / jnp.sum(weight))
         mean = nearest(parts.mean, parts.mean[jnp.argmax(law.law)], self.angles)
         mean, covariance = moments_of_mixture(mean, jax.vmap(lambda x: x.covariance)(parts), law.law)
         return Estimate(wrap_angles(mean, self.angles), covariance, self.claim, law.law)

@@ -129,6 +129,7 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
     new = {name: rename(name, f"bias_{name}") if name in plant.states else name for name in bias.states}
     states = (*plant.states, *new.values())
     circular = (*plant.circular, *(new[name] for name in bias.circular))
+    limits = (*plant.limits, *((new[name], ends) for name, ends in bias.limits))
     # Both laws of the initial state, and of the noises.
     laws = [model.deviation or Gaussian(model.initial_covariance) for model in models]
     centers = [model.initial_mean - law.mean for model, law in zip(models, laws, strict=True)]
@@ -141,9 +142,9 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
         move = Driven(plant, bias, coupling, places)
         if np.any(np.asarray(coupling)[list(plant.manifold.rotations)]):
             raise fail("bias of a plant", "a coupling of 0 to attitudes, which have no sum", list(plant.attitude))
-        return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude)
+        return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude, limits)
     matrix, driven = _stack_blocks(plant, bias, coupling, np.eye(len(plant.inputs))[list(places)])
-    return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs, circular)
+    return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs, circular, limits)
 
 
 def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:

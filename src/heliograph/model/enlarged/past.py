@@ -68,4 +68,5 @@ def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
         driven,
         (*plant.states, *line),
         plant.inputs,
+        limits=plant.limits,
     )

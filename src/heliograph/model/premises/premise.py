@@ -21,6 +21,7 @@ from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
 
 WITHOUT_ATTITUDE = "no attitude (hg.extended_filter, unscented_filter and cubature_filter know them)"
+LIMITS_TAKEN_BY = "states without limits here (Gaussian, multiple model, mixture and particle filters take them)"
 MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim rests on
 
 
@@ -105,6 +106,9 @@ def believing(made: B, premise: Premise | None) -> B:
     attitude = () if premise is None else first(premise.plant).attitude
     if attitude and not getattr(made, "attitude", ()):
         raise fail(f"plant of a {type(made).__name__}", WITHOUT_ATTITUDE, list(attitude))
+    limits = () if premise is None else first(premise.plant).limits
+    if limits and not getattr(made, "takes_limits", False):
+        raise fail("plant", LIMITS_TAKEN_BY, f"limits of {[name for name, _ in limits]}")
     twin = copy(made)
     object.__setattr__(twin, "kept", Kept(premise))
     return twin

@@ -1,0 +1,76 @@
+"""Gaussians that are known to lie in an interval of one combination of their components."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.gaussian import Gaussian, impose_moments_of_combination
+from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
+
+PlacedLimits = tuple[tuple[int, float, float], ...]  # place, lowest and highest value of each limited component
+CERTAIN = 1e-24  # a variance below this share of its mean square and of the interval's is rounding
+
+
+@jax.jit
+def truncate_gaussians(
+    x: Gaussian, centre: jax.Array, row: jax.Array, ends: Sequence[jax.Array]
+) -> tuple[jax.Array, Gaussian]:
+    """Truncate Gaussians to where d'x = centre + row xi is above the first end, and below the second if there is one.
+
+    With S the variance of d'x and mu, v the moments of a standard normal number that is cut: d'x moves by sqrt(S) mu
+    and has the variance v S; x given d'x stays. Returns log P(d'x in the interval) (K,), -inf where d'x has no variance
+    and lies outside, and the Gaussians of the same moments.
+
+    Shapes: x (K, n), centre (K,), row (K, n), ends (K,) each.
+    """
+    # Without variance d'x lies inside or it does not.
+    variance = jnp.sum(row**2 * x.variances, axis=1)
+    certain = variance <= CERTAIN * (centre**2 + sum(end**2 for end in ends))
+    deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
+    inside = (ends[0] <= centre) & (centre <= ends[-1] if len(ends) > 1 else True)
+    # Moments of a standard normal number between the two, or beyond one.
+    moments = (truncated_normal if len(ends) > 1 else upper_tail)(*((end - centre) / deviation for end in ends))
+    log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
+    # Moments of the part inside, where it has any probability.
+    changes = jnp.isfinite(log_mass) & ~certain
+    shift = deviation * jnp.where(changes, moments.mean, 0.0)
+    ratio = jnp.where(changes, moments.variance, 1.0)
+    return log_mass, jax.vmap(impose_moments_of_combination)(x, jnp.where(changes[:, None], row, 0.0), shift, ratio)
+
+
+def hold_mean(x: Gaussian, limits: PlacedLimits) -> Gaussian:
+    """Move the mean to the most likely point within the limits, one after the other; the covariance stays.
+
+    The point of x_i = c that is most likely is m + P e_i (c - m_i) / P_ii. A component without variance stays.
+
+    Source: Simon, Kalman filtering with state constraints (2010), Section 2.4, with P^-1 as weight.
+    """
+    mean, covariance = x.mean, x.columns
+    for place, low, high in limits:
+        product = covariance.weights * covariance.matrix[place]
+        column, value = covariance.matrix @ product, mean[place]
+        held = jnp.clip(value, low, high)
+        known = column[place] <= 0
+        moved = mean + column * ((held - value) / jnp.where(known, 1.0, column[place]))
+        mean = jnp.where(known, mean, moved.at[place].set(held))
+    return x._replace(mean=mean)
+
+
+def truncate_to_limits(x: Gaussian, limits: PlacedLimits) -> tuple[jax.Array, Gaussian]:
+    """Condition Gaussians (K, n) on limits of their components; return log P(within) (K,) and the conditional moments.
+
+    Exact moments for one limited component; of several one after the other, each of the Gaussian of the moments after
+    those before it: nominal where limited components are correlated.
+
+    Source: Simon and Simon, Constrained Kalman filtering via density function truncation (2010).
+    """
+    total = jnp.zeros(len(x.mean))
+    for place, low, high in limits:
+        sign = 1.0 if np.isfinite(low) else -1.0
+        centre, row = sign * x.mean[:, place], sign * x.root[:, place]
+        ends = sorted(sign * end for end in (low, high) if np.isfinite(end))
+        log_mass, x = truncate_gaussians(x, centre, row, [jnp.full(len(x.mean), end) for end in ends])
+        total = total + log_mass
+    return total, x

@@ -1,0 +1,213 @@
+"""Filters of plants whose states have limits: what a filter says of the state, given that it lies within them.
+
+The filter within goes on as if there were none. Its Gaussian conditioned on the limits is the law of x_k given the data
+and that x_k lies within them: exact for a linear plant, however often it is asked, since what is conditioned is not
+filtered again. (A filter that went on from the truncated moments would count the same limits anew at each step: a
+state that hardly moves would be pushed away from them, and ever surer of it.) What is not used is that the states
+before lay within them too. Where a mean leaves the limits, the filter goes on from the most likely point within.
+"""
+
+import inspect
+from collections.abc import Callable
+from copy import copy
+from dataclasses import replace
+from functools import wraps
+from typing import Any, ClassVar, ParamSpec, TypeVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.factors.gaussian import Gaussian
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    make_sizes,
+    predicts,
+)
+from heliograph.filters.particles.state_particles import StateParticles
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
+from heliograph.filters.truncation import PlacedLimits, hold_mean, truncate_to_limits
+from heliograph.filters.wrappers.sensor_inputs import StateUnderInputs
+from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
+from heliograph.model.over_time import at_each_step, first
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.premises.premise import believing
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, PyTree
+
+F = TypeVar("F", bound=AbstractFilter)
+P = ParamSpec("P")
+
+
+class LimitedFilter(AbstractSizedFilter):
+    """A filter that conditions what it says on the limits of its plant's states.
+
+    Its state is that of the filter within; the likelihood is that of a measurement given that the state keeps them:
+    p(z) P(within | z) / P(within).
+
+    Args:
+        base: the filter of the plant without limits.
+        limits: place, lowest and highest value of each limited state.
+    """
+
+    takes_limits: ClassVar[bool] = True
+    base: AbstractFilter
+    limits: PlacedLimits = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> PyTree:
+        """Return the state before the first step."""
+        return self.base.init()
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Predict from the most likely point within the limits; of particles, from those within."""
+        return self.base.predict(self._enter(state), u, k)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Correct the prediction, its mean held within the limits."""
+        prior = state if _is_particles(state) else self._hold(state)
+        after, innovation = self.base.correct(prior, z, k)
+        masses = self._condition(after)[0], self._condition(state)[0]
+        both = jnp.isfinite(masses[0]) & jnp.isfinite(masses[1])
+        more = jnp.where(both, masses[0] - masses[1], 0.0)
+        return after, replace(innovation, log_likelihood=innovation.log_likelihood + more)
+
+    @estimates
+    def estimate(self, state: PyTree) -> Estimate:
+        """Return the mean and covariance given that the state lies within the limits."""
+        return self._claimed(self.base.estimate(self.condition(state)))
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """Return the same after step k."""
+        return self._claimed(self.base.after_step(self.condition(state), k))
+
+    def condition(self, state: PyTree) -> PyTree:
+        """Return the state of the filter within, given that the plant's state lies within the limits."""
+        return self._condition(state)[1]
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return that of the filter within, whose estimates are conditioned on the limits."""
+        inner = self.base.smoother_step(step.map_states(self._hold))
+        return replace(inner, limits=self.limits, claim=weakest([inner.claim, "nominal"]))
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return the angles of the filter within."""
+        return self.base.angles_used()
+
+    @property
+    def of_atoms(self) -> bool:
+        """As the filter within."""
+        return self.base.of_atoms
+
+    def _claimed(self, estimate: Estimate) -> Estimate:
+        return replace(estimate, claim=self.claim)
+
+    def _enter(self, state: PyTree) -> PyTree:
+        """Return the state from which the next prediction starts."""
+        return self.condition(state) if _is_particles(state) else self._hold(state)
+
+    def _hold(self, state: PyTree) -> PyTree:
+        """Hold the means of a state's Gaussians within the limits."""
+        if isinstance(state, StateUnderInputs):
+            return state._replace(base=self._hold(state.base))
+        if hasattr(state, "believed"):  # of a gate that may give in to its rival
+            return state._replace(believed=self._hold(state.believed), rival=self._hold(state.rival))
+        if _is_particles(state):
+            return state
+        x = Gaussian(*map(jnp.asarray, gaussian_of(state)))
+        hold = jax.vmap(self._hold_one) if x.mean.ndim == 2 else self._hold_one
+        return with_gaussian(state, hold(x))
+
+    def _hold_one(self, x: Gaussian) -> Gaussian:
+        return hold_mean(x, self.limits)
+
+    def _condition(self, state: PyTree) -> tuple[jax.Array, PyTree]:
+        """Return log P(within the limits), and the state given that."""
+        if isinstance(state, StateUnderInputs):
+            log_mass, inner = self._condition(state.base)
+            return log_mass, state._replace(base=inner)
+        if hasattr(state, "believed"):
+            log_mass, inner = self._condition(state.believed)
+            return log_mass, state._replace(believed=inner)
+        if isinstance(state, StateParticles):
+            return self._condition_particles(state)
+        held = self._hold(state)
+        x = Gaussian(*map(jnp.asarray, gaussian_of(held)))
+        if x.mean.ndim == 1:
+            log_mass, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], x), self.limits)
+            return log_mass[0], with_gaussian(held, jax.tree.map(lambda leaf: leaf[0], inside))
+        # Of a mixture each Gaussian by itself, and their weights by the probability of each.
+        log_masses, inside = truncate_to_limits(x, self.limits)
+        weight = jnp.asarray(held.weight)
+        left = weight * jnp.exp(log_masses).reshape(-1, *[1] * (weight.ndim - 1))
+        mass = jnp.sum(left)
+        some = mass > 0
+        weight = jnp.where(some, left / jnp.where(some, mass, 1.0), weight)
+        log_mass = jnp.where(some, jnp.log(jnp.where(some, mass, 1.0)), -jnp.inf)
+        return log_mass, held._replace(gaussian=inside, weight=weight)
+
+    def _condition_particles(self, state: StateParticles) -> tuple[jax.Array, StateParticles]:
+        """Leave out the particles that are not within; all stay where none is."""
+        inside = jnp.ones(len(state.log_weight), bool)
+        for place, low, high in self.limits:
+            value = jnp.asarray(state.position)[:, place]
+            inside = inside & (low <= value) & (value <= high)
+        left = jnp.where(inside, state.log_weight, -jnp.inf)
+        log_mass = jax.nn.logsumexp(left) - jax.nn.logsumexp(state.log_weight)
+        some = jnp.any(jnp.isfinite(left))
+        top = jnp.where(some, jnp.max(left), 0.0)
+        return log_mass, state._replace(log_weight=jnp.where(some, left - top, state.log_weight))
+
+
+def _is_particles(state: PyTree) -> bool:
+    return isinstance(getattr(state, "base", state), StateParticles)
+
+
+def without_limits(plant: AnyPlant) -> AnyPlant:
+    """Return the plant without limits of its states."""
+
+    def drop(step: AbstractPlant) -> AbstractPlant:
+        free = copy(step)
+        object.__setattr__(free, "limits", ())
+        return free
+
+    free: AnyPlant = at_each_step(drop, plant)
+    return free
+
+
+def keeps_limits(make: Callable[P, F]) -> Callable[P, F]:
+    """Let a function that makes a filter take plants whose states have limits, by a `LimitedFilter` of what it makes.
+
+    Args:
+        make: a function of a plant and more, whose filter keeps Gaussians or particles.
+    """
+    parameters = inspect.signature(make)
+
+    @wraps(make)
+    def build(*args: P.args, **kwargs: P.kwargs) -> F:
+        given = parameters.bind(*args, **kwargs)
+        plant = given.arguments.get("plant")
+        start = first(plant)
+        if not isinstance(start, AbstractPlant) or not start.limits:
+            return make(*args, **kwargs)
+        given.arguments["plant"] = without_limits(cast(Any, plant))
+        return cast(F, _limit(make(*given.args, **given.kwargs), cast(Any, plant)))
+
+    return build
+
+
+def _limit(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
+    """Return the filter of the plant with limits, from that of the plant without."""
+    start = first(plant)
+    limits = tuple((start.states.index(name), low, high) for name, (low, high) in start.limits)
+    claim: Claim = weakest([base.claim, "nominal"])
+    limited = LimitedFilter(base=base, limits=limits, **make_sizes(claim, base, base.received))
+    premise = base.premise
+    return believing(limited, premise and premise.replaced(plant=plant))
