@@ -149,14 +149,15 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
     noise = _noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
     size = dict(zip(plant.states, s, strict=True))
     limits = {name: (size[name] * low, size[name] * high) for name, (low, high) in plant.limits}
-    names = {"states": plant.states, "inputs": plant.inputs, "circular": plant.circular, "limits": limits}
+    names = plant.states, plant.inputs, plant.circular
     if isinstance(plant, LinearPlant):
         matrix, entry = (
             InUnits(given.function, s[:, None] / by, (u,)) if isinstance(given, OfInputs) else s[:, None] * given / by
             for given, by in ((plant.matrix, s), (plant.input_matrix, u))
         )
-        return LinearPlant(matrix, noise, center, law, entry, **names)
-    return Plant(InUnits(plant.transition, s, (s, u)), noise, center, law, **names, attitude=plant.attitude)
+        return LinearPlant(matrix, noise, center, law, entry, *names, limits=limits)
+    move = InUnits(plant.transition, s, (s, u))
+    return Plant(move, noise, center, law, *names, attitude=plant.attitude, limits=limits)
 
 
 def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
