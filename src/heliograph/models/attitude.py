@@ -74,11 +74,12 @@ def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*an
 def _read(name: str, value: ArrayLike, last: int) -> Any:
     """Return an array of JAX as it is, any other as doubles, NaN for what is missing; check its last axis."""
     if isinstance(value, jax.Array):
-        if jnp.shape(value)[-1:] != (last,):
-            raise fail(name, f"shape (..., {last})", f"shape {jnp.shape(value)}")
-        return value
-    try:
-        free = max(np.ndim(value) - 1, 0)
-    except (TypeError, ValueError):  # no array, which the check names
-        free = 0
-    return array(name, value, (*(None for _ in range(free)), last), missing=True)
+        read = value
+    else:
+        try:
+            read = array(name, value, (None,) * np.ndim(value), missing=True)
+        except (TypeError, ValueError):
+            read = array(name, value, (last,), missing=True)  # no array of numbers, which this names
+    if jnp.shape(read)[-1:] != (last,):
+        raise fail(name, f"shape (..., {last})", f"shape {jnp.shape(read)}")
+    return read

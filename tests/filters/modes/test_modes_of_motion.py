@@ -218,7 +218,6 @@ def test_estimates_of_modes_stand_in_tables_and_go_both_ways():
         (lambda a, b: hg.markov_plant([a, b, a], ROWS), "models: expected 2, one for each mode"),
         (lambda a, b: hg.markov_plant([a, b]), "chain of the modes: expected transition="),
         (lambda a, b: hg.cubature_filter(motion(), SENSOR, LINK), "imm_filter, gpb1_filter and gpb2_filter"),
-        (lambda a, b: hg.filters.particle_filter(motion(), SENSOR, LINK), "imm_filter and gpb2_filter"),
         (lambda a, b: hg.linear_filter(motion(), SENSOR, LINK), "of one law .imm_filter"),
     ],
 )  # fmt: skip

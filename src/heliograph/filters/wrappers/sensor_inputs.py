@@ -25,6 +25,7 @@ from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believing
 from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -80,6 +81,11 @@ class FilterOfInputs(AbstractWrapper):
         """Return the smoother step of the filter of the sensor under the inputs of this step."""
         filter = self._filter_under(jnp.asarray(step.u), step.k)
         return filter.smoother_step(step.map_states(self.within))
+
+    @property
+    def attitude(self) -> Angles:
+        """Return the places of attitudes among the states of the filter within."""
+        return self.base.attitude
 
     def _filter_under(self, u: Array, k: Step) -> AbstractFilter:
         now = at(self.sensor, k).under(self.inputs, u)

@@ -14,7 +14,6 @@ from heliograph.filters.base import (
     predicts,
 )
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
 
@@ -22,9 +21,9 @@ from heliograph.numerics.types import ArrayLike, PyTree
 class AbstractWrapper(AbstractSizedFilter):
     """A filter around another, `base`, of whose states it estimates the first ones: mostly all of them.
 
-    A final class defines what it does otherwise. One that keeps more than the state of `base` says where that is, in
-    `within`, and defines `init`, `predict` and `correct`. Smoothing is not handed on: whoever changes a step says how
-    the way back changes.
+    A final class defines what it does otherwise, and says itself whether it turns attitudes. One that keeps more than
+    the state of `base` says where that is, in `within`, and defines `init`, `predict` and `correct`. Smoothing is not
+    handed on: whoever changes a step says how the way back changes.
     """
 
     base: eqx.AbstractVar[AbstractFilter]
@@ -61,11 +60,6 @@ class AbstractWrapper(AbstractSizedFilter):
         """Return the angles of the filter within, of its states those that are estimated."""
         angles = self.base.angles_used()
         return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
-
-    @property
-    def attitude(self) -> Angles:
-        """Return the places of attitudes among the states that are estimated."""
-        return tuple(i for i in self.base.attitude if i < len(self.states))
 
     @property
     def of_atoms(self) -> bool:
