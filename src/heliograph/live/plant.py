@@ -10,7 +10,6 @@ from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.leap import ARRIVAL, Leap, Moments, find_leap
 from heliograph.live.rows import HeldRow, Key, Rows
 from heliograph.model.stuck import Repeats
-from heliograph.numerics.check import fail, show_value
 
 NO_REPEATS = Repeats()
 GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
@@ -75,11 +74,7 @@ class LinkCounts:
 
     def __post_init__(self) -> None:
         """Take runs of equal readings as they were stored."""
-        pair = self.repeats if isinstance(self.repeats, tuple | list) else ()
-        if len(pair) != 2 or not all(isinstance(part, tuple | list) for part in pair):
-            raise fail("repeats", "newest readings, and how many in a row are equal to them", show_value(self.repeats))
-        newest, lengths = pair
-        self.repeats = Repeats(tuple(newest), tuple(lengths))
+        self.repeats = Repeats.read(self.repeats)
 
     def count_screened(self, screened: ScreenedEvent, verdict: Verdict) -> None:
         """Count the values that count as not arrived, of an event that was no copy and of a time that could be used."""

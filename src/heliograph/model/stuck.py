@@ -37,6 +37,18 @@ class Repeats(NamedTuple):
     newest: tuple[float, ...] = ()
     lengths: tuple[int, ...] = ()
 
+    @staticmethod
+    def read(stored: object) -> "Repeats":
+        """Return runs that were stored: a pair of lists, or the runs themselves.
+
+        Raises:
+            ValueError: no such pair.
+        """
+        pair = stored if isinstance(stored, tuple | list) else ()
+        if len(pair) != 2 or not all(isinstance(part, tuple | list) for part in pair):
+            raise fail("repeats", "newest readings, and how many in a row are equal to them", show_value(stored))
+        return Repeats(tuple(pair[0]), tuple(pair[1]))
+
 
 def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[np.ndarray, "time m"], Repeats]:
     """Count how many equal readings in a row end with each one; 0 where nothing arrived, which ends no run.
