@@ -6,7 +6,7 @@ from .availability import (
 from .bags.output import (
     Pose as Pose,
 )
-from .sources.computed import (
+from .sources.derived import (
     Covariance as Covariance,
     Geodetic as Geodetic,
     Yaw as Yaw,

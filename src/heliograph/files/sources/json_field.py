@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.files.availability import Available
-from heliograph.files.sources.computed import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
+from heliograph.files.sources.derived import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
 from heliograph.files.sources.fields import TimeUnit, at, convert_name
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.availability import LastWords
-from heliograph.files.sources.computed import Computed, ZeroIfAbsent
+from heliograph.files.sources.derived import Computed, ZeroIfAbsent
 from heliograph.files.sources.fields import (
     MissingFieldError,
     at,
