@@ -15,7 +15,8 @@ from jaxtyping import PyTree
 
 from straightline.folding import DTYPES
 from straightline.limits import ALONE, LITTLE, LONGEST
-from straightline.llvm.module import LINE, Code, write_module
+from straightline.llvm.layout import LINE
+from straightline.llvm.module import Code, write_module
 from straightline.machine import Machine, Tiers, features, generate, narrow
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower

@@ -1,24 +1,25 @@
-"""Functions of a compiled program as text of LLVM IR, and the layout of its numbers in memory."""
+"""Functions of a compiled program as text of LLVM IR: for blocks of runs, and for what all runs share."""
 
 import math
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from straightline.folding import DTYPES
 from straightline.limits import LONGEST, TABLE
 from straightline.llvm.lanes import WIDTH, gather, lane_numbers, types, write_flush
+from straightline.llvm.layout import FILLED, LINE, Layout, Parts, lay_out
 from straightline.llvm.operations import BITS
 from straightline.llvm.prefetch import Rows, longest, share
-from straightline.llvm.text import Slots, Writer, loops_of, turns_of
+from straightline.llvm.text import Slots, Writer, turns_of
 from straightline.llvm.transposed import mover, mover_name
 from straightline.lowering import Lowering, Value, refusing
 from straightline.memory import InMemory, contiguous
-from straightline.nodes import REAL, Buffer, Loop, Node, Type, Unsupported
+from straightline.nodes import Buffer, Loop, Node, Type, Unsupported
 from straightline.program import (
     Program,
     Summed,
@@ -28,15 +29,12 @@ from straightline.program import (
     products_of,
     row_length,
     sort_items,
-    uses,
 )
 from straightline.rules.loops import copied
 from straightline.rules.random_bits import hash_function
 from straightline.vectors.elementary import functions
 
-LINE = 64  # bytes: where vectors of any width may start
 WIDEST = 8  # runs of a vector of doubles: one register of the widest processors, two of others; more only spill
-FILLED = ("scratch", "carried")  # kinds of memory that the program fills
 SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
 
 
@@ -146,56 +144,44 @@ def write_module(
     outputs = output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
     items = sort_items(list_needed(outputs))
-    counts = Counter([x.op for x in items if isinstance(x, Node)])
-    operations = counts.total() - counts["constant"]
-    if operations > LONGEST:
-        raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
-    width = width or widest(items)
-    # Numbers that differ between runs; all others are computed once.
+    counts = _count_operations(items)
+    # What differs between runs, and where it lies.
     spread = {*items, *program.inputs} if alone else find_differing(items, lanes)
-    products = products_of(items) if fuse else set()
-    tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
-    common = [b not in spread for b in outputs]
-    spread -= set(tables)
-    # Layout: per thread in scratch memory, shared by all runs in shared memory.
-    owners = dict.fromkeys(x.owner[0] for x in items if isinstance(x, Buffer))
-    added = set() if summed is None else {b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in spread}
-    _check_sums(items, added)
-    scratch, in_scratch = _place_buffers(
-        [
-            b
-            for b in owners
-            if b not in added and b in spread and b.kind != "table" and not (alone and (b in outputs or b in lanes))
-        ],
-        width,
-        0,
-    )
+    spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
+    parts = Parts(program, items, outputs, lanes, spread, alone, width or widest(items), summed)
     mine = crossing(items, spread)
-    # What blocks read of memory that is filled anew in each turn of a loop has a place for each turn.
-    turning = {b for b in owners if b not in spread and b.kind in FILLED and loops_of(b.block)}
-    turning &= _read(mine) if turning else turning
-    shared, in_shared = _place_buffers([b for b in owners if b not in spread and b.kind in FILLED], 1, 0, turning)
+    layout = lay_out(parts, mine)
     # The function of blocks computes what differs, and reads the rest from slots.
-    slots = Slots(shared)
-    pointers = [*program.inputs, *tables, *outputs]
-    blocks = Writer(alone, mine, products, spread, slots)
-    blocks.turning = turning
-    blocks.flushes = flushes = _is_single(items)
-    text, movers = _write_blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, width, summed)
+    slots = Slots(layout.shared)
+    blocks = Writer(alone, mine, products_of(items) if fuse else set(), spread, slots)
+    blocks.turning, blocks.flushes = layout.turning, _is_single(items)
+    source = _write_blocks(blocks, parts, layout)
     # The other function fills these slots, once for all runs.
-    roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind in FILLED)]
-    roots += [b for b, c in zip(outputs, common, strict=True) if c]
-    once = None
-    if roots:
-        writer = Writer(True, list_needed(roots), products, set(), slots)
-        writer.turning, writer.flushes = turning, flushes
-        once = _finish_source(_write_shared(writer, program, pointers, in_shared), writer, [])
-    arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
-    places = [in_shared.get(b, 0) for b in outputs]
-    source, results = _finish_source(text, blocks, movers), [Output(b.type, b.shape) for b in outputs]
-    divisions = counts["div"] + counts["sqrt"]
+    once = _write_once(blocks, parts, layout)
+    arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in parts.tables if b.table is not None]
     program.graph.top.let_go()
-    return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions, width)
+    return Code(
+        blocks=source,
+        once=once,
+        tables=arrays,
+        outputs=[Output(b.type, b.shape) for b in outputs],
+        common=parts.common,
+        places=[layout.in_shared.get(b, 0) for b in outputs],
+        shared=slots.size,
+        scratch=layout.scratch + LINE,
+        operations=counts.total(),
+        divisions=counts["div"] + counts["sqrt"],
+        width=parts.width,
+    )
+
+
+def _count_operations(items: Iterable[Any]) -> Counter[str]:
+    """Count the operations by name, constants aside; raise if they are too many."""
+    counts = Counter([x.op for x in items if isinstance(x, Node)])
+    del counts["constant"]
+    if counts.total() > LONGEST:
+        raise Unsupported(f"a program of {counts.total()} operations, above {LONGEST}")
+    return counts
 
 
 def widest(items: Iterable[Any]) -> int:
@@ -208,19 +194,6 @@ def _is_single(items: Iterable[Any]) -> bool:
     """Return whether real numbers are all of single precision."""
     types_ = {x.type for x in items if isinstance(x, Node)}
     return "f32" in types_ and "f64" not in types_
-
-
-def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
-    """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
-    read = _read(items) if outputs else set()
-    if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
-        raise Unsupported("a sum over runs of numbers that are used again")
-
-
-def _read(items: Iterable[Any]) -> set[Buffer]:
-    """Return the buffers that these items, or what they use directly, load numbers of."""
-    nodes = (node for x in items for node in (x, *uses(x)) if isinstance(node, Node))
-    return {node.value[0].owner[0] for node in nodes if node.op == "load"}
 
 
 def _finish_source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -> Source:
@@ -239,39 +212,13 @@ def _finish_source(text: str, writer: Writer, movers: Sequence[Callable[[int], s
     return Source(zlib.compress(text.encode(), 1), helpers, counts.total(), work)
 
 
-def _place_buffers(
-    buffers: Iterable[Buffer], width: int, start: int, turning: Collection[Buffer] = ()
-) -> tuple[int, dict[Buffer, int]]:
-    """Place buffers one after another; return the end and each one's offset, in bytes; of some one for each turn."""
-    places: dict[Buffer, int] = {}
-    for buffer in buffers:
-        places[buffer] = start
-        copies = turns_of(buffer.block) if buffer in turning else 1
-        start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
-    return start, places
-
-
 HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 
 
-def _write_blocks(
-    writer: Writer,
-    program: Program,
-    pointers: list[Buffer],
-    lanes: list[Buffer],
-    outputs: list[Buffer],
-    in_scratch: dict[Buffer, int],
-    in_shared: dict[Buffer, int],
-    alone: bool,
-    width: int,
-    summed: Summed | None,
-) -> tuple[str, list[Callable[[int], str]]]:
-    """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back.
-
-    Return it with what writes the functions that move inputs and outputs.
-    """
-    names = _write_pointers(writer, pointers, in_shared)
-    for buffer, offset in in_scratch.items():
+def _write_blocks(writer: Writer, parts: Parts, layout: Layout) -> Source:
+    """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
+    names = _write_pointers(writer, parts.pointers, layout.in_shared)
+    for buffer, offset in layout.in_scratch.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
     # Loop over blocks; the block `number` has runs from `first` on.
     writer.line("%last = sub i64 %runs, 1")
@@ -279,31 +226,15 @@ def _write_blocks(
     writer.start("block")
     writer.line("%number = phi i64 [%begin, %entry], [%next, %done]")
     writer.line(f"%first = mul i64 %number, {WIDTH}")
-    movers = set[tuple[int, bool, bool]]()
-
-    def move(kind: str, buffer: Buffer) -> None:
-        mover_kind = BITS[buffer.type], kind == "take", buffer.type in SQUARED
-        movers.add(mover_kind)
-        pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
-        writer.line(f"call void @{mover_name(*mover_kind)}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
-
-    # Inputs to lanes, the operations, lanes to outputs; the longest loop asks for the memory of these to come.
-    taken = [] if alone else [b for b in lanes if b in in_scratch and b.size]
-    given = [] if alone else [b for b in outputs if b in in_scratch and b.size]
-    for buffer in taken:
-        move("take", buffer)
-    writer.asking = longest(x for x in program.graph.top.items if x in writer.mine)
-    if writer.asking is not None:
-        writer.asked = _locate_rows(writer, names, taken, given, width, writer.asking)
-    helpers: list[Callable[[int], str]] = []
-    if summed is not None:
-        helpers.append(lane_numbers)
-        added = [b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in writer.spread]
-        _add(writer, summed, names, program.inputs[summed.number], added, width)
-    writer.block(program.graph.top)
-    for buffer in given:
-        if buffer not in writer.sums:
-            move("give", buffer)
+    # Inputs to lanes, the operations, lanes to outputs.
+    moved = set() if parts.alone else {b for b in layout.in_scratch if b.size}
+    taken, given = [b for b in parts.lanes if b in moved], [b for b in parts.outputs if b in moved]
+    movers = {_write_move(writer, names, buffer, "take") for buffer in taken}
+    _ask_for_rows(writer, parts, names, taken, given)
+    if parts.summed is not None:
+        _add(writer, parts.summed, names, parts.program.inputs[parts.summed.number], parts.added, parts.width)
+    writer.block(parts.program.graph.top)
+    movers |= {_write_move(writer, names, buffer, "give") for buffer in given if buffer not in writer.sums}
     # Next block.
     writer.line("br label %done")
     writer.start("done")
@@ -311,9 +242,28 @@ def _write_blocks(
     writer.line("%more = icmp slt i64 %next, %end")
     writer.line("br i1 %more, label %block, label %exit")
     writer.start("exit")
-    body = "\n".join(writer.lines)
+    helpers: list[Callable[[int], str]] = [] if parts.summed is None else [lane_numbers]
     helpers += [partial(mover, *kind) for kind in sorted(movers)]
-    return _run(body, writer), helpers
+    return _finish_source(_run("\n".join(writer.lines), writer), writer, helpers)
+
+
+def _write_move(
+    writer: Writer, names: dict[Buffer, str], buffer: Buffer, kind: Literal["take", "give"]
+) -> tuple[int, bool, bool]:
+    """Write the call that takes a buffer's rows into lanes or gives them back; return what it calls."""
+    called = BITS[buffer.type], kind == "take", buffer.type in SQUARED
+    pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
+    writer.line(f"call void @{mover_name(*called)}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
+    return called
+
+
+def _ask_for_rows(
+    writer: Writer, parts: Parts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
+) -> None:
+    """Let the longest loop, if there is one, ask for the memory of inputs and outputs before it is used."""
+    writer.asking = longest(x for x in parts.program.graph.top.items if x in writer.mine)
+    if writer.asking is not None:
+        writer.asked = _locate_rows(writer, names, taken, given, parts.width, writer.asking)
 
 
 def _locate_rows(
@@ -349,12 +299,17 @@ def _add(
         writer.sums[buffer] = row_length(width, summed.batches)
 
 
-def _write_shared(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:
-    """Write the function that computes what all runs share."""
-    _write_pointers(writer, pointers, in_shared)
-    writer.block(program.graph.top)
-    body = "\n".join(writer.lines)
-    return _run(body, writer)
+def _write_once(blocks: Writer, parts: Parts, layout: Layout) -> Source | None:
+    """Write the function that computes what all runs share, if blocks read it or a caller gets it."""
+    shared_outputs = [b for b, is_common in zip(parts.outputs, parts.common, strict=True) if is_common]
+    roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
+    if not roots:
+        return None
+    writer = Writer(True, list_needed(roots), blocks.products, set(), blocks.slots)
+    writer.turning, writer.flushes = blocks.turning, blocks.flushes
+    _write_pointers(writer, parts.pointers, layout.in_shared)
+    writer.block(parts.program.graph.top)
+    return _finish_source(_run("\n".join(writer.lines), writer), writer, [])
 
 
 def _run(body: str, writer: Writer) -> str:

@@ -293,14 +293,7 @@ class Writer:
             self.lines += [f"  {line}" for line in write_requests(rows, loop.length or 1, counter, WIDTH, self.add)]
         # Counted: body, then the latch. Conditional: the check is inside the body.
         if loop.condition is None:
-            self.block(loop.body)
-            following = [self.operand(loop.following[k]) for k in moving]
-            self.line(f"br label %{name}.latch")
-            self.start(f"{name}.latch")
-            self.line(f"{counter}.next = add i64 {counter}, 1")
-            self.line(f"%{name}.more = icmp slt i64 {counter}.next, {loop.length}")
-            self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
-            finals = following
+            following = finals = self._write_counted_loop(loop, name, counter, moving)
         else:
             following, finals = self._write_conditional_loop(loop, name, moving)
         # The phi nodes come first, but their arguments are known only now.
@@ -313,6 +306,17 @@ class Writer:
         self.scopes.pop()
         for k, final in zip(moving, finals, strict=True):
             self._keep(loop.results[k], final)
+
+    def _write_counted_loop(self, loop: Loop, name: str, counter: str, moving: list[int]) -> list[str]:
+        """Write the body and the latch of a loop of known length; return the names of what it carries on."""
+        self.block(loop.body)
+        following = [self.operand(loop.following[k]) for k in moving]
+        self.line(f"br label %{name}.latch")
+        self.start(f"{name}.latch")
+        self.line(f"{counter}.next = add i64 {counter}, 1")
+        self.line(f"%{name}.more = icmp slt i64 {counter}.next, {loop.length}")
+        self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
+        return following
 
     def _write_conditional_loop(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
         """Write a loop that ends when no lane's condition holds."""

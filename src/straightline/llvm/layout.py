@@ -1,0 +1,107 @@
+"""What of a program differs between runs, and where its numbers lie in memory."""
+
+from collections.abc import Collection, Iterable
+from typing import Any, NamedTuple
+
+from straightline.llvm.operations import BITS
+from straightline.llvm.text import loops_of, turns_of
+from straightline.nodes import REAL, Buffer, Node, Unsupported
+from straightline.program import Program, Summed, uses
+
+LINE = 64  # bytes: where vectors of any width may start
+FILLED = ("scratch", "carried")  # kinds of memory that the program fills
+
+
+class Parts(NamedTuple):
+    """Items of a program in order, and what of them differs between runs: `spread`; all else is computed once.
+
+    `lanes` are the inputs that differ. `alone`: there is one run, whose arrays are used in place. A vector has at most
+    `width` runs.
+    """
+
+    program: Program
+    items: list[Any]
+    outputs: list[Buffer]
+    lanes: list[Buffer]
+    spread: set[Any]
+    alone: bool
+    width: int
+    summed: Summed | None
+
+    @property
+    def tables(self) -> list[Buffer]:
+        """Return the tables of constants that the items read."""
+        return [x for x in self.items if isinstance(x, Buffer) and x.kind == "table"]
+
+    @property
+    def pointers(self) -> list[Buffer]:
+        """Return the buffers whose addresses a caller passes."""
+        return [*self.program.inputs, *self.tables, *self.outputs]
+
+    @property
+    def common(self) -> list[bool]:
+        """Return which outputs all runs share."""
+        return [b not in self.spread for b in self.outputs]
+
+    @property
+    def added(self) -> list[Buffer]:
+        """Return the outputs that are summed over runs."""
+        if self.summed is None:
+            return []
+        pairs = zip(self.outputs, self.summed.outputs, strict=True)
+        return [b for b, is_sum in pairs if is_sum and b in self.spread]
+
+
+class Layout(NamedTuple):
+    """Offsets of buffers, and their ends, in bytes: of memory that belongs to a thread, and that all runs share.
+
+    `turning` are shared buffers within loops that have a place for each turn.
+    """
+
+    scratch: int
+    in_scratch: dict[Buffer, int]
+    shared: int
+    in_shared: dict[Buffer, int]
+    turning: set[Buffer]
+
+
+def lay_out(parts: Parts, mine: Collection[Any]) -> Layout:
+    """Place what differs between runs in the memory of a thread, and what the program fills for all in shared memory.
+
+    `mine` are the items of the function of blocks. What it reads of memory that is filled anew in each turn of a loop
+    has a place for each turn.
+    """
+    owners = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
+    added = set(parts.added)
+    _check_sums(parts.items, added)
+    used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
+    own = [b for b in owners if b in parts.spread and b not in added and b not in used_in_place]
+    common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
+    turning = {b for b in common if loops_of(b.block)}
+    turning &= _read(mine) if turning else turning
+    return Layout(*_place_buffers(own, parts.width), *_place_buffers(common, 1, turning), turning)
+
+
+def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
+    """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
+    read = _read(items) if outputs else set()
+    if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
+        raise Unsupported("a sum over runs of numbers that are used again")
+
+
+def _read(items: Iterable[Any]) -> set[Buffer]:
+    """Return the buffers that these items, or what they use directly, load numbers of."""
+    nodes = (node for x in items for node in (x, *uses(x)) if isinstance(node, Node))
+    return {node.value[0].owner[0] for node in nodes if node.op == "load"}
+
+
+def _place_buffers(
+    buffers: Iterable[Buffer], width: int, turning: Collection[Buffer] = ()
+) -> tuple[int, dict[Buffer, int]]:
+    """Place buffers one after another; return the end and each one's offset, in bytes; of some one for each turn."""
+    start, places = 0, dict[Buffer, int]()
+    for buffer in buffers:
+        places[buffer] = start
+        copies = turns_of(buffer.block) if buffer in turning else 1
+        start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
+    return start, places
