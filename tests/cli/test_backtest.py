@@ -41,6 +41,23 @@ def test_a_backtest_is_a_page_by_horizon(call, tmp_path, capsys):
     assert "end within the 60 rows of data" in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_the_headline_is_what_each_filters_forecasts_are_worth(call, tmp_path):
+    """The right filter holds; one that believes a hundredth of the noises is too sure, which is said once."""
+    told = NETWORK.replace(
+        '{"f": hg.kalman_filter(plant, sensor)}',
+        """{
+        "right": hg.kalman_filter(plant, sensor),
+        "sure": hg.kalman_filter(hg.LinearPlant([[0.9]], 0.005, [0.0], 2.0, states=["level"]), sensor),
+    }""",
+    )
+    (tmp_path / "level.py").write_text(told)
+    assert cli.main([*call, "--horizons", "1,5"]) == 0
+    page = (tmp_path / "results" / "backtest" / "report.html").read_text()
+    assert "Forecasts of a/right hold, those of a/sure are too sure" in page
+    assert page.count("furthest off") == 1 and "a/right: all 6 intervals held" in page
+
+
 def test_horizons_are_rows(call, capsys):
     assert cli.main([*call, "--horizons", "5s"]) == 2
     assert "--horizons: expected numbers of rows" in capsys.readouterr().err

@@ -1,16 +1,18 @@
 """Page of a backtest: what forecasts said ahead, and what came, by horizon."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import matplotlib
+import matplotlib.ticker
 import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.report.figures import COLOURS, MUTED, STYLE, WIDTH, place_legend_above
+from heliograph.report.figures import COLOURS, MUTED, STYLE, place_legend_above, stacked_panels
 from heliograph.report.outputs import round_to
-from heliograph.report.pages.page import Page, Picture, Points, Section, Table, Text
+from heliograph.report.pages.page import Page, Picture, Points, Section, Table
 from heliograph.report.results import Json, Results
 
 if TYPE_CHECKING:
@@ -19,6 +21,58 @@ if TYPE_CHECKING:
 FAR = 3.0  # standard errors beyond which a coverage is doubted
 SHARES = ("50 %", "80 %", "95 %")
 CLAIMED = (0.5, 0.8, 0.95)
+DRAWN = 1  # of these, the interval that the figure shows
+PANELS = 6  # numbers that it shows; the table has all
+LISTED = 3  # filters of which the page speaks before its table
+
+
+@dataclass(frozen=True)
+class Miss:
+    """An interval that held another share of what came than it claims, by more than chance explains."""
+
+    score: "heliograph.forecasting.Score"
+    level: int  # of SHARES
+
+    @property
+    def excess(self) -> float:
+        """The share that was inside less the share that was claimed."""
+        return self.score.coverage[self.level].value - CLAIMED[self.level]
+
+    def describe(self) -> str:
+        """Say which interval held how much."""
+        s, share = self.score, self.score.coverage[self.level]
+        return (f"{s.part} {s.name}, {s.horizon} ahead: the interval of {SHARES[self.level]} held {share.value:.1%} "
+                f"+- {share.error:.1%}: {'too sure' if self.excess < 0 else 'too cautious'}")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FilterVerdict:
+    """What a filter's forecasts were worth: how many intervals were compared, and those that did not hold."""
+
+    name: str
+    compared: int
+    misses: Sequence[Miss]
+
+    def summarise(self) -> str:
+        """Say in a word whether its forecasts hold."""
+        sure = {miss.excess < 0 for miss in self.misses}
+        return (
+            "hold"
+            if not sure
+            else "are too sure"
+            if sure == {True}
+            else "are too cautious"
+            if sure == {False}
+            else "are off"
+        )
+
+    def describe(self) -> str:
+        """Say it with numbers, and with the interval that is furthest off."""
+        if not self.misses:
+            return f"{self.name}: all {self.compared} intervals held what they claim, as far as chance lets tell."
+        worst = max(self.misses, key=lambda miss: abs(miss.excess))
+        failed = f"{len(self.misses)} of {self.compared} intervals did not hold"
+        return f"{self.name}: {failed}; furthest off {worst.describe()}."
 
 
 def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str, refit: int = 0) -> Results:
@@ -36,34 +90,48 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
     )
 
 
+def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
+    """Compare the intervals of each filter with what came; the filters that are furthest off come first."""
+    verdicts = []
+    for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
+        scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and s.compared]
+        misses = [
+            miss
+            for s in scores
+            for miss in (Miss(s, level) for level in range(len(SHARES)))
+            if abs(miss.excess) > FAR * s.coverage[miss.level].error
+        ]
+        verdicts.append(FilterVerdict(name, len(SHARES) * len(scores), misses))
+    return sorted(verdicts, key=lambda v: -len(v.misses) / max(v.compared, 1))
+
+
 def list_doubts(found: "heliograph.forecasting.Backtest") -> list[str]:
     """List coverages that are further from what was claimed than chance explains, a line each."""
-    return [
-        f"{s.node}/{s.filter}, {s.part} {s.name}, {s.horizon} ahead: the interval of {said} held {share.value:.1%} "
-        f"+- {share.error:.1%}: {'too sure' if share.value < claimed else 'too cautious'}"
-        for s in found.scores
-        for said, claimed, share in zip(SHARES, CLAIMED, s.coverage, strict=True)
-        if abs(share.value - claimed) > FAR * share.error
-    ]
+    return [f"{v.name}, {miss.describe()}" for v in judge_filters(found) for miss in v.misses]
 
 
 @matplotlib.rc_context(STYLE)
 def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
-    """Return the share within the intervals of 80 and 95 % over the horizon, with two standard errors on each side."""
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    axes = figure.subplots()
-    named = list(dict.fromkeys((s.node, s.filter, s.part, s.name) for s in found.scores))
-    for number, key in enumerate(named):
-        scores = [s for s in found.scores if (s.node, s.filter, s.part, s.name) == key]
-        for place, marker in ((1, "s"), (2, "o")):
-            shares, errors = zip(*((s.coverage[place].value, 2 * s.coverage[place].error) for s in scores), strict=True)
-            label = quote_for_figure(f"{key[0]}/{key[1]} {key[3]}") if place == 2 else None
-            colour, places = COLOURS[number % len(COLOURS)], [s.horizon for s in scores]
-            axes.errorbar(places, shares, errors, label=label, color=colour, marker=marker, markersize=4, linewidth=1)
-    for claimed in CLAIMED[1:]:
-        axes.axhline(claimed, color=MUTED, linewidth=1)
-    axes.set(xlabel="rows ahead", ylabel="share inside", ylim=(None, 1.02), xticks=found.horizons)
-    place_legend_above(figure, axes, 2)
+    """Draw the share within the interval of 80 % over the horizon, a panel a number and a line a filter."""
+    numbers = list(dict.fromkeys((s.node, s.part, s.name) for s in found.scores))[:PANELS]
+    filters = list(dict.fromkeys(s.filter for s in found.scores))
+    nodes = {node for node, _, _ in numbers}
+    figure, panels = stacked_panels(len(numbers), 1.3, 0.9)
+    for axes, (node, part, name) in zip(panels, numbers, strict=True):
+        for place, one in enumerate(filters):
+            scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, one)]
+            shares = [s.coverage[DRAWN] for s in scores]
+            apart = 0.04 * (place - (len(filters) - 1) / 2)  # on a scale of logarithms, so that none hides another
+            axes.errorbar([s.horizon * np.exp(apart) for s in scores], [x.value for x in shares],
+                          [2 * x.error for x in shares], label=quote_for_figure(one) if axes is panels[0] else None,
+                          color=COLOURS[place % len(COLOURS)], marker="o", markersize=4, linewidth=1)  # fmt: skip
+        axes.axhline(CLAIMED[DRAWN], color=MUTED, linewidth=1, linestyle="--")
+        axes.set_title(quote_for_figure(f"{part} {name}" if len(nodes) == 1 else f"{node}: {part} {name}"))
+        axes.set(ylim=(-0.03, 1.03), yticks=[0, 0.4, 0.8], xscale="log")
+        axes.set_xticks(found.horizons, [str(h) for h in found.horizons])
+        axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
+    panels[-1].set_xlabel("rows ahead")
+    place_legend_above(figure, panels[0], 2)
     return figure
 
 
@@ -71,22 +139,32 @@ def make_backtest_page(
     found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes], refit: int = 0
 ) -> Page:
     """Return the page; `drawings` holds each figure as SVG, `refit` is how many rows lay between fits, 0 for none."""
-    doubts = [visible(line) for line in list_doubts(found)]
-    title = f"{len(doubts)} claims ahead do not hold" if doubts else "What was said ahead held"
+    verdicts = judge_filters(found)
     lead = (
         f"From each of {found.rows:,} rows `{visible(network)}` forecast {', '.join(map(str, found.horizons))} rows "
         "ahead, as if nothing more arrived; scored is what came."
         + (f" Its free numbers were fitted every {refit} rows, to those before." if refit else "")
     )
     caption = (
-        "Share of what came within the intervals of 80 % (squares) and 95 % (dots), with two standard errors, which "
-        "know that forecasts overlap; the lines are what was claimed."
+        f"Share of what came within the interval of {SHARES[DRAWN]}, with two standard errors, which know that "
+        "forecasts overlap; the dashed line is what was claimed."
     )
-    parts: list[Picture | Table] = [Picture(drawings["coverage"], caption, caption), _make_score_table(found)]
-    none = "No coverage is further from its claim than chance explains."
-    said = Points(doubts) if doubts else Text([none])
-    return Page(f"Heliograph backtest: {visible(network)}", title, lead,
-                [Section("At a glance", [said]), Section("By horizon", parts)])  # fmt: skip
+    more = len({(s.node, s.part, s.name) for s in found.scores}) - PANELS
+    caption += f" {more} more numbers are in the table." if more > 0 else ""
+    said = [visible(v.describe()) for v in verdicts[:LISTED]]
+    if len(verdicts) > LISTED:
+        said.append(f"{len(verdicts) - LISTED} more filters, none of them further off: in the table.")
+    by_horizon: list[Picture | Table] = [Picture(drawings["coverage"], caption, caption), _make_score_table(found)]
+    return Page(f"Heliograph backtest: {visible(network)}", _make_title(verdicts), lead,
+                [Section("At a glance", [Points(said)]), Section("By horizon", by_horizon)])  # fmt: skip
+
+
+def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
+    """Return the result in a line: of two filters what the forecasts of each are worth, of more how many hold."""
+    if len(verdicts) > 2:
+        held = sum(not v.misses for v in verdicts)
+        return f"The forecasts of {held} of {len(verdicts)} filters hold"
+    return "Forecasts of " + ", those of ".join(f"{visible(v.name)} {v.summarise()}" for v in reversed(verdicts))
 
 
 def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
